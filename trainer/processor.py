@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
     import torch
 
-    from pans.runtime.commands.doctor_checks import Finding
+    from pans.runtime.commands.doctor import Finding
 
 # Environments that torch is tried with, until one computes everything. oneDNN and ATen read them at their first operation.
 LIMITS: tuple[dict[str, str], ...] = (
@@ -198,7 +198,7 @@ def _rate(products: str) -> float:
 
 def check_torch() -> Iterator[Finding]:
     """What torch announces, computes and takes here: a check of `pans doctor`."""
-    from pans.runtime.commands.doctor_checks import Finding
+    from pans.runtime.commands.doctor import Finding
 
     choice = settle()
     if choice is None:

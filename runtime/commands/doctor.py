@@ -1,16 +1,451 @@
-"""`pans devices` and `pans doctor`: where instruments may be, and what in this machine stands in their way.
+"""`pans devices` and `pans doctor`: where instruments may be, and what in this machine helps or hurts; each finding with its remedy.
 
-Owns the commands' arguments and wording; the checks are doctor.py's.
+No port is opened (that would reset some boards) and nothing is changed. Each check yields `Finding`s; a check that itself fails is a
+finding too. `needed` tells what stops a run from what only makes it slower.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+import itertools
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from pans.runtime import SHIPPED
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
+from pans.runtime.cli.talk import is_quiet
+from pans.runtime.errors import UsageError
+from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
 
-from .doctor_checks import Finding, examine, schemes, serial_ports, udev_rule, usb_devices
+if TYPE_CHECKING:
+    from pans.runtime.timing.rehearsal import Rehearsal
+
+RULE = "70-pans.rules"
+RULES_FOLDERS = ("/etc/udev/rules.d", "/run/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d")
+UDEV = "pans doctor --udev prints a rule to install"
+LIMITS = "for steadier latencies: echo '{line}' | sudo tee -a /etc/security/limits.d/pans.conf, log in again"
+CLOCK_READS, CLOCK_COARSE_NS = 2000, 1_000
+TRIAL_PATIENCE_S = 120.0  # compiling on a busy machine
+HELPS, HARMS = 0.9, 1.1  # ratio of quantiles, besides every round
+AWAY_MS_PER_S, AWAY_US = 1.0, 200.0  # a fifth of the shortest deadline (1 ms)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at; `remedy` is empty when nothing needs doing."""
+
+    check: str
+    ok: bool
+    found: str
+    remedy: str = ""
+    needed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class PortState:
+    """One place where an instrument may be; `state` is free, busy, no permission, or not there."""
+
+    url: str
+    kind: str
+    description: str
+    vid_pid_serial: str
+    state: str
+    remedy: str = ""
+
+
+# -- ports -------------------------------------------------------------------------------------------------------------
+
+
+def serial_ports() -> list[PortState]:
+    """Return the serial ports with their state, without opening one."""
+    from serial.tools import list_ports
+
+    states = []
+    for port in sorted(list_ports.comports(), key=lambda port: str(port.device)):
+        named = port.vid is not None
+        ids = f"{port.vid:04x}:{port.pid:04x}:{port.serial_number or ''}" if named else ""
+        state, remedy = port_state(str(port.device))
+        url = f"serial:{ids.rstrip(':')}" if named else f"serial:{port.device}"
+        states.append(PortState(url, "serial", f"{port.device}: {port.description}", ids, state, remedy))
+    return states
+
+
+def port_state(device: str, proc: Path = Path("/proc")) -> tuple[str, str]:
+    """Return (state, remedy) of a device file: not there, no permission, busy (and who), free as far as can be seen."""
+    if sys.platform == "win32":
+        return "unknown", "Windows tells only by opening it"
+    if not os.path.exists(device):
+        return "not there", "check the cable"
+    if not os.access(device, os.R_OK | os.W_OK):
+        return "no permission", f"{UDEV}; or: sudo usermod -aG dialout $USER, log in again"
+    holder = _holder(device, proc)
+    return ("busy", f"close {holder} first") if holder else ("free", "")
+
+
+def _holder(device: str, proc: Path) -> str:
+    """Return who has `device` open, as far as this user may see; "" for nobody."""
+    wanted = os.path.realpath(device)
+    for folder in proc.glob("[0-9]*"):
+        try:
+            if any(os.readlink(entry) == wanted for entry in (folder / "fd").iterdir()):
+                return f"{(folder / 'comm').read_text().strip()} (process {folder.name})"
+        except OSError:  # another user's process, or one that has just ended
+            continue
+    return ""
+
+
+def usb_devices() -> list[PortState]:
+    """Return the USB devices with vendor-specific bulk interfaces; [] without libusb."""
+    import usb.core
+
+    try:
+        found = list(usb.core.find(find_all=True) or [])
+    except usb.core.NoBackendError:
+        return []
+    states = []
+    for device in found:
+        if device.bDeviceClass == 9:  # hubs
+            continue
+        ids, state, remedy = f"{device.idVendor:04x}:{device.idProduct:04x}", "free", ""
+        try:
+            ids += f":{device.serial_number or ''}"
+        except (usb.core.USBError, ValueError, NotImplementedError):
+            state, remedy = "no permission", UDEV
+        where = f"bus {device.bus} address {device.address}"
+        states.append(PortState(f"usb:{ids.rstrip(':')}", "usb", where, ids, state, remedy))
+    return states
+
+
+def schemes() -> list[str]:
+    """Return the URL schemes that this installation opens."""
+    return sorted({"serial", "usb", *(point.name for point in entry_points(group="pans.devices"))})
+
+
+# -- the machine -------------------------------------------------------------------------------------------------------
+
+
+def check_python() -> Iterator[Finding]:
+    """The interpreter is new enough."""
+    found = ".".join(str(part) for part in sys.version_info[:3])
+    yield Finding("python", sys.version_info >= (3, 11), found, "install Python 3.11 or newer", needed=True)
+
+
+def check_numba() -> Iterator[Finding]:
+    """Compiled kernels load, and are kept between runs."""
+    import numba
+    from numba.core import config
+
+    yield Finding("numba", True, f"numba {numba.__version__}", needed=True)
+    folder = Path(config.CACHE_DIR) if config.CACHE_DIR else Path(__file__).parent / "__pycache__"
+    ok = os.access(folder, os.W_OK) or (not folder.exists() and os.access(folder.parent, os.W_OK))
+    remedy = "export NUMBA_CACHE_DIR=~/.cache/pans: without a cache every start compiles for seconds"
+    yield Finding("numba cache", ok, str(folder), "" if ok else remedy)
+
+
+def check_libusb() -> Iterator[Finding]:
+    """pyusb finds libusb."""
+    import usb.backend.libusb1
+
+    ok = usb.backend.libusb1.get_backend() is not None
+    remedy = "only for usb: devices: pip install 'pans-runtime[usb]', or install libusb-1.0"
+    yield Finding("libusb", ok, "found" if ok else "not found", "" if ok else remedy)
+
+
+def check_clock() -> Iterator[Finding]:
+    """The clock is fine enough to time decisions."""
+    readings = [time.perf_counter_ns() for _ in range(CLOCK_READS)]
+    finest = min((after - before for before, after in itertools.pairwise(readings) if after > before), default=10**9)
+    source = _first_line("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "source unknown"
+    ok = finest <= CLOCK_COARSE_NS
+    remedy = "" if ok else "boot with clocksource=tsc; a virtual machine may hide it"
+    yield Finding("clock resolution", ok, f"{finest} ns ({source})", remedy)
+
+
+# What a child process tries, each answer on a line: integers and floats in vectors, the golden scores of a shipped head, privileges.
+# An instruction that is announced and not granted ends the process, and what is locked must not stay so here.
+_TRIAL = """
+import numba, numpy
+@numba.njit
+def kernel(integers, floats):
+    total, kept = 0, 0.0
+    for i in range(len(integers)):
+        total += integers[i] * integers[i]
+        floats[i] = floats[i] * floats[i] + floats[i]
+    return total
+floats = numpy.arange(1000.0)
+right = kernel(numpy.arange(1000), floats) == 332833500 and (floats == numpy.arange(1000.0) * numpy.arange(1, 1001)).all()
+print("compiled=" + ("right" if right else "wrong results"), flush=True)
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.decide.onnx import OnnxDecider
+try:
+    OnnxDecider(load_bundle(SHIPPED / "fashion10.pans")[0])
+    print("onnxruntime=right", flush=True)
+except Exception as error:
+    print(f"onnxruntime={error}".splitlines()[0], flush=True)
+from pans.runtime.timing.ledger import request_fifo, request_mlockall
+print("sched_fifo=" + request_fifo([0]), flush=True)
+print("mlockall=" + request_mlockall(), flush=True)
+"""
+
+
+def _tried(*names: str) -> dict[str, str]:
+    """Return what a child process answered for each name; how it ended, for those without an answer."""
+    try:
+        done = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=TRIAL_PATIENCE_S)
+        printed, reason = done.stdout, (done.stderr.strip().splitlines() or [""])[-1]
+        ended = f"the process ended by signal {-done.returncode}" if done.returncode < 0 else reason
+    except subprocess.TimeoutExpired as error:
+        printed, ended = (error.stdout or b"").decode(), f"no answer within {TRIAL_PATIENCE_S:.0f} s"
+    answers = dict(line.split("=", 1) for line in printed.splitlines() if "=" in line)
+    return {name: answers.get(name, ended) for name in names}
+
+
+def check_processor() -> Iterator[Finding]:
+    """Kernels and heads compute, SCHED_FIFO and locked memory are granted: announced, tried in a child process, taken."""
+    import llvmlite.binding
+    import numba
+    import onnxruntime
+
+    tried = _tried("compiled", "onnxruntime", "sched_fifo", "mlockall")
+    host, chosen = llvmlite.binding.get_host_cpu_name(), numba.config.CPU_NAME
+    right = tried["compiled"] == "right"
+    found = f"announced {host}; works {tried['compiled']}; taken {chosen or host}"
+    remedy = "export NUMBA_CPU_NAME=generic: kernels without the instructions that are refused here"
+    yield Finding("numba's target", right, found, "" if right else remedy, needed=True)
+    announced, right = ", ".join(onnxruntime.get_available_providers()), tried["onnxruntime"] == "right"
+    found = (
+        f"{onnxruntime.__version__}: announced {announced}; works {tried['onnxruntime']}; taken CPUExecutionProvider"
+    )
+    remedy = "pip install --force-reinstall onnxruntime; a bundle with a table decides without it"
+    yield Finding("onnxruntime", right, found, "" if right else remedy, needed=True)
+    if sys.platform == "win32":
+        return
+    import resource
+
+    user = os.environ.get("USER", "$USER")
+    for check, name, key, line in (
+        ("SCHED_FIFO", "RLIMIT_RTPRIO", "sched_fifo", f"{user} - rtprio 20"),
+        ("locked memory", "RLIMIT_MEMLOCK", "mlockall", f"{user} - memlock unlimited"),
+    ):
+        limit = resource.getrlimit(getattr(resource, name))[0] if hasattr(resource, name) else None
+        stated = "root" if os.geteuid() == 0 else "unlimited" if limit == resource.RLIM_INFINITY else f"limit {limit}"
+        ok, remedy = tried[key] == "granted", LIMITS.format(line=line)
+        if stated in ("root", "unlimited"):
+            remedy += "; a container or virtual machine may refuse it all the same"
+        taken = "asked for by each run" if ok else "runs go on without it"
+        yield Finding(check, ok, f"announced {stated}; works {tried[key]}; taken: {taken}", "" if ok else remedy)
+
+
+def check_governor() -> Iterator[Finding]:
+    """The processor does not slow down between decisions."""
+    governor = _first_line("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    ok = governor in ("", "performance")
+    remedy = "" if ok else "for steadier latencies: sudo cpupower frequency-set -g performance"
+    yield Finding("processor governor", ok, governor or "not offered by this system", remedy)
+
+
+def check_udev() -> Iterator[Finding]:
+    """The rule that gives access to instruments is installed."""
+    if sys.platform != "linux":
+        return
+    import grp
+
+    where = next((folder for folder in RULES_FOLDERS if (Path(folder) / RULE).exists()), "")
+    mine = set(os.getgroups())
+    member = any(group.gr_gid in mine for group in grp.getgrall() if group.gr_name == "dialout")
+    found = f"rule in {where}" if where else f"no rule, {'in' if member else 'not in'} group dialout"
+    ok = bool(where) or member or os.geteuid() == 0
+    remedy = f"pans doctor --udev | sudo tee /etc/udev/rules.d/{RULE}; or join the group dialout"
+    yield Finding("access to ports", ok, found, "" if ok else remedy)
+
+
+def check_ports() -> Iterator[Finding]:
+    """Every port that is there can be opened; FTDI adapters pass bytes on at once."""
+    ports = serial_ports()
+    if not ports:
+        yield Finding("serial ports", True, "none; pseudo-terminals and socket:// are never listed")
+    for port in ports:
+        yield Finding(f"port {port.url}", port.state == "free", f"{port.description}: {port.state}", port.remedy)
+        device = port.description.partition(":")[0]
+        timer_ms = latency_timer_ms(device)
+        if timer_ms is not None:
+            ok = timer_ms <= FTDI_SLOW_MS
+            remedy = "" if ok else f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{Path(device).name}/latency_timer"
+            yield Finding(f"FTDI latency {device}", ok, f"{timer_ms} ms", remedy)
+
+
+def check_others() -> Iterator[Finding]:
+    """What other packages check, by the entry points `pans.checks`: torch's products among them."""
+    for point in entry_points(group="pans.checks"):
+        yield from point.load()()
+
+
+Check = Callable[[], Iterator[Finding]]
+CHECKS: tuple[Check, ...] = (
+    *(check_python, check_numba, check_libusb, check_clock, check_processor, check_governor),
+    *(check_udev, check_ports, check_others),
+)
+
+
+def examine(checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
+    """Run all checks; one that breaks becomes a finding and stops no other."""
+    findings: list[Finding] = []
+    for check in checks:
+        name = check.__name__.removeprefix("check_").replace("_", " ")
+        try:
+            findings += check()
+        except ImportError as error:
+            remedy = "pip install --force-reinstall pans-runtime"
+            findings.append(Finding(name, False, f"cannot be loaded: {error}", remedy, needed=True))
+        except Exception as error:
+            findings.append(Finding(name, False, f"the check itself failed: {error!r}", "report this with its text"))
+    return findings
+
+
+def _first_line(path: str) -> str:
+    from pans.runtime.timing.cpu import first_line
+
+    return first_line(Path(path))
+
+
+# -- what each real-time setting brings --------------------------------------------------------------------------------
+
+
+def _compared(
+    setting: str, in_force: str, found: Rehearsal, arms: tuple[str, str], q: float, do: dict[str, str]
+) -> dict[str, Any]:
+    """A row that compares two arms by a quantile; `do` by effect, and "refused" for an arm that was not granted.
+
+    A setting helps or harms only if it does so in every round.
+    """
+    turns = [found.arms.get(arm) for arm in arms]
+    rounds = [[float(np.quantile(one, q)) for one in arm.rounds_ns] if arm else [] for arm in turns]
+    effect, better = "", None
+    if rounds[0] and len(rounds[0]) == len(rounds[1]):
+        better = sum(one > two for one, two in zip(*rounds))
+        worse = sum(one < two for one, two in zip(*rounds))
+        ratio = median(rounds[1]) / median(rounds[0])
+        helps, harms = better == len(rounds[0]) and ratio < HELPS, worse == len(rounds[0]) and ratio > HARMS
+        effect = "helps" if helps else "harms" if harms else "none"
+    return {
+        "setting": setting,
+        "in_force": in_force,
+        "measured": f"woken by a timer: {arms[0]}; {arms[1]} (compared by p{100 * q:.0f})",
+        "without": turns[0].figures() if turns[0] else {},
+        "with": turns[1].figures() if turns[1] else {},
+        "rounds_better": better,
+        "rounds": len(rounds[0]) if effect else None,
+        "effect": effect,
+        "do": do.get(effect or "refused", "nothing"),
+    }
+
+
+def settings_of(found: Rehearsal) -> list[dict[str, Any]]:
+    """Return a row for each setting: what is in force, what was measured without and with it, and what to do."""
+    from pans.runtime.timing.cpu import isolated_cores
+
+    base = "bound, SCHED_FIFO" if found.fifo else "bound"
+    pair = f"pans run --core {found.host}"
+    pair += "" if found.device is None else f", and a simulated device on pans simulate --core {found.device}"
+    cores = ", ".join(str(row["core"]) for row in found.cores) or "unknown"
+    rows = [
+        _compared(
+            "SCHED_FIFO", "granted" if found.fifo else "refused", found, ("ordinary", "SCHED_FIFO"), 0.99,
+            {"harms": "compare once more on a quiet machine; --no-realtime leaves it out",
+             "refused": LIMITS.format(line="$USER - rtprio 20")},
+        ),
+        _compared(
+            "affinity", f"cores {cores} allowed", found, ("ordinary", "bound"), 0.99,
+            {"helps": f"--core {found.host} binds the loop"},
+        ),
+        _compared(
+            "core kept awake", "no: by --core N", found, (base, "kept awake"), 0.99,
+            {"helps": f"{pair}: each takes all of its core", "harms": "leave --core out"},
+        ),
+        _compared(
+            "C-states", _first_line("/sys/devices/system/cpu/cpuidle/current_driver") or "not told by this system", found,
+            (base, "shallow idle states"), 0.5,
+            {"helps": "--core keeps one core out of them; for all: idle=poll or processor.max_cstate=1 at boot",
+             "refused": "to try it, run this as root: the file /dev/cpu_dma_latency is root's"},
+        ),
+        _compared(
+            "timer slack", "50 us unless set", found, ("ordinary", "exact timers"), 0.5,
+            {"helps": "nothing: SCHED_FIFO has exact timers" if found.fifo else "allow SCHED_FIFO"},
+        ),
+    ]  # fmt: skip
+    isolated = isolated_cores()
+    others = next((row for row in found.cores if row["core"] == found.host), {})
+    is_shared = found.host not in isolated and not found.fifo and others.get("away_ms_per_s", 0.0) > AWAY_MS_PER_S
+    do = f"allow SCHED_FIFO; or isolcpus={found.host} at boot, then --core {found.host}" if is_shared else "nothing"
+    rows.append(_measured("isolcpus", f"cores {sorted(isolated)}" if isolated else "none", others, do))
+    worst = max(found.cores, key=lambda row: float(row.get("fifo_away_ms_per_s", 0.0)), default={})
+    beyond = {name.removeprefix("fifo_"): value for name, value in worst.items() if name.startswith("fifo_")}
+    stolen = "unknown" if found.steal_ms is None else f"{found.steal_ms:.0f} ms stolen in {found.seconds:.0f} s"
+    held = float(beyond.get("largest_away_us", 0.0)) > AWAY_US
+    do = "a computer of its own, or cores of its own: no priority helps against interrupts and the hypervisor"
+    return [*rows, _measured("virtualisation", stolen, beyond, do if held else "nothing")]
+
+
+def _measured(setting: str, in_force: str, away: dict[str, Any], do: str) -> dict[str, Any]:
+    names = ("away_ms_per_s", "largest_away_us")
+    without = {name: away[name] for name in names if name in away}
+    measured = "for how long a core ran something else"
+    row = {"setting": setting, "in_force": in_force, "measured": measured, "without": without, "with": {}}
+    return row | {"rounds_better": None, "rounds": None, "effect": "", "do": do}
+
+
+def table_text(rows: list[dict[str, Any]], found: Rehearsal) -> str:
+    """Return the table, a line of figures and one of advice for each row."""
+    lines = [f"{'setting':<16} {'in force':<32} {'without':>28} {'with':>28}   times in us: p50 / p99 / p99.9 / max"]
+    for row in rows:
+        lines.append(f"{row['setting']:<16} {row['in_force']:<32} {_cell(row['without']):>28} {_cell(row['with']):>28}")
+        rounds = (
+            f"; better in {row['rounds_better']} of {row['rounds']} rounds: {row['effect']}" if row["effect"] else ""
+        )
+        lines += [f"{'':<16} {row['measured']}{rounds}", f"{'':<16} do: {row['do']}"]
+    pair = f"--core {found.host} for the run" if found.host is not None else "no cores to choose from"
+    pair += "" if found.device is None else f", --core {found.device} for a simulated device on this computer"
+    load = "{:.2f} before, {:.2f} after".format(*found.load_1min)
+    return "\n".join(
+        [*lines, f"cores suggested: {pair}", f"load of one minute: {load}; measured for {found.seconds:.1f} s"]
+    )
+
+
+def _cell(values: dict[str, Any]) -> str:
+    if "away_ms_per_s" in values:
+        return f"{values['away_ms_per_s']:.2f} ms/s, {values['largest_away_us']:.0f} us"
+    if "p50_us" not in values:
+        return "not tried"
+    return f"{values['p50_us']:.1f} / {values['p99_us']:.1f} / {values['p999_us']:.0f} / {values['max_us']:.0f}"
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[float], None]]:
+    if is_quiet() or not sys.stderr.isatty():
+        yield lambda share: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    # no thread that draws: it would take part in what is measured
+    with Progress(console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
+        task = progress.add_task("real time", total=1.0)
+        yield lambda share: progress.update(task, completed=share, refresh=True)
+
+
+# -- the commands ------------------------------------------------------------------------------------------------------
 
 
 def _configure_devices(parser: argparse.ArgumentParser) -> None:
@@ -28,17 +463,17 @@ def _devices(args: argparse.Namespace) -> int:
 
 
 def _configure_doctor(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--udev", action="store_true", help="print the udev rule that gives access to instruments, and end"
-    )
-    parser.add_argument(
-        "--realtime", action="store_true", help="measure for about 10 s what each real-time setting brings here"
-    )
-    parser.add_argument(
-        "--warm",
-        action="store_true",
-        help="compile all kernels into the cache, on all cores, so that a first run need not",
-    )
+    for option, words in (
+        ("--udev", "print the udev rule that gives access to instruments, and end"),
+        ("--realtime", "measure for about 10 s what each real-time setting brings here"),
+        ("--warm", "compile all kernels into the cache, on all cores, so that a first run need not"),
+    ):
+        parser.add_argument(option, action="store_true", help=words)
+
+
+def udev_rule() -> str:
+    """Return the text of the shipped udev rule."""
+    return (SHIPPED / RULE).read_text(encoding="utf-8")
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -48,30 +483,49 @@ def _doctor(args: argparse.Namespace) -> int:
     if args.warm:
         return _warm(args)
     findings = examine()
+    broken = [finding.check for finding in findings if finding.needed and not finding.ok]
+    payload: dict[str, Any] = {"findings": [asdict(finding) for finding in findings], "ready": not broken}
     if args.realtime:
-        return _realtime(args, findings)
-    lines = []
-    for finding in findings:
-        mark = "ok" if finding.ok else "FAIL" if finding.needed else "note"
-        lines.append(f"{mark:<5}{finding.check:<22} {finding.found}")
-        if not finding.ok:
-            lines.append(f"     remedy: {finding.remedy}")
-    broken = [finding.check for finding in findings if finding.needed and not finding.ok]
-    lines.append(f"{'cannot run: ' + ', '.join(broken) if broken else 'ready to run'}")
-    emit(args, {"findings": [asdict(finding) for finding in findings], "ready": not broken}, "\n".join(lines))
+        text = _realtime(payload)
+    else:
+        lines = []
+        for finding in findings:
+            mark = "ok" if finding.ok else "FAIL" if finding.needed else "note"
+            lines.append(f"{mark:<5}{finding.check:<22} {finding.found}")
+            if not finding.ok:
+                lines.append(f"     remedy: {finding.remedy}")
+        text = "\n".join([*lines, f"cannot run: {', '.join(broken)}" if broken else "ready to run"])
+    emit(args, payload, text)
     return EXIT_ALERT if broken else EXIT_FINE
 
 
-def _realtime(args: argparse.Namespace, findings: list[Finding]) -> int:
-    from .doctor_realtime import findings_of, measure, payload_of, settings_of, table_text
+def _realtime(payload: dict[str, Any]) -> str:
+    """Measure, add the figures to `payload`, and return the table; UsageError where this system has no such measurement."""
+    if sys.platform == "win32":
+        remedy = "pans bench link measures the whole path"
+        raise UsageError("--realtime measures on Linux and macOS only", remedy=remedy)
+    from pans.runtime.timing.rehearsal import SECONDS, rehearse
 
-    machine, found = measure()
-    rows = settings_of(machine, found)
-    broken = [finding.check for finding in findings if finding.needed and not finding.ok]
-    told = [asdict(finding) for finding in [*findings, *findings_of(rows)]]
-    payload = {"findings": told, "ready": not broken, "realtime": payload_of(rows, found)}
-    emit(args, payload, table_text(rows, found))
-    return EXIT_ALERT if broken else EXIT_FINE
+    say(
+        f"pans: measuring wake-ups for about {SECONDS:.0f} s; what else runs now takes part, and a live run would suffer"
+    )
+    with _bar() as report:
+        found = rehearse(SECONDS, report)
+    rows = settings_of(found)
+    for row in rows:
+        ok = row["do"].startswith(("nothing", "leave"))
+        finding = Finding(f"realtime: {row['setting']}", ok, row["in_force"], "" if ok else row["do"])
+        payload["findings"].append(asdict(finding))
+    payload["realtime"] = {
+        "settings": rows,
+        "wakeups": {name: {"asked": turns.asked, "sleep": turns.figures()} for name, turns in found.arms.items()},
+        "cores": found.cores,
+        "suggested": {"host": found.host, "device": found.device},
+        "steal_ms": found.steal_ms,
+        "load_1min": list(found.load_1min),
+        "seconds": found.seconds,
+    }
+    return table_text(rows, found)
 
 
 def _warm(args: argparse.Namespace) -> int:

@@ -1,7 +1,6 @@
 """What a live run does about late work: wakes when a block is overdue, asks the device then, and closes incidents with a verdict.
 
-Owns the evidence of one run (timing/evidence.py) and when it is taken; the judgement is timing/attribution.py's, late decisions are
-counted by timing/ledger.py.
+Evidence and judgement are timing/evidence.py's; late decisions are counted by timing/ledger.py.
 `settled` returns the verdicts that are ready as events for the recording. Costs a block one comparison and one short call.
 """
 
@@ -16,9 +15,18 @@ from pans.runtime.link.base import Link
 from pans.runtime.link.connection import Connection
 from pans.runtime.record import AnyRecorder
 from pans.runtime.record.format import TIMING_RUN_DTYPE
-from pans.runtime.timing.attribution import Incidents, LateAttribution, LateWork, MissingAttribution
 from pans.runtime.timing.clock import ClockModel
-from pans.runtime.timing.evidence import DISK, INFERENCE, NS_PER_S, Evidence, Stamped, longest_pause_ns
+from pans.runtime.timing.evidence import (
+    DISK,
+    INFERENCE,
+    NS_PER_S,
+    Attribution,
+    Evidence,
+    Incidents,
+    LateWork,
+    Stamped,
+    longest_pause_ns,
+)
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn import settling as kernels
@@ -86,7 +94,7 @@ class Lateness:
         """Take a late decision with its times, as `TimingLedger.judge` did."""
         self.incidents.late(LateWork(number, marks_ns[0], marks_ns[1], marks_ns[3], uncertainty_ns))
 
-    def lost(self, gap: Gap, connection: Connection, now_ns: int) -> MissingAttribution:
+    def lost(self, gap: Gap, connection: Connection, now_ns: int) -> Attribution:
         """Return the verdict on exposures that never came."""
         counters = connection.decoder.counters
         damaged = counters.crc_errors + counters.cobs_errors + counters.short_frames + counters.oversized_frames
@@ -94,7 +102,7 @@ class Lateness:
         self._damaged = damaged
         return attribution
 
-    def settled(self, connection: Connection, now_ns: int, *, idle: bool) -> LateAttribution | None:
+    def settled(self, connection: Connection, now_ns: int, *, idle: bool) -> Attribution | None:
         """Do what is due after a turn that brought something, or nothing (`idle`); return a verdict that is ready."""
         if idle and not self._asked and now_ns >= self.block_ns + self._patience_ns:
             connection.session.probe(now_ns)  # is the link open while the block is overdue?
@@ -102,7 +110,7 @@ class Lateness:
         self.evidence.read_if_stale(now_ns)
         return self.incidents.verdict(now_ns)
 
-    def closing_verdicts(self, now_ns: int) -> list[LateAttribution]:
+    def closing_verdicts(self, now_ns: int) -> list[Attribution]:
         """Return the verdicts on what the end of the run cuts short."""
         return list(iter(lambda: self.incidents.verdict(now_ns, final=True), None))
 

@@ -1,7 +1,6 @@
-"""Time on the host: the device's clock, latency per stage, what made work late, and a processor that does not fall asleep.
+"""Time on the host: the device's clock, latency per stage, why work was late, and a processor that does not fall asleep.
 
-Owns the conversion of device ticks to host time with its uncertainty, the ledger of latencies, and the attribution of late and missing work
-to link, device, host, garbage collection, disk or inference. It acts on nothing: live asks and reports.
+Device ticks and host times come in; host times with their uncertainty, latencies and causes go out. Begin with `clock.py`.
 
 >>> from pans.runtime.timing import TimingLedger
 >>> ledger = TimingLedger(deadline_ns=1_000_000)
@@ -11,20 +10,18 @@ True
 {'decide': 1}
 """
 
-from .attribution import Incidents, LateAttribution, MissingAttribution
 from .clock import ClockModel
 from .cpu import busy_core
-from .evidence import Evidence
+from .evidence import Attribution, Evidence, Incidents
 from .ledger import LatencyHistogram, TimingLedger, arm_realtime, frozen_heap
 from .page_faults import ThreadCounts
 
 __all__ = [
+    "Attribution",
     "ClockModel",
     "Evidence",
     "Incidents",
-    "LateAttribution",
     "LatencyHistogram",
-    "MissingAttribution",
     "ThreadCounts",
     "TimingLedger",
     "arm_realtime",

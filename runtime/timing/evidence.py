@@ -1,43 +1,58 @@
-"""What was going on while work became late: spans of the loop's time, the scheduler's counters, messages that say when they left.
+"""Why work was late or missing: evidence is collected while a run lasts, and one cause is named, with the reason in plain words.
 
-Owns the collecting, in bounded memory: nothing here looks at a photon, and a thread of its own reads the system (counters.py). Never
-judges (attribution.py). `Evidence.facts` returns what is known about one stretch of time. Spans shorter than `floor_ns` are not kept:
-none of them alone can make anything late. In virtual time the counters of the machine mean nothing and are not read.
+Every nanosecond between the end of the exposure and the decision is given to the cause that was seen there:
+
+    gc          a garbage collection held the interpreter
+    disk        a write of the recording did not return
+    inference   the decision back end computed
+    host        the loop or its reader waited for a processor, slept beyond its timer, or stood still (starved, stolen by the hypervisor,
+                stopped)
+    link        the loop was awake and waiting for bytes, and nothing says that the device was late
+    device      ... and a message that says when it left shows that the link was open, or that the device held it back
+    decode      the loop's own work, none of the above (reading messages, recording)
+
+The largest share is the cause. What separates link from device is in docs/explanation/timing.md: a click block says when it was exposed,
+never when it was sent, so that only a PONG or a STATUS that falls into the silence can tell; without one the verdict is `link`, not sure.
+Memory is bounded. In virtual time the counters of the machine mean nothing and are not read.
 """
 
 from __future__ import annotations
 
 import gc
+import os
 import threading
 import time
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pans.runtime.core.plan import Plan
-
-from .counters import Counters
+from pans.runtime.wire.tracker import Gap
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
-STALE_NS = 250 * NS_PER_MS  # a counters' thread that was not heard for so long is starved: the loop reads for itself
-FLOOR_NS = 100 * NS_PER_US
-OVERSLEPT_NS = 500 * NS_PER_US  # a timer that fires later than this was not the timer's fault
-MAX_SPANS = 1024
-MAX_STAMPED = 64
-MAX_ARRIVALS = 512
-
+CAUSES = ("link", "device", "host", "gc", "disk", "inference", "decode")
 GC, DISK, INFERENCE, IDLE, OVERSLEPT = "gc", "disk", "inference", "idle", "overslept"
+FLOOR_NS = 100 * NS_PER_US  # a shorter span alone makes nothing late, and is not kept
+OVERSLEPT_NS = 500 * NS_PER_US  # a timer that fires later than this was not the timer's fault
+LEG_NS = 500_000  # a way that takes longer than this and half the delay is no ordinary one
+QUIET_NS = 50 * NS_PER_MS  # without late work: the incident is over, and the probes sent within it are back
+PATIENCE_NS = 4 * QUIET_NS  # for the counters' thread to read after the incident; then the loop reads for itself
+LONGEST_INCIDENT_NS = NS_PER_S  # a run that is late all the time gets a verdict per second
+READ_EVERY_S, STALE_NS = 0.02, 250 * NS_PER_MS  # of the counters; when their thread counts as starved
+MAX_SPANS, MAX_STAMPED, MAX_ARRIVALS, MAX_SAMPLES = 1024, 64, 512, 160
+READ_BYTES, JOIN_S = 4096, 2.0
 
 
 class Span(NamedTuple):
     """What the loop did from `begin_ns` to `end_ns`: one of GC, DISK, INFERENCE, IDLE (awake, waiting for bytes), OVERSLEPT.
 
-    `cpu_ns` is how long its thread had computed since it last waited, an upper bound for the span; -1 where nobody looked.
+    `cpu_ns` is how long its thread had computed since it last waited, an upper bound for the span; -1 where it is not known.
     """
 
     kind: str
@@ -66,10 +81,196 @@ class Facts(NamedTuple):
     arrivals_ns: tuple[int, ...]  # when the reader stamped bytes
     pause_ns: int  # the longest time between two blocks when everything is on time
     cpu_ns: int  # the loop's thread computed for so long, at most
-    run_delay_ns: int  # it, or its reader while it did not compute, waited for a processor, beyond what is usual
+    run_delay_ns: int  # it, or its reader while it did not compute, waited for a processor
     steal_ns: int
     switches: int
     stamped: tuple[Stamped, ...]
+
+
+class Verdict(NamedTuple):
+    """The cause, how much of the delay it explains, whether the evidence settles it, and why in plain words."""
+
+    cause: str
+    share_ns: int
+    sure: bool
+    why: str
+    shares_ns: dict[str, int]
+
+    def facts(self) -> dict[str, Any]:
+        """Return the fields of an event; shares in whole microseconds, those below one left out."""
+        shares = {name: share // 1000 for name, share in self.shares_ns.items() if share >= 1000}
+        return {"cause": self.cause, "sure": self.sure, "why": self.why, "shares_us": shares}
+
+
+# ---- judging ---------------------------------------------------------------------------------------------------------
+
+
+def judge(facts: Facts) -> Verdict:
+    """Return the cause of the time from `facts.begin_ns` to `facts.end_ns`."""
+    shares = _shares(facts)
+    outside = shares.pop("outside")
+    source, sure, why = attribute_silence(facts)
+    shares[source] = shares.get(source, 0) + outside
+    cause = max(CAUSES, key=lambda name: shares.get(name, 0))
+    share = shares.get(cause, 0)
+    if cause == source and outside == share:
+        return Verdict(cause, share, sure, why, shares)
+    total = max(facts.end_ns - facts.begin_ns, 1)
+    return Verdict(cause, share, 2 * share >= total, _words(cause, share, facts), shares)
+
+
+def judge_gap(gap: Gap, facts: Facts, damaged_frames: int) -> Verdict:
+    """Return the cause of a gap: what the device dropped was held up by whoever did not take it, the rest got lost on the link."""
+    dropped = gap.dropped_by_device
+    if 2 * dropped < gap.exposures:
+        why = (
+            f"{gap.messages} stream messages left the device (their numbers are missing) and never came; "
+            f"{damaged_frames} damaged frames were thrown away meanwhile"
+        )
+        return Verdict("link", 0, True, why, {})
+    held_up = judge(facts)
+    full = f"the device dropped {dropped} exposures because its buffer was full"
+    if held_up.share_ns < NS_PER_MS:
+        return Verdict("device", 0, False, f"{full}; nothing on this side held the stream up", held_up.shares_ns)
+    return held_up._replace(why=f"{full}; before that, {held_up.why}")
+
+
+def _shares(facts: Facts) -> dict[str, int]:
+    """Return how many ns each cause on this side explains, and `outside`: awake, and no bytes."""
+    begin, end = facts.begin_ns, facts.end_ns
+    collecting = _clipped(facts.spans, GC, begin, end)
+
+    def without_gc(kind: str) -> int:
+        spans = _clipped(facts.spans, kind, begin, end)
+        shared = sum(max(0, min(a[1], b[1]) - max(a[0], b[0])) for a in spans for b in collecting)
+        return _length(spans) - shared
+
+    shares = {"gc": _length(collecting)}
+    shares |= {cause: without_gc(kind) for cause, kind in (("disk", DISK), ("inference", INFERENCE), ("outside", IDLE))}
+    asleep = without_gc(OVERSLEPT)
+    own = max(end - begin - _covered(facts.spans, begin, end), 0)
+    # What the hypervisor took explains work that took long; a loop that woke up on time lost nothing by it.
+    stolen = min(facts.steal_ns, own + shares["inference"] + shares["disk"])
+    starved = min(max(facts.run_delay_ns, asleep, stolen), end - begin)
+    # A thread that waits for a processor does so in the middle of something: that time is the machine's, not the activity's.
+    hidden = max(starved - asleep, 0)
+    shares["decode"] = own
+    for cause in sorted(("disk", "inference", "decode", "outside"), key=lambda name: -shares[name]):
+        taken = min(shares[cause], hidden)
+        shares[cause] -= taken
+        hidden -= taken
+    return shares | {"host": min(starved + _stopped(facts, shares), end - begin)}
+
+
+def _stopped(facts: Facts, shares: dict[str, int]) -> int:
+    """Take from `shares`, and return, the time in which the loop should have computed and nothing of this process did.
+
+    The loop's own work costs it processor time. A back end may sleep, as one that waits for other hardware does; but then the reader
+    still stamps what comes.
+    """
+    computed = min(shares["decode"], facts.cpu_ns)
+    still = shares["decode"] - computed
+    shares["decode"] = computed
+    margin = facts.pause_ns
+    for span in facts.spans:
+        length = min(span.end_ns, facts.end_ns) - max(span.begin_ns, facts.begin_ns)
+        expected = 0 < 4 * margin < span.end_ns - span.begin_ns
+        computed = facts.cpu_ns if span.cpu_ns < 0 else span.cpu_ns
+        if span.kind != INFERENCE or not expected or 2 * computed > length or length > shares["inference"]:
+            continue
+        if not any(span.begin_ns + margin < arrival < span.end_ns - margin for arrival in facts.arrivals_ns):
+            shares["inference"] -= length
+            still += length
+    return still
+
+
+def attribute_silence(facts: Facts) -> tuple[str, bool, str]:
+    """Tell link from device for a silence that began when the exposure ended and lasted until the block came."""
+    begin, end = facts.begin_ns, facts.arrival_ns
+    delay = max(end - begin, 1)
+    long_ns = max(LEG_NS, delay // 2)
+    for message in facts.stamped:
+        held = 0 if message.reached_ns is None else message.left_ns - message.reached_ns
+        if held > long_ns and message.left_ns > begin:
+            return "device", True, f"the device kept a clock probe for {_ms(held)} before it answered"
+    open_again = _latest_round_trip(facts.stamped, begin, end)
+    for message in facts.stamped:
+        way = message.arrival_ns - message.left_ns
+        if begin <= message.left_ns <= end and way > long_ns:
+            what = "a clock probe's answer" if message.sent_ns is not None else "a STATUS"
+            why = f"{what} left the device on time and was {_ms(way)} on the way, while the host waited for bytes"
+            return "link", True, why
+        if message.sent_ns is None or message.reached_ns is None or open_again is not None:
+            continue
+        way = message.reached_ns - message.sent_ns
+        if begin - delay <= message.sent_ns <= end and way > max(LEG_NS, (end - message.sent_ns) // 2):
+            why = f"a clock probe needed {_ms(way)} to reach the device, while the host was awake and waited for bytes"
+            return "link", True, why
+    if open_again is not None:
+        trip, overdue = open_again.arrival_ns - (open_again.sent_ns or 0), open_again.arrival_ns - begin
+        why = (
+            f"a clock probe went to the device and back in {_ms(trip)} while the block was already {_ms(overdue)} late, "
+            "so the link was open and the block had not been sent"
+        )
+        return "device", True, why
+    why = f"the host was awake and waited for bytes for {_ms(delay)}; no message that says when it left fell into this time"
+    return "link", False, why
+
+
+def _latest_round_trip(stamped: Iterable[Stamped], begin: int, end: int) -> Stamped | None:
+    """A probe that was sent after the block should have come, and was back well before it came."""
+    margin = max(LEG_NS, (end - begin) // 8)
+    inside = [one for one in stamped if (one.sent_ns or 0) >= begin and one.sent_ns and one.arrival_ns <= end - margin]
+    return max(inside, key=attrgetter("arrival_ns"), default=None)
+
+
+def _words(cause: str, share: int, facts: Facts) -> str:
+    total_ns = facts.end_ns - facts.begin_ns
+    if cause == "host":
+        # the system's counters are read around the delay, not at its ends: they hold time beyond it
+        waited, stolen, computed = (
+            _ms(min(one, total_ns)) for one in (facts.run_delay_ns, facts.steal_ns, facts.cpu_ns)
+        )
+        return (
+            f"the host did not run for {_ms(share)} of {_ms(total_ns)}: waiting for a processor {waited}, stolen from the "
+            f"machine {stolen}, computing at most {computed}, {facts.switches} involuntary switches"
+        )
+    sentence = {
+        "gc": "a garbage collection held the interpreter",
+        "disk": "writing the recording did not return",
+        "inference": "the decision back end computed",
+        "decode": "the loop was busy with its own work, reading messages,",
+        "link": "the host was awake and waited for bytes",
+        "device": "the device had not sent the block",
+    }[cause]
+    return f"{sentence} for {_ms(share)} of {_ms(total_ns)}"
+
+
+def _ms(nanoseconds: int) -> str:
+    return f"{nanoseconds / NS_PER_MS:.2f} ms"
+
+
+def _clipped(spans: Iterable[Span], kind: str, begin: int, end: int) -> list[tuple[int, int]]:
+    cut = [(max(span.begin_ns, begin), min(span.end_ns, end)) for span in spans if span.kind == kind]
+    return [(first, last) for first, last in cut if last > first]
+
+
+def _length(pieces: Iterable[tuple[int, int]]) -> int:
+    return sum(last - first for first, last in pieces)
+
+
+def _covered(spans: Iterable[Span], begin: int, end: int) -> int:
+    """How much of the time from `begin` to `end` any of `spans` covers; what overlaps counts once."""
+    covered, reached = 0, begin
+    for span in sorted(spans, key=attrgetter("begin_ns")):
+        first, last = max(span.begin_ns, reached), min(span.end_ns, end)
+        if last > first:
+            covered += last - first
+            reached = last
+    return covered
+
+
+# ---- collecting ------------------------------------------------------------------------------------------------------
 
 
 class Evidence:
@@ -84,7 +285,7 @@ class Evidence:
         self._spans: deque[Span] = deque(maxlen=MAX_SPANS)
         self._stamped: deque[Stamped] = deque(maxlen=MAX_STAMPED)
         self._collecting_ns = self._cpu_mark_ns = 0
-        self._apart = False  # another thread than the one that tells of them waits and works
+        self._apart = False  # another thread than the one that reports waits and works
         self._counters = Counters(now_ns, [])
 
     def watch(self, threads: Iterable[int | None] = (), loop: int | None = None) -> None:
@@ -107,13 +308,11 @@ class Evidence:
             gc.callbacks.remove(self._on_gc)
         self._counters.close()
 
-    # -- what the loop tells -------------------------------------------------------------------------------------------
-
     def worked(self, kind: str, begin_ns: int, end_ns: int) -> None:
         """Note that the loop was busy with `kind`."""
         if end_ns - begin_ns >= self.floor_ns:
-            looked = not self._virtual and not self._apart
-            cpu_ns = time.thread_time_ns() - self._cpu_mark_ns if looked else -1
+            known = not self._virtual and not self._apart
+            cpu_ns = time.thread_time_ns() - self._cpu_mark_ns if known else -1
             self._spans.append(Span(kind, begin_ns, end_ns, cpu_ns))
 
     def waited(self, begin_ns: int, asked_s: float, end_ns: int) -> None:
@@ -138,7 +337,7 @@ class Evidence:
         self._stamped.append(message)
 
     def heard_since(self, end_ns: int) -> bool:
-        """Return whether the system's counters were read after `end_ns`; in virtual time nobody asks them."""
+        """Return whether the system's counters were read after `end_ns`; in virtual time they do not count."""
         return self._virtual or self._counters.heard_ns >= end_ns
 
     def read_if_stale(self, now_ns: int) -> None:
@@ -146,41 +345,34 @@ class Evidence:
         if not self._virtual and now_ns - self._counters.heard_ns >= STALE_NS:
             self._counters.read()
 
-    # -- what is known -------------------------------------------------------------------------------------------------
-
     def facts(self, begin_ns: int, arrival_ns: int, end_ns: int, uncertainty_ns: int) -> Facts:
         """Return what is known about the time from `begin_ns` to `end_ns`, both host times."""
         if not self.heard_since(end_ns):
             self._counters.read()
         first, last = self._counters.around(begin_ns, end_ns)
         cpu_ns = last.cpu_ns - first.cpu_ns
-        delays_ns = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)] or [0]
-        usual = self._counters.usual or [0.0] * len(delays_ns)
-        own, *readers = [
-            max(delay - round(share * (last.at_ns - first.at_ns)), 0) for delay, share in zip(delays_ns, usual)
-        ]
-        # a reader that waits while the loop computes waits for the loop
-        delay_ns = max([own, *(delay - cpu_ns for delay in readers)])
+        delays = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)]
+        own, *readers = delays or [0]
         spans, arrivals_ns = list(self._spans), list(self._arrivals)  # both in the order of their ends
         first_span = bisect_right(spans, begin_ns, key=attrgetter("end_ns"))
-        first_arrival = bisect_right(arrivals_ns, begin_ns)
         return Facts(
             begin_ns,
             arrival_ns,
             end_ns,
             uncertainty_ns,
             tuple(span for span in spans[first_span:] if span.begin_ns < end_ns),
-            tuple(arrivals_ns[first_arrival : bisect_left(arrivals_ns, end_ns)]),
+            tuple(arrivals_ns[bisect_right(arrivals_ns, begin_ns) : bisect_left(arrivals_ns, end_ns)]),
             self._pause_ns,
             cpu_ns,
-            delay_ns,
+            max(
+                [own, *(delay - cpu_ns for delay in readers)]
+            ),  # a reader that waits while the loop computes waits for it
             last.steal_ns - first.steal_ns,
             last.switches - first.switches,
             tuple(
-                message
-                for message in self._stamped
-                if message.arrival_ns >= begin_ns
-                and (message.left_ns if message.sent_ns is None else message.sent_ns) <= end_ns
+                one
+                for one in self._stamped
+                if one.arrival_ns >= begin_ns and (one.left_ns if one.sent_ns is None else one.sent_ns) <= end_ns
             ),
         )
 
@@ -190,6 +382,213 @@ class Evidence:
         elif self._collecting_ns:
             self.worked(GC, self._collecting_ns, self._now())
             self._collecting_ns = 0
+
+
+class Sample(NamedTuple):
+    """Counters of the system, read between `began_ns` and `ended_ns`; they only ever grow."""
+
+    began_ns: int
+    ended_ns: int
+    cpu_ns: int  # that the loop's thread has computed
+    run_delays_ns: tuple[int, ...]  # how long each thread, the loop's first, waited to run
+    steal_ns: int  # of the whole machine: time in which the hypervisor ran somebody else
+    switches: int  # involuntary, of the loop's thread
+
+
+class Counters:
+    """Samples of the counters of some threads, the loop's first; made by a thread of their own, or by `read` in the caller's.
+
+    The thread runs one step below the loop's priority, where that is a real-time one: it never takes the processor from the loop. Not
+    further down: whoever holds the interpreter must not wait for the rest of the machine, since the loop may be waiting for it.
+    Where the system does not tell, there is no thread, and a sample holds the caller's own time and zeros.
+    """
+
+    def __init__(self, now_ns: Callable[[], int], threads: Sequence[int]) -> None:
+        self.heard_ns = 0  # when the latest reading began
+        self._now = now_ns
+        self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        tasks = [f"/proc/self/task/{thread}" for thread in threads]
+        paths = [f"{tasks[0]}/status", "/proc/stat", *(f"{task}/schedstat" for task in tasks)] if tasks else []
+        self._files = [_open(path) for path in paths]
+        self._tick_ns = NS_PER_S // (os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100)
+        self._told = len(self._files) > 2 and self._files[2] is not None
+        self.read()
+        self._thread = threading.Thread(target=self._watch, name="pans-counters", daemon=True) if self._told else None
+        if self._thread is not None:
+            self._thread.start()
+
+    def read(self) -> None:
+        """Read in the calling thread: some ten to a hundred microseconds; nothing if the other thread is at it."""
+        if self._stop.is_set() or not self._lock.acquire(blocking=False):
+            return
+        try:
+            began_ns = self._now()
+            files = [_read(file) for file in self._files]
+            self._samples.append(self._sample(began_ns, self._now(), files))
+            self.heard_ns = began_ns
+        finally:
+            self._lock.release()
+
+    def _sample(self, began_ns: int, ended_ns: int, files: Sequence[bytes]) -> Sample:
+        if not self._told:
+            return Sample(began_ns, ended_ns, time.thread_time_ns(), (), 0, 0)
+        status, stat, *threads = files
+        return Sample(
+            began_ns,
+            ended_ns,
+            _number(threads[0], 0),
+            tuple(_number(text, 1) for text in threads),
+            _number(stat.partition(b"\n")[0], 8) * self._tick_ns,
+            _number(status.partition(b"\nnonvoluntary_ctxt_switches:")[2], 0),
+        )
+
+    def around(self, begin_ns: int, end_ns: int) -> tuple[Sample, Sample]:
+        """Return the latest sample that was whole at `begin_ns` and the first one begun at `end_ns`; as near as there are."""
+        samples = list(self._samples)
+        if not samples:
+            return Sample(0, 0, 0, (), 0, 0), Sample(0, 0, 0, (), 0, 0)
+        before = next((one for one in reversed(samples) if one.ended_ns <= begin_ns), samples[0])
+        return before, next((one for one in samples if one.began_ns >= end_ns), samples[-1])
+
+    def close(self) -> None:
+        """End the thread and close the files; idempotent."""
+        self._stop.set()
+        if self._thread is not None and self._thread.is_alive():
+            self._thread.join(JOIN_S)
+        with self._lock:
+            for file in self._files:
+                if file is not None:
+                    os.close(file)
+            self._files = []
+
+    def _watch(self) -> None:
+        if hasattr(os, "sched_setscheduler") and (priority := os.sched_getparam(0).sched_priority) > 1:
+            with suppress(OSError):  # a reading in time is worth little against a run
+                os.sched_setscheduler(0, os.sched_getscheduler(0), os.sched_param(priority - 1))
+        while not self._stop.wait(READ_EVERY_S):
+            self.read()
+
+
+def _open(path: str) -> int | None:
+    try:
+        return os.open(path, os.O_RDONLY)
+    except OSError:
+        return None
+
+
+def _read(file: int | None) -> bytes:
+    """Return a file's first bytes, which the kernel makes afresh for each read from its start."""
+    try:
+        return b"" if file is None else os.pread(file, READ_BYTES, 0)
+    except OSError:
+        return b""
+
+
+def _number(text: bytes, index: int) -> int:
+    """Field `index` of a text, 0 where there is none."""
+    try:
+        return int(text.split(None, index + 1)[index])
+    except (ValueError, IndexError):
+        return 0
+
+
+# ---- incidents -------------------------------------------------------------------------------------------------------
+
+
+class LateWork(NamedTuple):
+    """One late decision, in host ns: exposure ended, bytes came, decided."""
+
+    number: int
+    begin_ns: int
+    arrival_ns: int
+    end_ns: int
+    uncertainty_ns: int
+
+
+class Attribution(NamedTuple):
+    """What was late or missing, as the fields of an event, and the verdict on it."""
+
+    what: dict[str, Any]
+    verdict: Verdict
+
+    def event(self) -> dict[str, Any]:
+        """Return it as an event for the recording."""
+        return {"kind": "blame", **self.what, **self.verdict.facts()}
+
+
+@dataclass(slots=True)
+class _Incident:
+    first: LateWork
+    worst: LateWork
+    last: LateWork
+    decisions: int = 1
+
+
+@dataclass(slots=True)
+class Incidents:
+    """Late decisions in a row are one incident with one cause, judged from its worst decision once it is quiet again."""
+
+    evidence: Evidence
+    causes: dict[str, int] = field(default_factory=dict)  # late decisions by cause
+    missing: dict[str, int] = field(default_factory=dict)  # lost exposures by cause
+    _waiting: deque[_Incident] = field(default_factory=deque)  # for their verdicts, the oldest first
+    _known: tuple[_Incident, Facts] | None = None  # to be judged next
+
+    def late(self, work: LateWork) -> None:
+        """Add one late decision; it belongs to the incident before it if that was not over when its own exposure ended."""
+        latest = self._waiting[-1] if self._waiting else None
+        longest = latest is not None and work.end_ns - latest.first.end_ns > LONGEST_INCIDENT_NS
+        if latest is None or longest or work.begin_ns > latest.last.end_ns:
+            self._waiting.append(_Incident(work, work, work))
+            return
+        if work.end_ns - work.begin_ns > latest.worst.end_ns - latest.worst.begin_ns:
+            latest.worst = work
+        latest.last = work
+        latest.decisions += 1
+
+    def verdict(self, now_ns: int, *, final: bool = False) -> Attribution | None:
+        """Return the verdict on the incident under way, None while there is none or it is not over.
+
+        What is known is gathered in one call and judged in the next: a decision may be due between the two.
+        """
+        if self._known is not None:
+            return self._judged(*self._known)
+        if not self._waiting:
+            return None
+        oldest = self._waiting[0]
+        quiet_ns = now_ns - oldest.last.end_ns
+        if not final:
+            if quiet_ns < QUIET_NS and now_ns - oldest.first.end_ns < LONGEST_INCIDENT_NS:
+                return None
+            if quiet_ns < PATIENCE_NS and not self.evidence.heard_since(oldest.worst.end_ns):
+                return None
+        self._waiting.popleft()
+        self._known = oldest, self.evidence.facts(*oldest.worst[1:])
+        return self._judged(*self._known) if final else None
+
+    def _judged(self, incident: _Incident, facts: Facts) -> Attribution:
+        self._known = None
+        verdict = judge(facts)
+        self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + incident.decisions
+        worst = incident.worst
+        what = {
+            "what": "late",
+            "first_decision": incident.first.number,
+            "last_decision": incident.last.number,
+            "decisions": incident.decisions,
+            "worst_us": (worst.end_ns - worst.begin_ns) / 1000,
+            "begin_ns": worst.begin_ns,
+            "end_ns": worst.end_ns,
+        }
+        return Attribution(what, verdict)
+
+    def lost(self, gap: Gap, since_ns: int, now_ns: int, damaged_frames: int) -> Attribution:
+        """Return the cause of exposures that never came; `since_ns` is when the latest block before came."""
+        verdict = judge_gap(gap, self.evidence.facts(since_ns, now_ns, now_ns, 0), damaged_frames)
+        self.missing[verdict.cause] = self.missing.get(verdict.cause, 0) + gap.exposures
+        what = {"what": "missing", "first_exposure": gap.first_exposure, "exposures": gap.exposures}
+        return Attribution(what, verdict)
 
 
 def longest_pause_ns(plan: Plan) -> int:

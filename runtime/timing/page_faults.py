@@ -1,8 +1,7 @@
 """What the kernel did to one thread: page faults, and how often another thread was put in its place; a heap that makes none.
 
-Owns the counting, by getrusage of the calling thread (Linux; elsewhere nothing is known), and the heap that is touched before arming. A
-minor fault is the first touch of a page, or of one that had been given back: one to a few microseconds each. A major fault waits for the
-disk. An involuntary switch means that the scheduler took the core away for somebody else.
+Counts come from getrusage of the calling thread (Linux; elsewhere nothing is known). A minor fault is the first touch of a page, one to a
+few microseconds. A major fault waits for the disk. An involuntary switch means that the scheduler took the core away for somebody else.
 """
 
 from __future__ import annotations

@@ -1,40 +1,46 @@
-"""Ten seconds of wake-ups under different conditions, in short turns one after another: what each condition brings on this computer, now.
+"""How late a thread wakes under one real-time condition after another, on this computer, now; and which core is the quietest.
 
-Owns which conditions are compared, their order and what is kept; the loops are wakeups.py's, the conditions are conditions.py's. All turns
-alternate in ROUNDS rounds, so that whatever else the machine does hits every condition. Nothing stays changed. It must not run beside a
-live run: it takes a core for tenths of a second at the run's own priority.
+All conditions alternate in ROUNDS rounds, so that whatever else the machine does hits every condition. Nothing stays changed. It must not
+run beside a live run: it takes a core for tenths of a second at the run's own priority. Loops are Python's: about a microsecond.
 """
 
 from __future__ import annotations
 
 import gc
 import os
+import random
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .conditions import GRANTED, bound, fifo, shallow_idle, timer_slack
-from .cpu import busy_core, usable_cores
-from .first_touch import first_touch
+from .cpu import (
+    bound,
+    busy_core,
+    cores_of,
+    fifo,
+    first_line,
+    isolated_cores,
+    shallow_idle,
+    steal_ms,
+    timer_slack,
+    usable_cores,
+)
 from .ledger import FIFO_PRIORITY
-from .machine import Machine, steal_ms
-from .wakeups import Sender, clock_gaps, figures, sleeps, work_times
 
-SECONDS = 10.0
-ROUNDS = 4
-MOST_CORES = 8
-PAUSE_S = 0.001  # as between two blocks at 1000 decisions per second
-CORE_SHARE, WORK_SHARE = 0.08, 0.06  # of the time: to look at the cores, and at work after a pause
-Told = Callable[[float], None]
+SECONDS, ROUNDS, MOST_CORES = 10.0, 4, 8
+CORE_SHARE = 0.1  # of the time: to look at the cores
+PAUSE_S = (0.0002, 0.0006)  # random: nothing on the machine has this period
+SPIN_GAP_NS = 20_000  # a reading of the clock takes 0.1 us: what is longer was spent elsewhere
 
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """Conditions that hold together; `kinds` of wake-ups that are measured under them."""
+    """Conditions that hold together."""
 
     name: str
     fifo: bool = False
@@ -42,116 +48,82 @@ class Arm:
     awake: bool = False
     shallow: bool = False
     slack_ns: int = 0
-    kinds: tuple[str, ...] = ("sleep", "pipe")
 
 
 @dataclass(slots=True)
 class Turns:
-    """What came of an arm: what was answered to its requests, and by kind the times of each round in ns."""
+    """What came of an arm: the answers to its requests, and by how much each sleep of each round was too long, ns."""
 
     asked: dict[str, Any] = field(default_factory=dict)
-    late_ns: dict[str, list[list[int]]] = field(default_factory=dict)
+    rounds_ns: list[list[int]] = field(default_factory=list)
 
-    def all_of(self, kind: str) -> list[int]:
-        """Return the times of all rounds."""
-        return [late for one in self.late_ns.get(kind, []) for late in one]
-
-    def by_round(self, kind: str, q: float) -> list[float]:
-        """Return quantile `q` of each round in microseconds."""
-        return [float(np.quantile(one, q)) / 1000 for one in self.late_ns.get(kind, []) if one]
+    def figures(self) -> dict[str, float]:
+        """Return {samples, p50_us, p99_us, p999_us, max_us} of all rounds."""
+        return figures([late for one in self.rounds_ns for late in one])
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """All that was measured: `cores` with their figures, the pair that is suggested, `arms` by name, first touches, work after a pause."""
+    """All that was measured: `cores` with their figures, the pair that is suggested, and `arms` by name."""
 
     cores: list[dict[str, Any]]
     host: int | None
     device: int | None
-    fifo: str  # granted, or why not
+    fifo: bool  # granted
     arms: dict[str, Turns]
-    first_touch: dict[str, dict[str, Any]]
-    work: dict[str, dict[str, float]]
     steal_ms: float | None
     load_1min: tuple[float, float]
     seconds: float
 
-    @property
-    def free(self) -> str:
-        """The best arm in which the thread is not bound."""
-        return "SCHED_FIFO" if self.fifo == GRANTED else "ordinary"
-
-    @property
-    def base(self) -> str:
-        """The arm that those with a core kept awake are to be compared with."""
-        return "bound, SCHED_FIFO" if self.fifo == GRANTED else "bound"
-
 
 def arms_of(granted: bool) -> tuple[Arm, ...]:
     """Return the arms to compare; without SCHED_FIFO those that need it are left out."""
-    all_kinds = ("sleep", "pipe", "terminal")
-    with_priority: tuple[Arm, ...] = ()
-    if granted:
-        with_priority = (Arm("SCHED_FIFO", fifo=True, kinds=all_kinds), Arm("bound, SCHED_FIFO", fifo=True, bound=True))
+    fifo_arms = (Arm("SCHED_FIFO", fifo=True), Arm("bound, SCHED_FIFO", fifo=True, bound=True)) if granted else ()
     return (
-        Arm("ordinary", kinds=("sleep", "pipe") if granted else all_kinds),
+        Arm("ordinary"),
         Arm("bound", bound=True),
-        *with_priority,
+        *fifo_arms,
         Arm("kept awake", fifo=granted, bound=True, awake=True),
         Arm("shallow idle states", fifo=granted, bound=True, shallow=True),
-        Arm("exact timers", slack_ns=1, kinds=("sleep",)),
+        Arm("exact timers", slack_ns=1),
     )
 
 
-def rehearse(machine: Machine, seconds: float = SECONDS, tell: Told = lambda share: None) -> Rehearsal:
-    """Measure for about `seconds`, and `tell` the share that is done."""
-    began, load, stolen = time.perf_counter(), _load(), steal_ms()
-    with _no_collections():
-        with fifo(FIFO_PRIORITY) as granted:
-            pass
-        cores = look_at_cores(seconds * CORE_SHARE, granted == GRANTED)
-        host, device = pair_of(cores, machine)
-        tell(CORE_SHARE)
-        arms = arms_of(granted == GRANTED)
+def rehearse(seconds: float = SECONDS, report: Callable[[float], None] = lambda share: None) -> Rehearsal:
+    """Measure for about `seconds`, and `report` the share that is done."""
+    began, load, stolen, collecting = time.perf_counter(), _load(), steal_ms(), gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        with fifo(FIFO_PRIORITY) as answer:
+            granted = answer == "granted"
+        cores = look_at_cores(seconds * CORE_SHARE, granted)
+        host, device = pair_of(cores, isolated_cores(), core_siblings())
+        report(CORE_SHARE)
+        arms = arms_of(granted)
         turns = {arm.name: Turns() for arm in arms}
-        turn_s = seconds * (1 - CORE_SHARE - WORK_SHARE) / (ROUNDS * sum(len(arm.kinds) for arm in arms))
-        with ExitStack() as stack:
-            senders = {kind: stack.enter_context(closing(Sender(kind))) for kind in ("pipe", "terminal")}
-            for sender in senders.values():
-                sender.bind(device)
-            for number in range(ROUNDS):
-                for place, arm in enumerate(arms):
-                    _one_turn(arm, turns[arm.name], turn_s, senders, host)
-                    share = (number + (place + 1) / len(arms)) / ROUNDS
-                    tell(CORE_SHARE + (1 - CORE_SHARE - WORK_SHARE) * share)
-        touched = {"as it comes": first_touch(lock=False), "locked": first_touch(lock=True)}
-        work = _work(seconds * WORK_SHARE / 3, host)
-    tell(1.0)
+        steps = ROUNDS * len(arms)
+        for step in range(steps):
+            arm = arms[step % len(arms)]
+            _one_turn(arm, turns[arm.name], seconds * (1 - CORE_SHARE) / steps, host)
+            report(CORE_SHARE + (1 - CORE_SHARE) * (step + 1) / steps)
+    finally:
+        if collecting:
+            gc.enable()
     now = steal_ms()
-    return Rehearsal(
-        cores=cores,
-        host=host,
-        device=device,
-        fifo=granted,
-        arms=turns,
-        first_touch=touched,
-        work=work,
-        steal_ms=None if now is None or stolen is None else now - stolen,
-        load_1min=(load, _load()),
-        seconds=time.perf_counter() - began,
-    )
+    steal = None if now is None or stolen is None else now - stolen
+    return Rehearsal(cores, host, device, granted, turns, steal, (load, _load()), time.perf_counter() - began)
 
 
-def _one_turn(arm: Arm, turns: Turns, turn_s: float, senders: Mapping[str, Sender], host: int | None) -> None:
+def _one_turn(arm: Arm, turns: Turns, seconds: float, host: int | None) -> None:
+    if arm.bound and host is None:
+        turns.asked = {"core": "refused: this system does not bind threads to cores"}
+        return
     with ExitStack() as stack:
         asked: dict[str, Any] = {}
-        if arm.bound and host is None:
-            turns.asked = {"core": "refused: this system does not bind threads to cores"}
-            return
         if arm.awake:
             asked |= stack.enter_context(busy_core(host))  # binds, too
-        elif arm.bound:
-            assert host is not None
+        elif arm.bound and host is not None:
             asked["core"] = stack.enter_context(bound(host))
         if arm.fifo:
             asked["sched_fifo"] = stack.enter_context(fifo(FIFO_PRIORITY))
@@ -160,11 +132,41 @@ def _one_turn(arm: Arm, turns: Turns, turn_s: float, senders: Mapping[str, Sende
         if arm.slack_ns:
             asked["timer_slack"] = stack.enter_context(timer_slack(arm.slack_ns))
         turns.asked = asked
-        if any(str(answer).startswith("refused") for answer in asked.values()):
-            return
-        for kind in arm.kinds:
-            late = sleeps(turn_s) if kind == "sleep" else senders[kind].wakes(turn_s)
-            turns.late_ns.setdefault(kind, []).append(late)
+        if not any(str(answer).startswith("refused") for answer in asked.values()):
+            turns.rounds_ns.append(sleeps(seconds))
+
+
+def sleeps(seconds: float) -> list[int]:
+    """Sleep for random times until `seconds` are over; return by how many ns each sleep was too long."""
+    clock, dice, late = time.perf_counter_ns, random.Random(2), []
+    until = clock() + round(seconds * 1e9)
+    while clock() < until:
+        pause_s = dice.uniform(*PAUSE_S)
+        due = clock() + round(pause_s * 1e9)
+        time.sleep(pause_s)
+        late.append(clock() - due)
+    return late
+
+
+def clock_gaps(seconds: float) -> list[int]:
+    """Read the clock for `seconds`; return the gaps, ns, in which this thread did not run, beyond SPIN_GAP_NS."""
+    clock = time.perf_counter_ns
+    last, gaps = clock(), list[int]()
+    until = last + round(seconds * 1e9)
+    while last < until:
+        now = clock()
+        if now - last > SPIN_GAP_NS:
+            gaps.append(now - last)
+        last = now
+    return gaps
+
+
+def figures(late_ns: Sequence[int]) -> dict[str, float]:
+    """Return {samples, p50_us, p99_us, p999_us, max_us} of times in ns; no quantile of nothing."""
+    if not len(late_ns):
+        return {"samples": 0}
+    p50, p99, p999 = (float(value) / 1000 for value in np.quantile(late_ns, [0.5, 0.99, 0.999]))
+    return {"samples": len(late_ns), "p50_us": p50, "p99_us": p99, "p999_us": p999, "max_us": max(late_ns) / 1000}
 
 
 def look_at_cores(seconds: float, granted: bool) -> list[dict[str, Any]]:
@@ -173,8 +175,7 @@ def look_at_cores(seconds: float, granted: bool) -> list[dict[str, Any]]:
     `away` is for how long a thread that never waits did not run: as an ordinary one, since others had the core, too; at real-time priority
     for interrupts and the hypervisor alone.
     """
-    cores = usable_cores()[:MOST_CORES] if hasattr(os, "sched_getaffinity") else []
-    found = []
+    cores, found = usable_cores()[:MOST_CORES] if hasattr(os, "sched_getaffinity") else [], []
     for core in cores:
         each_s = seconds / len(cores) / 3
         with bound(core):
@@ -188,13 +189,19 @@ def look_at_cores(seconds: float, granted: bool) -> list[dict[str, Any]]:
 
 def _away(prefix: str, seconds: float) -> dict[str, float]:
     gaps = clock_gaps(seconds)
-    return {
-        f"{prefix}away_ms_per_s": sum(gaps) / 1e6 / seconds,
-        f"{prefix}largest_away_us": max(gaps, default=0) / 1000,
-    }
+    largest_us = max(gaps, default=0) / 1000
+    return {f"{prefix}away_ms_per_s": sum(gaps) / 1e6 / seconds, f"{prefix}largest_away_us": largest_us}
 
 
-def pair_of(cores: Sequence[dict[str, Any]], machine: Machine) -> tuple[int | None, int | None]:
+def core_siblings(root: Path = Path("/")) -> list[frozenset[int]]:
+    """Return the groups of cores that share one physical core."""
+    paths = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/topology/thread_siblings_list")
+    return sorted({cores_of(text) for path in paths if (text := first_line(path))}, key=sorted)
+
+
+def pair_of(
+    cores: Sequence[dict[str, Any]], isolated: Collection[int], siblings: Sequence[frozenset[int]]
+) -> tuple[int | None, int | None]:
     """Return a core for the host's loop and one for a device on the same computer, None where there are not enough.
 
     Isolated cores go first, then those on which something else ran for the shortest time, then those on which sleeps ended soonest. The
@@ -202,41 +209,15 @@ def pair_of(cores: Sequence[dict[str, Any]], machine: Machine) -> tuple[int | No
     """
 
     def cost(row: dict[str, Any]) -> tuple[bool, float, float]:
-        return row["core"] not in machine.isolated, row["away_ms_per_s"], row["sleep"].get("p99_us", 0.0)
+        return row["core"] not in isolated, row["away_ms_per_s"], row["sleep"].get("p99_us", 0.0)
 
     order = [row["core"] for row in sorted(cores, key=cost)]
     if not order:
         return None, None
     host = order[0]
-    shared = next((group for group in machine.siblings if host in group), frozenset({host}))
+    shared = next((group for group in siblings if host in group), frozenset({host}))
     others = sorted(order[1:], key=lambda core: core in shared)
     return host, others[0] if others else None
-
-
-def _work(seconds: float, host: int | None) -> dict[str, dict[str, float]]:
-    """The same calculation at once, after a pause, and after a pause in which the core was kept awake."""
-    with ExitStack() as stack:
-        if host is not None:
-            stack.enter_context(bound(host))
-        found = {
-            "without a pause": figures(work_times(seconds, 0.0)),
-            "after a pause": figures(work_times(seconds, PAUSE_S)),
-        }
-    with busy_core(host):
-        found["after a pause, kept awake"] = figures(work_times(seconds, PAUSE_S))
-    return found
-
-
-@contextmanager
-def _no_collections() -> Iterator[None]:
-    on = gc.isenabled()
-    gc.collect()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if on:
-            gc.enable()
 
 
 def _load() -> float:

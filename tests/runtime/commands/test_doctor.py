@@ -13,8 +13,8 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from pans.firmware_sim.ports.serve import open_sim
 from pans.runtime.cli import main
-from pans.runtime.commands import doctor_checks as doctor
-from pans.runtime.commands.doctor_checks import Finding, examine, port_state, serial_ports, udev_rule
+from pans.runtime.commands import doctor
+from pans.runtime.commands.doctor import Finding, examine, port_state, serial_ports, udev_rule
 from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.link.trace import TracedLink
 

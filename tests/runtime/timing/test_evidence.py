@@ -1,9 +1,12 @@
-"""Attribution: every cause from evidence made by hand, and evidence from real collections, waits and threads."""
+"""Why work was late: every cause from evidence made by hand, and evidence from real collections, waits and threads."""
 
 from __future__ import annotations
 
 import gc
+import os
 import re
+import sys
+import threading
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -23,22 +26,31 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording
-from pans.runtime.timing.attribution import CAUSES, QUIET_NS, Incidents, LateWork, judge, judge_gap
 from pans.runtime.timing.evidence import (
+    CAUSES,
     DISK,
     GC,
     IDLE,
     INFERENCE,
     OVERSLEPT,
+    QUIET_NS,
+    READ_EVERY_S,
+    Counters,
     Evidence,
     Facts,
+    Incidents,
+    LateWork,
+    Sample,
     Span,
     Stamped,
+    judge,
+    judge_gap,
     longest_pause_ns,
 )
 from pans.runtime.wire.tracker import Gap
 
 MS = 1_000_000
+linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the counters are those of Linux")
 
 
 def facts(
@@ -195,7 +207,7 @@ def test_a_run_that_is_always_late_gets_a_verdict_per_second() -> None:
         verdicts.append(incidents.verdict((number + 20) * MS))
     found = [one for one in verdicts if one is not None]
     assert len(found) == 4
-    assert sum(incidents.causes.values()) == sum(one.decisions for one in found)
+    assert sum(incidents.causes.values()) == sum(one.what["decisions"] for one in found)
 
 
 def test_a_real_collection_is_seen_with_its_length() -> None:
@@ -227,26 +239,6 @@ def test_waits_that_end_on_time_are_idle_and_others_overslept() -> None:
     )
 
 
-def test_samples_around_a_stretch_of_time_are_compared() -> None:
-    evidence = Evidence(time.perf_counter_ns, MS)
-    evidence.watch([None])
-    begin = time.perf_counter_ns()
-    deadline = time.thread_time_ns() + 30 * MS
-    while time.thread_time_ns() < deadline:
-        pass
-    end = time.perf_counter_ns()
-    patience = time.monotonic() + 10
-    known = evidence.facts(begin, begin, end, 0)  # nothing was read since: it reads, or the other thread is at it
-    while known.cpu_ns < 20 * MS and time.monotonic() < patience:
-        time.sleep(0.05)
-        known = evidence.facts(begin, begin, end, 0)
-    evidence.close()
-    assert known.cpu_ns >= 20 * MS  # the kernel counts in steps of some ms while a thread goes on
-    assert known.run_delay_ns >= 0
-    assert known.steal_ns >= 0
-    assert known.switches >= 0
-
-
 def test_memory_is_bounded() -> None:
     evidence = Evidence(lambda: 0, MS, virtual=True)
     for number in range(10_000):
@@ -255,6 +247,84 @@ def test_memory_is_bounded() -> None:
     known = evidence.facts(0, 0, 10**13, 0)
     assert len(known.spans) == 1024
     assert len(known.stamped) == 64
+
+
+@linux_only
+def test_a_reading_is_taken_apart() -> None:
+    counters = Counters(time.perf_counter_ns, [threading.get_native_id()])
+    counters.close()
+    tick_ns = 10**9 // os.sysconf("SC_CLK_TCK")
+    status = b"Name:\tx\nvoluntary_ctxt_switches:\t900\nnonvoluntary_ctxt_switches:\t12\n"
+    stat = b"cpu  1 2 3 4 5 6 7 120 9 10\ncpu0 1 2 3 4 5 6 7 99 9 10\n"
+    files = (status, stat, b"120 77 12\n", b"5 240 3\n")
+    assert counters._sample(0, 1, files) == (0, 1, 120, (77, 240), 120 * tick_ns, 12)
+    assert counters._sample(0, 1, (b"", b"", b"", b"damaged")) == (0, 1, 0, (0, 0), 0, 0)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 3)), min_size=1, max_size=8),
+    st.integers(-5, 60),
+    st.integers(0, 20),
+)
+def test_the_readings_around_a_stretch_are_the_nearest_that_enclose_it(
+    steps: list[tuple[int, int]], begin_ns: int, length_ns: int
+) -> None:
+    counters, now = Counters(time.perf_counter_ns, []), 0
+    counters._samples.clear()
+    for gap, length in steps:
+        counters._samples.append(Sample(now + gap, now + gap + length, now, (), 0, 0))
+        now += gap + length
+    samples = list(counters._samples)
+    before = [one for one in samples if one.ended_ns <= begin_ns]
+    after = [one for one in samples if one.began_ns >= begin_ns + length_ns]
+    wanted = before[-1] if before else samples[0], after[0] if after else samples[-1]
+    assert counters.around(begin_ns, begin_ns + length_ns) == wanted
+
+
+@pytest.mark.parametrize("threads", [[], [threading.get_native_id()]])
+def test_the_processor_time_of_a_stretch_is_read_and_the_thread_ends(threads: list[int]) -> None:
+    before = len(os.listdir("/proc/self/fd")) if sys.platform == "linux" else 0
+    counters = Counters(time.perf_counter_ns, threads)
+    began = time.perf_counter_ns()
+    until = time.thread_time_ns() + 30 * MS
+    while time.thread_time_ns() < until:
+        pass
+    ended, give_up = time.perf_counter_ns(), time.monotonic() + 100 * READ_EVERY_S
+    if not threads:
+        counters.read()
+    while counters.heard_ns < ended and time.monotonic() < give_up:
+        time.sleep(READ_EVERY_S / 5)
+    first, last = counters.around(began, ended)
+    counters.close()
+    counters.close()
+    assert last.cpu_ns - first.cpu_ns >= 20 * MS  # the kernel counts in steps of some ms while a thread goes on
+    assert counters._thread is None or not counters._thread.is_alive()
+    assert sys.platform != "linux" or len(os.listdir("/proc/self/fd")) == before
+    heard = counters.heard_ns
+    counters.read()
+    assert counters.heard_ns == heard  # closed
+
+
+def test_a_verdict_waits_for_a_reading_and_not_for_ever() -> None:
+    now = [0]
+    evidence = Evidence(lambda: now[0], MS)  # nobody reads: it is not watched
+    incidents = Incidents(evidence)
+    now[0] = 100 * MS
+    incidents.late(LateWork(1, 90 * MS, 91 * MS, 92 * MS, 0))
+    assert incidents.verdict(150 * MS) is None
+    now[0] = 300 * MS
+    assert incidents.verdict(now[0]) is None  # gathered: the loop has read for itself
+    assert incidents.verdict(now[0]) is not None  # judged
+    assert evidence.heard_since(300 * MS)
+
+
+def test_a_starved_thread_is_stood_in_for() -> None:
+    now = [0]
+    evidence = Evidence(lambda: now[0], MS)
+    for at, heard in ((200 * MS, False), (251 * MS, True)):
+        now[0] = at
+        evidence.read_if_stale(at)
+        assert evidence.heard_since(at) == heard
 
 
 @pytest.mark.parametrize(
