@@ -17,8 +17,8 @@ import numpy as np
 from matplotlib import pyplot
 
 from pans.runtime.bundle import load_bundle
+from pans.runtime.bundle.automaton import log_scores
 from pans.runtime.bundle.model import word_means
-from pans.runtime.bundle.walks import log_scores
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.detector import afterpulses_of
 from pans.runtime.instrument.click_law import object_transmission

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.automaton import log_scores, walk_nodes
 from pans.runtime.bundle.layers import read_layers, reference_scores
 from pans.runtime.bundle.model import Bundle, load_bundle
-from pans.runtime.bundle.walks import log_scores, walk_nodes
 from pans.runtime.decide.automaton import AutomatonDecider
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.mlp import ReferenceDecider, SparseDecider

@@ -11,9 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.automaton import Automaton, reachable_automaton
+from pans.runtime.bundle.automaton import Automaton, reachable_automaton, walk_nodes
 from pans.runtime.bundle.model import Bundle, Shown, make_bundle
-from pans.runtime.bundle.walks import walk_nodes
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.plan import ADAPTIVE_PATTERN, NO_SHOT, Plan
 from pans.runtime.core.still import Core

@@ -1,7 +1,7 @@
-"""An automaton: which pattern the next exposure shows, from the clicks so far, and what every node knows by then.
+"""An automaton: which pattern the next exposure shows, from the clicks so far, and the class probabilities of every node.
 
-Owns the facts, the checks that need nothing else (ranges, order, depth, reach) and stopping by confidence. Never shows a pattern and never
-decides. All checks are linear in the size, whatever the arrays hold; they raise ValueError with what, found and allowed.
+Arrays in, a checked `Automaton` out; also stopping by confidence or dose, and the plain NumPy walk that the kernels are compared with.
+All checks are linear in the size, whatever the arrays hold; they raise ValueError with what, found and allowed.
 
 A *node* is a state or a leaf: state s is node s, leaf l is node `n_states` + l. A *walk* begins in state 0; one exposure per state, until a
 leaf is reached. With c channels a state shows c patterns at once, one for each, and an exposure has 2**c outcomes: bit k of the outcome is
@@ -29,6 +29,8 @@ CONFIDENCE_RANGE = Range(1e-6, 1.0)
 DOSE_PARTS = 64  # of the cap, to which the doses of walks that meet are told apart
 DOSE_ROUNDING = 1e-9  # of a cap: sums of light come in another order here than elsewhere
 DOSE_RANGE, STATES_RANGE = Range(1e-9, 1e15), Range(1, STATES_MAX, whole=True)
+GOLDEN_NODES = 512  # nodes, evenly spread, to which a golden walk leads
+LEAST_POSTERIOR = 1e-30  # of a score, so that it is finite: scores are log posteriors
 _EDGES_AT_ONCE = 1 << 20  # explored together, so that memory stays small
 _UNREACHED = 0xFFFF  # as a depth: above SLOTS_MAX
 
@@ -48,15 +50,11 @@ class Automaton:
     (2, 2, 2, [0, 1])
     """
 
-    pattern: NDArray[
-        np.uint16
-    ]  # (states,) row of Bundle.pattern_levels that the state shows, of several channels the first of as
-    # many rows in turn; states may share them
+    # (states,) row of Bundle.pattern_levels that the state shows, of several channels the first of as many rows; states may share them
+    pattern: NDArray[np.uint16]
     dwell: NDArray[np.uint16]  # (states,) the light is on for dwell / dwell_steps of the exposure, 1..dwell_steps
     dwell_steps: int  # 1: one time for all
-    successors: NDArray[
-        np.uint32
-    ]  # (states, outcomes): outcome 0 no click, 1 click; 2**c outcomes of c channels at once
+    successors: NDArray[np.uint32]  # (states, outcomes): outcome 0 no click, 1 click; 2**c outcomes of c channels
     posteriors: NDArray[np.float32]  # (states + leaves, classes) class probabilities in each node; rows sum to 1
     counts: bool = False  # outcomes are photon numbers of one detector, the last one "this many or more"
     depth: NDArray[np.uint16] = field(init=False)  # (states,) exposures before the state
@@ -156,6 +154,85 @@ def stopped(automaton: Automaton, confidence: float) -> Automaton:
         np.concatenate([automaton.posteriors, automaton.posteriors[:n_states][sure]]),
         automaton.counts,
     )
+
+
+def walk_nodes(automaton: Automaton, words: NDArray[Any]) -> NDArray[np.uint32]:
+    """Return the node in each slot, uint32 (n, n_slots + 1), of click words of zeros and ones (n, n_bits); the leaf is repeated to the end.
+
+    Bit t * channels + k is the click of channel k in slot t; where photons are counted, number t is theirs. What follows the leaf does
+    not matter.
+    """
+    n_states, channels = automaton.n_states, automaton.channels
+    bits = words.astype(np.uint32).reshape(len(words), automaton.n_slots, channels)
+    outcomes = (bits << np.arange(channels, dtype=np.uint32)).sum(axis=2, dtype=np.uint32)
+    nodes = np.zeros((len(words), automaton.n_slots + 1), np.uint32)
+    for slot in range(automaton.n_slots):
+        here = nodes[:, slot]
+        going = here < n_states
+        nodes[:, slot + 1] = here
+        nodes[going, slot + 1] = automaton.successors[here[going], outcomes[going, slot]]
+    return nodes
+
+
+def words_to(automaton: Automaton, nodes: NDArray[Any]) -> NDArray[np.float32]:
+    """Return one click word per node of `nodes` that leads to it, float32 (n, n_bits), zeros beyond."""
+    n_nodes, outcomes = len(automaton.posteriors), automaton.n_outcomes
+    edge = np.full(n_nodes, -1, np.int64)
+    edge[automaton.successors.reshape(-1)] = np.arange(automaton.successors.size)
+    bits = np.zeros((len(nodes), automaton.n_slots, automaton.channels), np.float32)
+    row, here = np.arange(len(nodes)), np.asarray(nodes, np.int64)
+    while (moving := here > 0).any():
+        row, here = row[moving], here[moving]
+        state, outcome = np.divmod(edge[here], outcomes)
+        slot = automaton.depth[state].astype(np.int64)
+        bits[row, slot] = (
+            outcome[:, None] if automaton.counts else outcome[:, None] >> np.arange(automaton.channels) & 1
+        )
+        here = state
+    return bits.reshape(len(nodes), automaton.n_bits)
+
+
+def golden_nodes(automaton: Automaton) -> NDArray[np.int64]:
+    """Return nodes that golden walks lead to: at most `GOLDEN_NODES`, evenly spread, the last leaf among them."""
+    last = len(automaton.posteriors) - 1
+    return np.unique(np.linspace(1, last, min(last, GOLDEN_NODES)).round().astype(np.int64))
+
+
+def log_scores(posteriors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return scores of posteriors (n, classes), float32: their logarithms, at least log(1e-30)."""
+    return np.log(np.maximum(posteriors, np.float32(LEAST_POSTERIOR)))
+
+
+def walk_difference(automaton: Automaton, words: NDArray[Any], walks: NDArray[Any]) -> str:
+    """Return what differs between golden walks (n, n_slots + 1) and the automaton's, or "" if nothing does."""
+    found = walk_nodes(automaton, words)
+    if found.shape != walks.shape:
+        return f"golden walks of shape {walks.shape}, expected {found.shape}"
+    differs = (found != walks).any(axis=1)
+    if not differs.any():
+        return ""
+    row = int(differs.argmax())
+    slot = int((found[row] != walks[row]).argmax())
+    return (
+        f"golden walk {row} is at node {walks[row, slot]} after {slot} exposures, the automaton at {found[row, slot]}"
+    )
+
+
+def greatest_light(automaton: Automaton, light: NDArray[np.float64]) -> float:
+    """Return the most light that one walk can take, of the light of each state, float64 (states,)."""
+    order = np.argsort(automaton.depth, kind="stable")
+    ends = np.searchsorted(automaton.depth[order], np.arange(automaton.n_slots + 1))
+    most = np.zeros(len(automaton.posteriors))
+    for slot in range(automaton.n_slots - 1, -1, -1):
+        states = order[ends[slot] : ends[slot + 1]]
+        most[states] = light[states] + most[automaton.successors[states]].max(axis=1)
+    return float(most[0])
+
+
+def shortest_walk(automaton: Automaton) -> int:
+    """Return the exposures of the shortest walk: one more than the depth of the first state with a leaf behind it."""
+    ends = (automaton.successors >= automaton.n_states).any(axis=1)
+    return int(automaton.depth[ends].min()) + 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,6 @@
-"""What a bundle is, and what makes one impossible: facts, limits, consistency, golden vectors.
+"""What a bundle is, and what makes one impossible: facts, limits, consistency, golden vectors, expected figures.
 
-Owns the checks that a made and a read bundle share; never touches a file. The checks raise ValueError with what, found and
-allowed, for the caller to say where.
+The checks are those of made and of read bundles; they raise ValueError with what, found and allowed, for the caller to say where.
 """
 
 from __future__ import annotations
@@ -19,13 +18,23 @@ from pans.runtime.grey_png import levels_png
 from pans.runtime.html_card import html_card
 from pans.runtime.ranges import Range, demand
 
-from .automaton import COUNT_OUTCOMES, Automaton
+from .automaton import COUNT_OUTCOMES, Automaton, greatest_light, log_scores, walk_difference
 from .head import HEAD_MAX_BYTES
 from .layers import STEP_MAX, WEIGHT_MAX, Int8Head
 from .onnx_check import check_head
 from .optics import LIGHT_RANGE, Analyser, check_analyser
-from .walks import check_expected, check_words, greatest_light, log_scores, walk_difference
 
+_TEXTS = ("profile", "task", "split")
+EXPECTED_RANGES = {
+    "objects": Range(1, 1 << 53, whole=True),
+    "accuracy": Range(0.0, 1.0),
+    "clicks": Range(0.0, 8 * 1024),
+    "photons": Range(0.0, 1e30),
+    "illumination": Range(0.0, 1e30),
+    "exposures": Range(1.0, 1024),
+}
+EXPECTED_KEYS = (*_TEXTS, *EXPECTED_RANGES)
+EXPECTED_TOLERANCE = 1e-6  # of an exact figure, times max(1, |figure|): the sums are float64
 SHOWN_MAX, SHOWN_PIXELS_MAX = 10, 1 << 14  # patterns and their size in a notebook
 ENCODERS = ("active", "coherent", "incoherent", "automaton")  # coherent and incoherent are passive: nothing is shown
 PATTERNS_MAX = 65_535  # of an automaton
@@ -140,6 +149,11 @@ class Bundle:
             raise ValueError(f"{self.name} has no automaton")
         return self.light_of(self.automaton)
 
+    def light_of(self, automaton: Automaton) -> NDArray[np.float64]:
+        """Return what each state of an `automaton` over these patterns shows, as `state_light`."""
+        whole = self.pattern_levels.sum(axis=1, dtype=np.uint64).astype(np.float64) * self.photons_per_level
+        return np.asarray(whole[automaton.rows].sum(axis=1) * (automaton.dwell / automaton.dwell_steps))
+
     def __repr__(self) -> str:
         """Return the facts in a line."""
         rows, columns = self.image_shape
@@ -169,11 +183,6 @@ class Bundle:
         pictures = [levels_png(levels.reshape(self.image_shape), self.levels) for levels in shown]
         return html_card(f"Bundle {self.name}", rows, [(f"pattern {at}", one) for at, one in enumerate(pictures)])
 
-    def light_of(self, automaton: Automaton) -> NDArray[np.float64]:
-        """Return what each state of an `automaton` over these patterns shows, as `state_light`."""
-        whole = self.pattern_levels.sum(axis=1, dtype=np.uint64).astype(np.float64) * self.photons_per_level
-        return np.asarray(whole[automaton.rows].sum(axis=1) * (automaton.dwell / automaton.dwell_steps))
-
 
 def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32], *, decides: bool = True) -> str:
     """Return what differs between scores (g, outputs) and the golden ones, or "" if nothing does.
@@ -184,32 +193,22 @@ def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32], *,
     if found.shape != golden.shape:
         return f"scores of shape {found.shape}, expected {golden.shape}"
     step = max(1, _COMPARE_VALUES // max(1, golden.shape[1]))  # rows at once, so that float64 copies stay small
-    pieces = [slice(start, start + step) for start in range(0, len(golden), step)]
-    wrong = (_score_violation(found[rows], golden[rows], rows.start) for rows in pieces)
-    decided = (_decision_violation(found[rows], golden[rows], rows.start) for rows in pieces if decides)
-    return next((text for texts in (wrong, decided) for text in texts if text), "")
-
-
-def _score_violation(found: NDArray[np.float32], golden: NDArray[np.float32], first: int) -> str:
-    wanted = golden.astype(np.float64)
-    error = np.abs(found.astype(np.float64) - wanted) / np.maximum(1.0, np.abs(wanted))
-    if np.all(error <= GOLDEN_TOLERANCE):  # not of a NaN
-        return ""
-    row = int(np.argmax(np.where(np.isfinite(error), error, np.inf).max(axis=1)))
-    off = f"off by {float(error[row].max()):.3g} of max(1, |score|), allowed {GOLDEN_TOLERANCE:g}"
-    return f"the scores of vector {first + row} are {off}"
-
-
-def _decision_violation(found: NDArray[np.float32], golden: NDArray[np.float32], first: int) -> str:
-    wanted = golden.astype(np.float64)
-    ranked = np.sort(wanted, axis=1)
-    scale = np.maximum(1.0, np.abs(wanted).max(axis=1))
-    clear = ranked[:, -1] - ranked[:, -2] > GOLDEN_TOLERANCE * scale
-    differs = clear & (found.argmax(axis=1) != golden.argmax(axis=1))
-    if not differs.any():
-        return ""
-    row = int(np.argmax(differs))
-    return f"the decision for vector {first + row} is {int(found[row].argmax())}, expected {int(golden[row].argmax())}"
+    for first in range(0, len(golden), step):
+        here, wanted = found[first : first + step], golden[first : first + step].astype(np.float64)
+        error = (np.abs(here.astype(np.float64) - wanted) / np.maximum(1.0, np.abs(wanted))).max(axis=1)
+        row = int(np.argmax(np.where(np.isfinite(error), error, np.inf)))
+        if not error[row] <= GOLDEN_TOLERANCE:  # a NaN too
+            off = f"off by {float(error[row]):.3g} of max(1, |score|), allowed {GOLDEN_TOLERANCE:g}"
+            return f"the scores of vector {first + row} are {off}"
+        if decides:
+            ranked = np.sort(wanted, axis=1)
+            clear = ranked[:, -1] - ranked[:, -2] > GOLDEN_TOLERANCE * np.maximum(1.0, np.abs(wanted).max(axis=1))
+            differs = clear & (here.argmax(axis=1) != wanted.argmax(axis=1))
+            if differs.any():
+                row = int(np.argmax(differs))
+                ends = f"{int(here[row].argmax())}, expected {int(wanted[row].argmax())}"
+                return f"the decision for vector {first + row} is {ends}"
+    return ""
 
 
 def words_among(means: NDArray[np.float32], outcomes: int = 2) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
@@ -249,27 +248,24 @@ def _check_facts(bundle: Bundle) -> None:
     demand(not counted, f"{bundle.outcomes} outcomes per exposure, allowed where fixed patterns decide among classes")
     shown = bundle.encoder in ("active", "automaton")
     demand(shown == (bundle.analyser is None), f"{bundle.encoder} optics, and an analyser or none")
-    decides_by_itself = bundle.automaton is not None
-    demand((bundle.encoder == "automaton") == decides_by_itself, f"encoder {bundle.encoder}, and an automaton or none")
-    if bundle.analyser is not None:
-        demand(
-            bundle.levels == 0 and bundle.photons_per_level == 0,
-            "a passive sensor has no projector: levels and photons_per_level are 0",
-        )
-        return
-    for name, allowed in RANGES.items():
-        allowed.checked(getattr(bundle, name), name)
+    walks = bundle.automaton is not None
+    demand((bundle.encoder == "automaton") == walks, f"encoder {bundle.encoder}, and an automaton or none")
+    if shown:
+        for name, allowed in RANGES.items():
+            allowed.checked(getattr(bundle, name), name)
+    else:
+        dark = bundle.levels == 0 and bundle.photons_per_level == 0
+        demand(dark, "a passive sensor has no projector: levels and photons_per_level are 0")
 
 
 def _check_outputs(bundle: Bundle) -> None:
     """Classes, or a picture: one of them."""
     n_classes, picture = len(bundle.classes), bundle.picture_shape
     if picture is not None:
-        demand(n_classes == 0, f"a picture and {n_classes} classes, allowed: either")
         fits = len(picture) == 2 and min(picture) > 0 and math.prod(picture) <= OUTPUTS_MAX
-        demand(
-            bundle.table is None and bundle.int8_head is None, "a picture from a table or an int8 head, allowed: a head"
-        )
+        demand(n_classes == 0, f"a picture and {n_classes} classes, allowed: either")
+        by_head = bundle.table is None and bundle.int8_head is None
+        demand(by_head, "a picture from a table or an int8 head, allowed: a head")
         demand(fits, f"picture_shape is {picture}, allowed: height and width, at most {OUTPUTS_MAX} pixels")
         return
     demand(2 <= n_classes <= CLASSES_MAX, f"{n_classes} classes, allowed: 2 to {CLASSES_MAX}")
@@ -301,41 +297,40 @@ def check_bundle(bundle: Bundle) -> None:
 
 
 def _check_back_ends(bundle: Bundle) -> None:
-    d_f = bundle.n_features
     if bundle.automaton is not None:
         _check_automaton(bundle, bundle.automaton)
         return
-    demand(
-        bundle.golden_walks is None and bundle.expected is None, "golden walks or expected figures, and no automaton"
-    )
-    demand(
-        bundle.head_onnx is not None or bundle.table is not None, "neither a head nor a table, allowed: either or both"
-    )
-    if bundle.head_onnx is not None:
-        size = len(bundle.head_onnx)
-        demand(0 < size <= HEAD_MAX_BYTES, f"the head has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
-        _check_cost(bundle.head_onnx, "ONNX head", bundle)
-    if bundle.int8_onnx is not None:
-        size = len(bundle.int8_onnx)
-        demand(0 < size <= HEAD_MAX_BYTES, f"the int8 model has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
-        _check_cost(bundle.int8_onnx, "int8 model", bundle)
+    walks = bundle.golden_walks is not None or bundle.expected is not None
+    demand(not walks, "golden walks or expected figures, and no automaton")
+    decides = bundle.head_onnx is not None or bundle.table is not None
+    demand(decides, "neither a head nor a table, allowed: either or both")
+    for model, what in ((bundle.head_onnx, "head"), (bundle.int8_onnx, "int8 model")):
+        if model is not None:
+            demand(
+                0 < len(model) <= HEAD_MAX_BYTES, f"the {what} has {len(model)} bytes, allowed: 1 to {HEAD_MAX_BYTES}"
+            )
+            _check_cost(model, what, bundle)
     if bundle.int8_head is not None:
-        _check_int8(bundle.int8_head, d_f, bundle.n_outputs)
+        _check_int8(bundle.int8_head, bundle.n_features, bundle.n_outputs)
     if bundle.table is not None:
-        check_table_shape(bundle.table.shape, d_f, bundle.n_outputs, bundle.outcomes)
+        check_table_shape(bundle.table.shape, bundle.n_features, bundle.n_outputs, bundle.outcomes)
         demand(_finite(bundle.table), "the table holds scores that are not finite")
 
 
+def check_pattern_cells(patterns: int, pixels: int) -> None:
+    """Raise ValueError for more patterns of an automaton than memory should hold."""
+    demand(patterns <= PATTERNS_MAX, f"{patterns} patterns of an automaton, allowed: 1 to {PATTERNS_MAX}")
+    cells = patterns * pixels <= PATTERN_CELLS_MAX
+    demand(cells, f"{patterns} patterns of {pixels} pixels, allowed: {PATTERN_CELLS_MAX} in all")
+
+
 def _check_automaton(bundle: Bundle, automaton: Automaton) -> None:
-    """What binds an automaton to its patterns, its classes and its golden walks."""
+    """What binds an automaton to its patterns and its classes."""
     others = (bundle.head_onnx, bundle.table, bundle.int8_head, bundle.int8_onnx, bundle.picture_shape)
     demand(all(part is None for part in others), "an automaton beside a head, a table or a picture, allowed: either")
-    patterns, pixels = bundle.pattern_levels.shape
-    demand(patterns <= PATTERNS_MAX, f"{patterns} patterns of an automaton, allowed: 1 to {PATTERNS_MAX}")
-    cells = patterns * pixels
-    demand(cells <= PATTERN_CELLS_MAX, f"{patterns} patterns of {pixels} pixels, allowed: {PATTERN_CELLS_MAX} in all")
+    check_pattern_cells(*bundle.pattern_levels.shape)
     top = int(automaton.pattern.max()) + automaton.channels - 1
-    demand(top < patterns, f"a state shows pattern {top}, allowed: 0 to {patterns - 1}")
+    demand(top < bundle.n_patterns, f"a state shows pattern {top}, allowed: 0 to {bundle.n_patterns - 1}")
     classes = automaton.n_classes
     demand(classes == bundle.n_classes, f"posteriors of {classes} classes, the bundle has {bundle.n_classes}")
     if bundle.expected is not None:
@@ -343,14 +338,14 @@ def _check_automaton(bundle: Bundle, automaton: Automaton) -> None:
 
 
 def _check_golden_walks(automaton: Automaton, bundle: Bundle) -> None:
-    words, walks = bundle.golden_means, bundle.golden_walks
-    check_words(automaton, words, "golden words")
+    words, walks, most = bundle.golden_means, bundle.golden_walks, automaton.largest
+    fits = bool(((words >= 0) & (words <= most) & (words == np.floor(words))).all())
+    demand(fits, f"golden words hold other numbers than whole ones from 0 to {most}")
     if walks is None:
         raise ValueError("an automaton without golden walks")
     difference = walk_difference(automaton, words, walks)
     demand(not difference, difference)
-    same = log_scores(automaton.posteriors[walks[:, -1]])
-    difference = golden_violation(same, bundle.golden_scores)
+    difference = golden_violation(log_scores(automaton.posteriors[walks[:, -1]]), bundle.golden_scores)
     demand(not difference, f"the leaves do not answer the golden words: {difference}")
 
 
@@ -405,3 +400,28 @@ def _check_golden(bundle: Bundle) -> None:
         single, rows = words_among(means, bundle.outcomes)
         difference = golden_violation(bundle.table[rows], scores[single])
         demand(not difference, f"the table does not answer the golden vectors: {difference}")
+
+
+def check_expected(expected: Mapping[str, Any], automaton: Automaton) -> None:
+    """Raise ValueError for figures that are not in range or that no walk of `automaton` can have."""
+    keys = f"expected has the keys {ascii(sorted(expected))[:200]}, needed: {EXPECTED_KEYS}"
+    demand(set(expected) == set(EXPECTED_KEYS), keys)
+    for name in _TEXTS:
+        _check_text(expected[name], f"expected.{name}")
+    for name, allowed in EXPECTED_RANGES.items():
+        allowed.checked(expected[name], f"expected.{name}")
+    exposures, clicks, slack = float(expected["exposures"]), float(expected["clicks"]), 1 + 1e-9  # rounded sums
+    slots, most = automaton.n_slots, exposures * automaton.largest * automaton.channels
+    demand(exposures <= slots * slack, f"expected.exposures is {exposures:g} of {slots} at most")
+    demand(clicks <= most * slack, f"expected.clicks is {clicks:g} of {exposures:g} exposures")
+
+
+def expected_differences(kept: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
+    """Return which figures of a bundle's `expected` are others now; those of other conditions cannot be compared, and give none."""
+    if any(kept[name] != found[name] for name in EXPECTED_KEYS[:4]):
+        return []
+    return [
+        f"expected {name} is {kept[name]:.9g} in the bundle, {found[name]:.9g} here"
+        for name in EXPECTED_KEYS[4:]
+        if not math.isclose(kept[name], found[name], rel_tol=EXPECTED_TOLERANCE, abs_tol=EXPECTED_TOLERANCE)
+    ]

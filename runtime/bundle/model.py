@@ -24,7 +24,7 @@ from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import demand
 
-from .automaton import Automaton
+from .automaton import Automaton, golden_nodes, log_scores, walk_nodes, words_to
 from .facts import (
     GOLDEN_MEANS_MAX,
     GOLDEN_SCORES_MAX,
@@ -33,6 +33,7 @@ from .facts import (
     RANGES,
     Bundle,
     check_bundle,
+    check_expected,
     check_table_shape,
     frozen,
     golden_violation,
@@ -42,7 +43,6 @@ from .format import bundle_bytes, parse_bundle, read_bundle
 from .head import OnnxHead, open_head
 from .layers import Int8Head
 from .optics import Analyser
-from .walks import check_expected, golden_nodes, log_scores, walk_nodes, words_to
 
 __all__ = [
     "BackEnd",

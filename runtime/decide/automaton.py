@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.bundle.automaton import Automaton, DoseCap, capped, stopped
+from pans.runtime.bundle.automaton import Automaton, DoseCap, capped, log_scores, stopped
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.bundle.walks import log_scores
 from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
 from pans.runtime.wire.inner import outer
 

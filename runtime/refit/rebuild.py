@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle import Automaton, BackEnd, Bundle, Shown, make_bundle
+from pans.runtime.bundle.automaton import log_scores, walk_nodes
 from pans.runtime.bundle.layers import Layer, quantise_head, read_layers, reference_scores
 from pans.runtime.bundle.model import word_means
-from pans.runtime.bundle.walks import log_scores, walk_nodes
 from pans.runtime.errors import UsageError
 
 from .choosing import Kind, Refitted, choose

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import Automaton
+from pans.runtime.bundle.automaton import Automaton, shortest_walk
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.bundle.optics import Analyser, amplification
-from pans.runtime.bundle.walks import shortest_walk
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile

@@ -1,4 +1,4 @@
-"""Automata in bundles of versions 3, 4 and 6, read as a lab would from docs/reference/formats.md ("Automata, versions 3, 4 and 6") alone.
+"""Automata in bundles, read as a lab would from docs/reference/formats.md ("Automata") alone.
 
 Owns the meaning of the parts: patterns out of bits, walks, the golden ones recomputed, stopping by a confidence. It owns the decisions of
 runs that followed one, too ("Walks" and "Photon numbers" there); all else of a run is lab_decisions.py's. Plain Python where the package
@@ -33,7 +33,7 @@ class Automaton:
     posteriors: NDArray[np.float32]
     channels: int
     slots: int
-    counts: bool = False  # version 4: a number of a click word is the outcome of a slot
+    counts: bool = False  # a number of a click word is the outcome of a slot
 
     def walk(self, word: Sequence[int], confidence: float = 0.0) -> list[int]:
         """Return the nodes of a click word's walk, from state 0 to the node that decides."""
@@ -54,7 +54,7 @@ class Automaton:
 
 
 def read_automaton(bundle: Bundle) -> Automaton:
-    """Return the automaton of a bundle of version 3, 4 or 6, every rule of the document checked."""
+    """Return the automaton of a bundle, every rule of the document checked."""
     header, parts = bundle.header, bundle.parts
     pixels = header["image_shape"][0] * header["image_shape"][1]
     steps = header["automaton"]["dwell_steps"]

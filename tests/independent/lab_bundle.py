@@ -41,15 +41,9 @@ AUTOMATON_DTYPES = {
     "golden_walks": "<u4",
     "golden_posteriors": "<f4",
 }
-NEW_KEYS: dict[int, set[str]] = {
-    1: set(),
-    2: {"sensor", "picture_shape"},
-    3: {"automaton", "expected"},
-    4: {"automaton", "expected"},
-    5: {"outcomes"},
-    6: {"automaton", "expected"},
-}
-OF_AUTOMATA = (3, 4, 6)
+VERSIONS = (1, 2, 3, 4, 5, 6)
+NEW_KEYS = {"sensor", "picture_shape", "outcomes"}
+AUTOMATON_KEYS = {"automaton", "expected"}
 KEYS = {"name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"}
 
 
@@ -124,17 +118,15 @@ def read_bundle(data: bytes) -> Bundle:
     """Return the bundle in `data`, every checksum checked."""
     demand(data[:8] == b"PANSBNDL" and 48 <= len(data) <= 64 * MIB, "no bundle")
     version, length = struct.unpack_from("<II", data, 8)
-    demand(version in NEW_KEYS and length <= MIB and 16 + length + 32 <= len(data), "version or header length")
+    demand(version in VERSIONS and length <= MIB and 16 + length + 32 <= len(data), "version or header length")
     demand(hashlib.sha256(data[:-32]).digest() == data[-32:], "the closing SHA-256")
     header = strict_json(data[16 : 16 + length])
+    walks = "automaton" in header
     more = set(header) - KEYS
-    demand(set(header) >= KEYS and more <= NEW_KEYS[version] and bool(more) == (version > 1), "header keys")
-    demand(("automaton" in more) == (version in OF_AUTOMATA), "an automaton")
-    if version in OF_AUTOMATA:
-        demand(isinstance(header["automaton"], dict), "an automaton that is no object")
-        demand(("outcomes" in header["automaton"]) == (version == 4), "an automaton of photon numbers is version 4")
-        demand(("channels" in header["automaton"]) == (version == 6), "an automaton of several channels is version 6")
-    dtypes = AUTOMATON_DTYPES if version in OF_AUTOMATA else DTYPES
+    demand(set(header) >= KEYS and more <= (AUTOMATON_KEYS if walks else NEW_KEYS), "header keys")
+    demand(walks == (header["encoder"] == "automaton"), "an encoder")
+    demand(not walks or isinstance(header["automaton"], dict), "an automaton that is no object")
+    dtypes = AUTOMATON_DTYPES if walks else DTYPES
     parts: dict[str, NDArray[Any]] = {}
     begin, offset = 16 + length, 0
     for row in header["parts"]:
@@ -151,7 +143,7 @@ def read_bundle(data: bytes) -> Bundle:
     if "pattern_levels" in parts:
         levels = parts["pattern_levels"]
         demand(levels.shape[1] == height * width and bool((levels < header["levels"]).all()), "patterns")
-    if version == 5:
+    if "outcomes" in header:
         _check_numbers(header, parts)
     return Bundle(header, parts, hashlib.sha256(data).hexdigest())
 

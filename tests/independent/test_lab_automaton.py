@@ -23,7 +23,7 @@ from pans.runtime.decide.automaton import AutomatonDecider
 from pans.runtime.errors import DamagedFileError
 
 AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=12), random_automaton(2, slots=5, channels=2)]
-COUNTED = [random_automaton(3, slots=6, outcomes=3), random_automaton(4, slots=4, outcomes=16)]  # version 4
+COUNTED = [random_automaton(3, slots=6, outcomes=3), random_automaton(4, slots=4, outcomes=16)]  # photon numbers
 
 
 @pytest.mark.parametrize("levels", [2, 100, 1000])
@@ -111,7 +111,7 @@ FAULTS = "loss:0.02,duplicate:0.02,flip:0.01"
     ],
 )
 def test_walks_come_out_the_same(tmp_path: Path, drive: str, outcomes: int, faults: str) -> None:
-    """A run with an automaton, of clicks (version 4), of photon numbers and (below 0) of several channels (6): every row, bit for bit."""
+    """A run with an automaton, of clicks, of photon numbers and (below 0) of several channels: every row, bit for bit."""
     more_of_it = {"channels": -outcomes} if outcomes < 0 else {"outcomes": outcomes}
     made = automaton_bundle(random_automaton(7, slots=6, **more_of_it), levels=2, photons_per_level=0.25)
     write_bundle(made, tmp_path / "walk.pans")

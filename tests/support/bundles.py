@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import struct
 from typing import Any
 
 import numpy as np
@@ -71,3 +74,13 @@ def automaton_bundle(automaton: Automaton, photons: float = 1.0, **facts: Any) -
     given = toy | facts
     shown = Shown(**{name: given.pop(name) for name in Shown.__slots__})
     return make_bundle(optics=shown, automaton=automaton, **given)
+
+
+def resealed(data: bytes, change: Any) -> bytes:
+    """The file with its header changed by `change(header dict)` and the closing checksum made to fit again."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    header = json.loads(data[16 : 16 + length])
+    change(header)
+    text = json.dumps(header).encode()
+    body = data[:12] + struct.pack("<I", len(text)) + text + data[16 + length : -32]
+    return body + hashlib.sha256(body).digest()

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton, stopped
+from pans.runtime.bundle.facts import expected_differences as expected_differences
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.bundle.walks import expected_differences as expected_differences
 from pans.runtime.decide.automaton import leaf_verdicts
 from pans.runtime.decide.expectation import ExpectedWalk, expected_walk, pattern_light
 from pans.runtime.decide.verdict import NO_LABEL

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import reachable_automaton
+from pans.runtime.bundle.automaton import log_scores, reachable_automaton, walk_nodes
 from pans.runtime.bundle.model import Bundle, Shown, load_bundle, make_bundle, with_expected, write_bundle
-from pans.runtime.bundle.walks import log_scores, walk_nodes
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import PansError

@@ -230,15 +230,18 @@ def hostile_heads() -> dict[str, tuple[bytes, str]]:
             head([helper.make_node("ArgMax", ["x"], ["y"], axis=1)], [x], [tensor("y", ["n", 1], "INT64")]),
             "tensor",
         ),
-        "two inputs": (head([helper.make_node("Add", ["x", "z"], ["y"])], [x, tensor("z", ["n", 2])], [y]), "2 inputs"),
-        "rows mixed": (head([flat], [x], [tensor("y", None)]), "ReduceSum works along the rows"),
+        "two inputs": (
+            head([helper.make_node("Add", ["x", "z"], ["y"])], [x, tensor("z", ["n", 2])], [y]),
+            "one input",
+        ),
+        "rows mixed": (head([flat], [x], [tensor("y", None)]), "ReduceSum gives the shape"),
         "weights elsewhere": (
             head([helper.make_node("MatMul", ["x", "w"], ["y"])], [x], [y], [outside]),
             "another file",
         ),
         "a name that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"means", b"\xf0eans"), "ONNX head"),
         "an initial that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"n", b"\xad"), "ONNX head"),
-        "an operator that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"Gemm", b"\xf0emm"), "not UTF-8"),
+        "an operator that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"Gemm", b"\xf0emm"), "utf-8"),
         "unknown operator": (
             head([helper.make_node("Teleport", ["x"], ["y"])], [x], [y]),
             "operator 'Teleport', allowed: Abs",

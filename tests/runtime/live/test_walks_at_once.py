@@ -14,8 +14,8 @@ from automata import automaton_bundle, random_automaton
 from commands import json_of
 
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
+from pans.runtime.bundle.automaton import walk_nodes
 from pans.runtime.bundle.model import Bundle, write_bundle
-from pans.runtime.bundle.walks import walk_nodes
 from pans.runtime.cli import main
 from pans.runtime.core.plan import build_plan
 from pans.runtime.decide.expectation import expected_walk

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pans.firmware_sim.testing import small_automaton_bundle
-from pans.runtime.bundle.walks import walk_nodes
+from pans.runtime.bundle.automaton import walk_nodes
 from pans.runtime.refit.choosing import choose, kinds_for
 from pans.runtime.refit.clicks import Labelled, Light
 from pans.runtime.refit.evidence import log_softmax
