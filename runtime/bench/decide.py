@@ -21,9 +21,9 @@ from pans.runtime.bundle.layers import read_layers, reference_scores
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.decide.automaton import AutomatonDecider
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.decide.mlp import ReferenceDecider, SparseDecider
+from pans.runtime.decide.mlp import SparseDecider, bundle_layers
 from pans.runtime.decide.onnx import PictureDecider
-from pans.runtime.decide.table import TableDecider
+from pans.runtime.decide.table import word_table
 from pans.runtime.decide.verdict import Decider, checked_counts
 from pans.runtime.errors import UsageError, as_usage_error
 
@@ -109,7 +109,7 @@ def picture_row(bundle: Bundle, n: int) -> Row:
 def bundle_rows(bundle: Bundle, inputs: Path | None, n: int) -> list[Row]:
     """Return the rows of every back end that the bundle can have, then the limits beside them."""
     counts, shots, labels = _inputs(bundle, inputs, n)
-    wanted = ReferenceDecider(bundle).scores_wide(counts, shots)
+    wanted = reference_scores(bundle_layers(bundle), counts / shots)
     rows: list[Row] = []
     for name in BACKENDS:
         with suppress(UsageError):  # a back end that this bundle, or these shots, cannot have
@@ -194,8 +194,6 @@ def _torch_rows(bundle: Bundle, counts: I64, shots: int) -> list[Row]:
         torch = import_module("torch")  # to measure against, where somebody has installed it
     except ModuleNotFoundError:
         return [{"name": f"{bundle.name} torch eager", "skipped": "torch is not installed"}]
-    from pans.runtime.decide.mlp import bundle_layers
-
     torch.set_num_threads(1)
     modules: list[Any] = []
     for layer in bundle_layers(bundle):
@@ -215,7 +213,7 @@ def _torch_rows(bundle: Bundle, counts: I64, shots: int) -> list[Row]:
 
 def _stream_rows(bundle: Bundle) -> list[Row]:
     """The table on streams of packed words against a copy of the same bytes, in the cache and out of memory."""
-    decider, rows = TableDecider(bundle), list[Row]()
+    decider, rows = word_table(bundle), list[Row]()
     dtypes: tuple[Any, ...] = (np.uint16, np.uint32, np.uint64)
     for dtype in dtypes:
         for n, place in ((CACHED_WORDS, "in the cache"), (MEMORY_WORDS, "from memory")):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.decide.table import CountTable, CountTableDecider, TableDecider, fits_count_table, n_features_of
+from pans.runtime.decide.table import TableDecider, count_table, fits_count_table, n_features_of
 from pans.runtime.decide.verdict import Decider, Verdict, softmax_winner
 from pans.runtime.errors import UsageError
 
@@ -67,7 +67,7 @@ def make_adapter(bundle: Bundle, shots: int) -> Adapter:
             remedy="use --shots 1, or --on-dark abstain",
         )
     if fits_count_table(bundle.n_features, shots):
-        return TableAdapter(CountTableDecider(bundle, shots).scores, shots + 1)
+        return TableAdapter(count_table(bundle, shots).scores, shots + 1)
     return HeadAdapter(bundle.n_features, shots)
 
 
@@ -90,7 +90,7 @@ class TableAdapter:
     def made(self, ordinary: Decider, extra: F64, masked: NDArray[np.bool_]) -> Decider:
         """See Adapter."""
         scores = adapted_scores(self._scores, word_prior(self._seen, self._base), extra, masked, self._base)
-        return AdaptedTable(scores) if self._base == 2 else AdaptedCounts(scores, self._base)
+        return TableDecider(scores, self._base - 1, self._base - 1, {"why": "made for the present dark rates"})
 
 
 class HeadAdapter:
@@ -187,20 +187,6 @@ def extra_probability(present: F64, before: F64) -> F64:
     least 0.
     """
     return np.maximum(1.0 - (1.0 - present) / (1.0 - before), 0.0)
-
-
-class AdaptedTable(TableDecider):
-    """A table of other scores: it is not the bundle's, so it is not held against the golden vectors."""
-
-    def __init__(self, scores: NDArray[np.float32]) -> None:
-        CountTable.__init__(self, scores, 1, {"chosen": self.name, "why": "made for the present dark rates"})
-
-
-class AdaptedCounts(CountTableDecider):
-    """A table of counts with other scores."""
-
-    def __init__(self, scores: NDArray[np.float32], base: int) -> None:
-        CountTable.__init__(self, scores, base - 1, {"chosen": self.name, "why": "made for the present dark rates"})
 
 
 class MixedHead:

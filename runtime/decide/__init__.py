@@ -18,8 +18,7 @@ no clicks and never abstains (core): scores that are not finite come back with p
 [0, 1]
 """
 
-from .backends import make_decider
-from .names import BACKENDS, backend_names
+from .backends import BACKENDS, backend_names, make_decider
 from .verdict import Decider, Verdict, Verdicts
 
 __all__ = ["BACKENDS", "Decider", "Verdict", "Verdicts", "backend_names", "make_decider"]

@@ -1,36 +1,44 @@
-"""The decision back ends behind one call, chosen by measurement when a bundle is loaded.
+"""A bundle in, a back end out that has answered the bundle's golden vectors: ours by name or by measurement, or another package's.
 
-Owns the choice and its reasons; never counts clicks (core/window.py) and never abstains (core/still.py). `make_decider` returns a back
-end that has been held against the bundle's golden vectors before it answers anything. What a decision is stands in verdict.py, the back
-ends in table.py, mlp.py and onnx.py; numba and onnxruntime are imported only by those that need them.
+numba and onnxruntime are imported only by the back ends that need them.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import suppress
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.automaton import DoseCap
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
+from pans.runtime.guests import load_guest, package_of
 
-from .names import BACKENDS as BACKENDS
-from .names import backend_names, offered_backends
-from .offered import CLICKS_SEED, OfferedDecider
-from .onnx import OnnxDecider as OnnxDecider
-from .onnx import PictureDecider
-from .photons import PhotonDecider
-from .table import CountTableDecider, fits_count_table
-from .table import TableDecider as TableDecider
+from .onnx import OnnxDecider, PictureDecider
+from .table import count_table, fits_count_table, word_table
 from .verdict import Decider as Decider
-from .verdict import Verdict as Verdict
-from .verdict import softmax_winner as softmax_winner
+from .verdict import Verdict, Verdicts, checked_counts
 
+BACKENDS = ("auto", "table", "count-table", "sparse", "onnx", "int8", "int8-onnx", "float64", "automaton")
+GROUP = "pans.backends"
 MEASURED_CALLS = 200
+TRIED = 64  # clicks tried before a run: enough to meet a wrong shape or range, few enough to cost nothing
+CLICKS_SEED = 20250103
+_LEAST = 1e-12  # of a probability, so that a score is finite
+
+
+def offered_backends() -> dict[str, EntryPoint]:
+    """Return the back ends of other packages by name; a name of ours cannot be used."""
+    return {point.name: point for point in entry_points(group=GROUP) if point.name not in BACKENDS}
+
+
+def backend_names() -> tuple[str, ...]:
+    """Return every name that `make_decider` knows."""
+    return (*BACKENDS, *sorted(offered_backends()))
 
 
 def make_decider(
@@ -64,13 +72,6 @@ def make_decider(
         if backend not in ("auto", PictureDecider.name):
             raise UsageError(f"back end {backend!r}: pictures come from the head alone", remedy="use the back end onnx")
         return PictureDecider(bundle)
-    if bundle.largest == 1:
-        return _fixed_decider(bundle, shots, backend)
-    return PhotonDecider(_fixed_decider(bundle, shots * bundle.largest, backend), bundle.largest)
-
-
-def _fixed_decider(bundle: Bundle, shots: int, backend: str) -> Decider:
-    """The back end of fixed patterns that answers counts of 0 to `shots`: of photon numbers `shots` is times the largest of them."""
     if backend == "auto":
         return _choose(bundle, shots)
     if backend in BACKENDS:
@@ -82,61 +83,60 @@ def _automaton_decider(bundle: Bundle, shots: int, backend: str, confidence: flo
     from .automaton import AutomatonDecider, demand_one_shot
 
     if backend not in ("auto", AutomatonDecider.name):
-        raise UsageError(
-            f"back end {backend!r}: {bundle.name} has neither head nor table, its automaton decides",
-            remedy="use the back end auto",
-        )
+        found = f"{bundle.name} has neither head nor table, its automaton decides"
+        raise UsageError(f"back end {backend!r}: {found}", remedy="use the back end auto")
     demand_one_shot(shots)
     return AutomatonDecider(bundle, confidence, dose)
 
 
 def _make(bundle: Bundle, shots: int, backend: str) -> Decider:
+    """The back end of ours of that name, for fixed patterns among classes."""
     if backend == "table":
-        return _table_decider(bundle, shots)
+        table = word_table(bundle)
+        table.decide(np.zeros(bundle.n_features, np.int64), shots)  # refuses other shots
+        return table
     if backend == "count-table":
-        return CountTableDecider(bundle, shots)
+        return count_table(bundle, shots)
     if backend == "automaton":
         raise UsageError(f"{bundle.name} has no automaton", remedy="use the back end auto")
     if backend in ("onnx", "int8-onnx"):
         return OnnxDecider(bundle, int8=backend == "int8-onnx")
-    from . import mlp as decide_mlp
+    from .mlp import Int8Decider, ReferenceDecider, SparseDecider
 
-    makers: dict[str, Callable[[Bundle], Decider]] = {
-        "sparse": decide_mlp.SparseDecider,
-        "int8": decide_mlp.Int8Decider,
-        "float64": decide_mlp.ReferenceDecider,
-    }
-    return makers[backend](bundle)
+    return {"sparse": SparseDecider, "int8": Int8Decider, "float64": ReferenceDecider}[backend](bundle)
 
 
 def _choose(bundle: Bundle, shots: int) -> Decider:
     """One look-up needs no measurement; otherwise every exact back end that can be made is timed on clicks as they come."""
-    if shots == bundle.largest and bundle.table is not None:
-        table = TableDecider(bundle)
+    if shots == 1 and bundle.table is not None:
+        table = word_table(bundle)
         table.choice = {"chosen": table.name, "why": "one look-up per decision"}
         return table
     if bundle.head_onnx is None:
         raise UsageError(
-            f"{bundle.name} has only a table of single shots, which cannot answer {shots // bundle.largest} shots",
+            f"{bundle.name} has only a table of single shots, which cannot answer {shots} shots",
             remedy="use --shots 1, or a bundle with an ONNX head",
         )
     onnx = OnnxDecider(bundle)
-    candidates: list[Decider] = [onnx]
+    candidates: list[Any] = [onnx]
     with suppress(UsageError):  # a head that is no plain chain of layers: onnxruntime runs it
         candidates.append(_make(bundle, shots, "sparse"))
-    if fits_count_table(bundle.n_features, shots) and onnx.affords((shots + 1) ** bundle.n_features):
-        candidates.append(CountTableDecider(bundle, shots))
+    exposures = shots * bundle.largest
+    if fits_count_table(bundle.n_features, exposures) and onnx.affords((exposures + 1) ** bundle.n_features):
+        candidates.append(count_table(bundle, shots))
     medians = {decider.name: median_us(decider, shots) for decider in candidates}
     best = min(candidates, key=lambda decider: medians[decider.name])
     measured = {name: round(value, 3) for name, value in medians.items()}
-    best.choice = {"chosen": best.name, "why": "least median time", "p50_us": measured}  # type: ignore[attr-defined]
+    best.choice = {"chosen": best.name, "why": "least median time", "p50_us": measured}
     return best
 
 
 def median_us(decider: Decider, shots: int, calls: int = MEASURED_CALLS) -> float:
     """Return the median time of one decision in microseconds, over varied clicks with a fixed seed."""
     rng = np.random.default_rng(CLICKS_SEED)
-    counts: NDArray[np.int64] = rng.integers(0, shots + 1, size=(calls, decider.n_features))
+    counts: NDArray[np.int64] = rng.integers(
+        0, shots * getattr(decider, "largest", 1) + 1, size=(calls, decider.n_features)
+    )
     times: list[int] = []
     for row in counts:
         start_ns = time.perf_counter_ns()
@@ -145,12 +145,65 @@ def median_us(decider: Decider, shots: int, calls: int = MEASURED_CALLS) -> floa
     return float(np.median(times)) / 1000
 
 
-def _table_decider(bundle: Bundle, shots: int) -> TableDecider:
-    if bundle.table is None:
-        raise UsageError(f"{bundle.name} has no table ({bundle.n_features} patterns)", remedy="use the back end onnx")
-    if shots != bundle.largest:
-        raise UsageError(
-            f"the table answers single shots, not {shots // bundle.largest}",
-            remedy="use the back end onnx, or one shot",
-        )
-    return TableDecider(bundle)
+class OfferedDecider:
+    """What another package's `point` makes for `bundle`, as a `Decider`; every answer of it is checked.
+
+    It is not compared with the golden vectors, for it may decide by other means than the head. Of photon numbers up to `largest` it gets
+    the sums, and as many shots times that.
+    """
+
+    def __init__(self, point: EntryPoint, bundle: Bundle, shots: int) -> None:
+        self.name, self.n_features, self.n_classes = point.name, bundle.n_features, bundle.n_classes
+        self.largest = bundle.largest
+        self._whose = f"back end {point.name!r} of {package_of(point)}"
+        make = load_guest(point)
+        try:
+            self._guest = make(bundle)
+        except Exception as error:
+            raise UsageError(f"{self._whose} cannot be made: {type(error).__name__}: {error}") from error
+        wanted = {"name": self.name, "n_features": self.n_features, "n_classes": self.n_classes}
+        for member, value in wanted.items():
+            found = getattr(self._guest, member, None)
+            if found != value:
+                raise UsageError(
+                    f"{self._whose}: its {member} is {found!r}, must be {value!r}",
+                    remedy="take the name of the entry point, and the numbers of patterns and classes of the bundle",
+                )
+        for row in np.random.default_rng(CLICKS_SEED).integers(
+            0, shots * self.largest + 1, size=(TRIED, self.n_features)
+        ):
+            self.decide(row, shots)
+
+    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
+        """Decide one object; UsageError for an answer that is none, and for an error of the back end."""
+        try:
+            label, probability = self._guest.decide(counts, shots * self.largest)
+        except Exception as error:
+            raise UsageError(
+                f"{self._whose} fails on the clicks {counts.tolist()}: {type(error).__name__}: {error}",
+                remedy="test it on these clicks, or run with another --backend",
+            ) from error
+        if not (0 <= label < self.n_classes and 0.0 <= probability <= 1.0):
+            raise UsageError(
+                f"{self._whose} answers {(label, probability)} to the clicks {counts.tolist()}",
+                remedy=f"allowed: a label in 0..{self.n_classes - 1} and a probability in 0..1",
+            )
+        return Verdict(int(label), float(probability))
+
+    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
+        """Return scores, float32 (n, classes), whose softmax gives the label its probability and the others equal shares."""
+        labels, probabilities = self.verdicts(counts, shots)
+        others = (1.0 - probabilities.astype(np.float64)) / max(self.n_classes - 1, 1)
+        scores = np.repeat(np.log(np.maximum(others, _LEAST))[:, None], self.n_classes, axis=1)
+        scores[np.arange(len(labels)), labels] = np.log(np.maximum(probabilities, _LEAST))
+        return scores.astype(np.float32)
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """Return the labels, int64 (n,), of click counts, integers (n, d_f)."""
+        return self.verdicts(counts, shots).labels.astype(np.int64)
+
+    def verdicts(self, counts: ArrayLike, shots: int) -> Verdicts:
+        """Return labels and probabilities of many objects, each decided alone."""
+        rows = checked_counts(counts, shots * self.largest, self.n_features)
+        found = np.array([self.decide(row, shots) for row in rows], np.float64).reshape(-1, 2)
+        return Verdicts(found[:, 0].astype(np.uint16), found[:, 1].astype(np.float32))

@@ -1,26 +1,26 @@
-"""The head's own kernels as back ends: float32, int8, and the float64 reference.
+"""A head that is a chain of layers, by our own kernels: click counts in, the same bits out alone, in a batch and from the core.
 
-Owns the padded layout of a chain of layers and the room for one decision; the loops are in kernels.py. A back end gives the same
-bits for one object alone, in a batch and from the streaming core. Not for several threads at once: each owns its scratch.
+The padded layout of the layers, the room for one decision, and the back ends `sparse`, `int8` and `float64`; the loops are in kernels.py.
+Not for several threads at once: each back end owns its scratch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pans.runtime.bundle.layers import Int8Head, Layer, read_layers, reference_scores
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
 
 from . import kernels
-from .verdict import Verdict, Verdicts, checked_counts, demand_golden, softmax_winner, softmax_winners
+from .verdict import ScoredDecider, Verdict, Verdicts, demand_golden
 
-SHOTS_MAX = 16  # of golden vectors
+GOLDEN_EXPOSURES_MAX = 16
 GROUP_BITS = (5, 4, 3)  # fewer save nothing: few patterns click
 GROUP_BYTES_MAX = 1 << 18  # a part of a level-2 cache
 Room = tuple[NDArray[np.float32], NDArray[np.uint16], NDArray[np.float32]]  # scores, labels, probabilities
@@ -33,41 +33,31 @@ class Padded(NamedTuple):
     numbers: Any
 
 
-class _KernelDecider:
+class _KernelDecider(ScoredDecider):
     """What the two compiled heads share: one kernel for one object and for many."""
 
-    name = ""
-
     def __init__(self, bundle: Bundle, run: Callable[..., None], layers: Padded, dtype: Any) -> None:
-        self.choice: Mapping[str, Any] = {}
-        self.n_features, self.n_classes = bundle.n_features, bundle.n_classes
-        self.layers, self.room = layers, make_room(layers.meta, dtype)
-        self.kernel = run
-        self._one = np.zeros((1, self.n_features), np.int64)
-        self._out = _room(1, self.n_classes)
+        super().__init__(bundle)
+        self.layers, self.room, self.kernel = layers, make_room(layers.meta, dtype), run
+        self._one, self._out = np.zeros((1, self.n_features), np.int64), _room(1, self.n_classes)
         run(self._one, 1, *layers, self.room, *self._out)  # compiles or loads the kernel
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
-        """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots and shots >= 1."""
+        """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots * largest and shots >= 1."""
         self._one[0] = counts
-        self.kernel(self._one, shots, *self.layers, self.room, *self._out)
+        self.kernel(self._one, shots * self.largest, *self.layers, self.room, *self._out)
         return Verdict(int(self._out[1][0]), float(self._out[2][0]))
 
-    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
-        """Return the scores, float32 (n, classes), for click counts (n, d_f)."""
-        return self._decide_all(checked_counts(counts, shots, self.n_features), shots)[0]
-
-    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        """Return the labels, int64 (n,), for click counts (n, d_f)."""
-        return self._decide_all(checked_counts(counts, shots, self.n_features), shots)[1].astype(np.int64)
-
     def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
-        """Return labels and probabilities for click counts, int64 (n, d_f), that are known to be 0..shots."""
-        return Verdicts(*self._decide_all(counts, shots)[1:])
+        """Return labels and probabilities of click counts, int64 (n, d_f), that are known to be 0..shots * largest."""
+        return Verdicts(*self._decide_all(counts, shots * self.largest)[1:])
 
-    def _decide_all(self, counts: NDArray[np.int64], shots: int) -> Room:
+    def _scores(self, counts: NDArray[np.int64], exposures: int) -> NDArray[np.float32]:
+        return self._decide_all(counts, exposures)[0]
+
+    def _decide_all(self, counts: NDArray[np.int64], exposures: int) -> Room:
         room = _room(len(counts), self.n_classes)
-        self.kernel(np.ascontiguousarray(counts), shots, *self.layers, self.room, *room)
+        self.kernel(np.ascontiguousarray(counts), exposures, *self.layers, self.room, *room)
         return room
 
 
@@ -78,10 +68,10 @@ class SparseDecider(_KernelDecider):
 
     def __init__(self, bundle: Bundle) -> None:
         super().__init__(bundle, kernels.float_run, pad_float(bundle_layers(bundle)), np.float32)
-        rows, counts, shots = golden_counts(bundle.golden_means)
+        rows, counts, exposures = golden_counts(bundle.golden_means)
         found = np.empty((len(rows), self.n_classes), np.float32)
-        for k in np.unique(shots):
-            found[shots == k] = self.scores_batch(counts[shots == k], int(k))
+        for k in np.unique(exposures):
+            found[exposures == k] = self._scores(counts[exposures == k], int(k))
         demand_golden(self.name, found, bundle.golden_scores[rows], bundle)
 
 
@@ -92,49 +82,30 @@ class Int8Decider(_KernelDecider):
 
     def __init__(self, bundle: Bundle) -> None:
         if bundle.int8_head is None:
-            raise UsageError(
-                f"{bundle.name} has no int8 head", remedy="export it again with one, or use another back end"
-            )
+            remedy = "export it again with one, or use another back end"
+            raise UsageError(f"{bundle.name} has no int8 head", remedy=remedy)
         super().__init__(bundle, kernels.int8_run, pad_int8(bundle.int8_head), np.int32)
 
 
-class ReferenceDecider:
+class ReferenceDecider(ScoredDecider):
     """The head in float64, slowly: what the errors of the others are measured against."""
 
     name = "float64"
 
     def __init__(self, bundle: Bundle) -> None:
+        super().__init__(bundle)
         self._layers = bundle_layers(bundle)
-        self.choice: Mapping[str, Any] = {}
-        self.n_features, self.n_classes = bundle.n_features, bundle.n_classes
         found = reference_scores(self._layers, bundle.golden_means).astype(np.float32)
         demand_golden(self.name, found, bundle.golden_scores, bundle)
 
-    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
-        """Decide from clicks per pattern, int64 (d_f,), over `shots` shots."""
-        return softmax_winner(self.scores_wide(counts[None], shots)[0])
-
-    def scores_wide(self, counts: ArrayLike, shots: int) -> NDArray[np.float64]:
-        """Return the scores, float64 (n, classes), for click counts (n, d_f)."""
-        return reference_scores(self._layers, checked_counts(counts, shots, self.n_features) / shots)
-
-    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
-        """Return the scores, rounded to float32 (n, classes), for click counts (n, d_f)."""
-        return self.scores_wide(counts, shots).astype(np.float32)
-
-    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        """Return the labels, int64 (n,), for click counts (n, d_f)."""
-        return self.scores_wide(counts, shots).argmax(axis=1).astype(np.int64)
-
-    def verdicts(self, counts: NDArray[Any], shots: int) -> Verdicts:
-        """Return labels and probabilities for click counts (n, d_f)."""
-        return softmax_winners(self.scores_wide(counts, shots))
+    def _scores(self, counts: NDArray[np.int64], exposures: int) -> NDArray[np.float64]:
+        return reference_scores(self._layers, counts / exposures)
 
 
 def golden_counts(means: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of `means` (g, d_f) that are counts over a number of shots up to SHOTS_MAX, their counts and shots."""
+    """Return the rows of `means` (g, d_f) that are counts over a number of shots up to GOLDEN_EXPOSURES_MAX, their counts and shots."""
     counts, shots = np.zeros(means.shape, np.int64), np.zeros(len(means), np.int64)
-    for k in range(SHOTS_MAX, 0, -1):  # the least number of shots is taken last
+    for k in range(GOLDEN_EXPOSURES_MAX, 0, -1):  # the least number of shots is taken last
         whole = np.rint(means.astype(np.float64) * k)
         exact = (whole.astype(np.float32) / np.float32(k) == means).all(axis=1)
         counts[exact], shots[exact] = whole[exact].astype(np.int64), k

@@ -1,14 +1,8 @@
-"""ONNX Runtime as a back end: one thread, buffers bound once; and heads that give back a picture instead of a class.
-
-Owns the single decision through onnxruntime, for the float head and for the quantised one, and the picture of one object or of many;
-never looks into a model (bundle/head.py) and never measures how good a picture is (image_quality.py).
-"""
+"""ONNX Runtime as a back end: click counts in; a class out, by buffers that are bound once, or a picture."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +11,7 @@ from pans.runtime.bundle.head import open_head
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
 
-from .verdict import Verdict, Verdicts, checked_counts, demand_golden, softmax_winner
+from .verdict import ScoredDecider, Verdict, Verdicts, demand_golden, softmax_winner
 
 WARM_UP_CALLS = 500  # of a few microseconds each
 WARM_UP_S = 0.5  # or as many as fit into this: the slowest head that is allowed takes about 0.05 s
@@ -26,31 +20,25 @@ TABLE_SCORES_MAX = 1 << 23  # 32 MiB
 PICTURE_WARM_UP_CALLS = 20  # heads of pictures are far larger
 
 
-class OnnxDecider:
-    """The ONNX head on one thread; a single decision runs through buffers that are bound once."""
-
-    name = "onnx"
+class OnnxDecider(ScoredDecider):
+    """The ONNX head on one thread, the float one or the quantised one; a single decision runs through buffers that are bound once."""
 
     def __init__(self, bundle: Bundle, *, int8: bool = False) -> None:
         import onnxruntime
 
+        super().__init__(bundle)
         self.name = "int8-onnx" if int8 else "onnx"
         model = bundle.int8_onnx if int8 else bundle.head_onnx
         if model is None:
             raise UsageError(f"{bundle.name} has no {'quantised ' if int8 else ''}ONNX head")
-        self.choice: Mapping[str, Any] = {}
-        self.n_features = bundle.n_features
-        self.n_classes = bundle.n_classes
         self._head = open_head(model, bundle.n_features, bundle.n_classes, bundle.name)
         self.operations = self._head.cost.operations
-        self._input = np.zeros((1, bundle.n_features), dtype=np.float32)
-        self._output = np.zeros((1, bundle.n_classes), dtype=np.float32)
-        self._means, self._scores = self._input[0], self._output[0]
-        self._run = self._head.session.run_with_iobinding
-        self._binding = self._head.session.io_binding()
+        inputs, scores = np.zeros((1, self.n_features), np.float32), np.zeros((1, self.n_classes), np.float32)
+        self._means, self._out = inputs[0], scores[0]
+        self._run, self._binding = self._head.session.run_with_iobinding, self._head.session.io_binding()
         make = onnxruntime.OrtValue.ortvalue_from_numpy  # on the CPU a view of the array, not a copy
-        self._binding.bind_ortvalue_input(self._head.cost.input_name, make(self._input))
-        self._binding.bind_ortvalue_output(self._head.cost.output_name, make(self._output))
+        self._binding.bind_ortvalue_input(self._head.cost.input_name, make(inputs))
+        self._binding.bind_ortvalue_output(self._head.cost.output_name, make(scores))
         if not int8:  # golden scores are the float head's
             self._check_golden(bundle)
         until = time.perf_counter() + WARM_UP_S
@@ -61,7 +49,7 @@ class OnnxDecider:
 
     def affords(self, rows: int) -> bool:
         """Whether a table of the scores of `rows` click vectors is made within a second or so, and is small."""
-        return rows * self._head.cost.operations <= TABLE_WORK_MAX and rows * self.n_classes <= TABLE_SCORES_MAX
+        return rows * self.operations <= TABLE_WORK_MAX and rows * self.n_classes <= TABLE_SCORES_MAX
 
     def _check_golden(self, bundle: Bundle) -> None:
         """Hold the batch path and the bound path against the golden vectors: they are different code in onnxruntime."""
@@ -70,40 +58,33 @@ class OnnxDecider:
         for row, means in enumerate(bundle.golden_means):
             self._means[:] = means
             self._run(self._binding)
-            found[row] = self._scores
+            found[row] = self._out
         demand_golden(f"{self.name} (single decisions)", found, bundle.golden_scores, bundle)
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
-        """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots and shots >= 1."""
-        np.divide(counts, np.float32(shots), out=self._means, casting="same_kind", dtype=np.float32)
+        """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots * largest and shots >= 1."""
+        np.divide(counts, np.float32(shots * self.largest), out=self._means, casting="same_kind", dtype=np.float32)
         self._run(self._binding)
-        return softmax_winner(self._scores)
+        return softmax_winner(self._out)
 
-    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
-        """Return the head's scores, float32 (n, classes), for click counts (n, d_f)."""
-        means = checked_counts(counts, shots, self.n_features).astype(np.float32) / np.float32(shots)
-        return self._head.scores(means)
-
-    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        """Return the labels, int64 (n,), for click counts (n, d_f)."""
-        return self.scores_batch(counts, shots).argmax(axis=1).astype(np.int64)
+    def _scores(self, counts: NDArray[np.int64], exposures: int) -> NDArray[np.float32]:
+        return self._head.scores(counts.astype(np.float32) / np.float32(exposures))
 
 
-class PictureDecider:
+class PictureDecider(ScoredDecider):
     """The ONNX head of a picture bundle on one thread; `n_classes` is 0, for there is no class to be right about.
 
     To the core it is a `Decider`: its verdict is label 0, "a picture was given back", with probability 1, or 0 where pixels are not
-    finite, so that the core abstains. The picture is not in the decision log: it follows from the recorded clicks (report/pictures.py).
+    finite, so that the core abstains. The picture is not in the decision log: it follows from the recorded clicks (record/pictures.py).
     """
 
     name = "onnx"
-    n_classes = 0
 
     def __init__(self, bundle: Bundle) -> None:
         if bundle.picture_shape is None or bundle.head_onnx is None:
             raise UsageError(f"{bundle.name} decides among classes, it returns no pictures")
-        self.choice: Mapping[str, Any] = {"chosen": self.name, "why": "pictures come from the head alone"}
-        self.n_features = bundle.n_features
+        super().__init__(bundle)
+        self.choice = {"chosen": self.name, "why": "pictures come from the head alone"}
         self.picture_shape = bundle.picture_shape
         self._head = open_head(bundle.head_onnx, bundle.n_features, bundle.n_outputs, bundle.name)
         demand_golden(self.name, self._head.scores(bundle.golden_means), bundle.golden_scores, bundle)
@@ -112,25 +93,17 @@ class PictureDecider:
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """Give back the picture of clicks per pattern, int64 (d_f,), and say whether it is one; `picture` holds it until the next."""
-        self.picture = self._pixels(counts[None], shots)[0].reshape(self.picture_shape)
+        self.picture = self._scores(counts[None], shots)[0].reshape(self.picture_shape)
         return Verdict(0, float(np.isfinite(self.picture).all()))
-
-    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
-        """Return the pixels as the head gives them, float32 (n, height * width), of click counts (n, d_f)."""
-        return self._pixels(checked_counts(counts, shots, self.n_features), shots)
 
     def pictures(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
         """Return pictures cut to [0, 1], float32 (n, height, width), of click counts (n, d_f)."""
         return self.scores_batch(counts, shots).clip(0.0, 1.0).reshape(-1, *self.picture_shape)
 
-    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        """Return label 0 for each of click counts (n, d_f)."""
-        return self.verdicts(checked_counts(counts, shots, self.n_features), shots).labels.astype(np.int64)
-
     def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
         """Return label 0 and probability 1, or 0 where the pixels are not finite, for click counts, int64 (n, d_f)."""
-        whole = np.asarray(np.isfinite(self._pixels(counts, shots)).all(axis=1), np.float32)
+        whole = np.asarray(np.isfinite(self._scores(counts, shots)).all(axis=1), np.float32)
         return Verdicts(np.zeros(len(counts), np.uint16), whole)
 
-    def _pixels(self, counts: NDArray[np.int64], shots: int) -> NDArray[np.float32]:
-        return self._head.scores(counts.astype(np.float32) / np.float32(shots))
+    def _scores(self, counts: NDArray[np.int64], exposures: int) -> NDArray[np.float32]:
+        return self._head.scores(counts.astype(np.float32) / np.float32(exposures))

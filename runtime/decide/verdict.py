@@ -1,7 +1,6 @@
-"""What a decision is: a label and the probability of its class, from one row of scores or from many.
+"""Rows of scores in, labels and probabilities out; and what the back ends share: their protocol, their checks, the golden vectors.
 
-Owns the softmax in its stable form and the checks that every back end shares; never evaluates a head. Scores that are not finite give
-probability 0.0, which no finite scores can give: the caller must not take their label.
+Scores that are not finite give probability 0.0, which no finite scores can give: the caller must not use their label.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class Decider(Protocol):
 
     @property
     def name(self) -> str:
-        """The name by which it is asked for (names.backend_names, without `auto`)."""
+        """The name by which it is asked for (backends.backend_names, without `auto`)."""
 
     @property
     def n_features(self) -> int:
@@ -110,16 +109,54 @@ def choice_of(decider: Decider) -> Mapping[str, Any]:
     return found
 
 
-def checked_counts(counts: ArrayLike, shots: int, n_features: int) -> NDArray[np.int64]:
-    """Return click counts as int64 (n, d_f); ValueError for another shape or type, or a count beyond 0..shots."""
+def checked_counts(counts: ArrayLike, most: int, n_features: int) -> NDArray[np.int64]:
+    """Return click counts as int64 (n, d_f); ValueError for another shape or type, or a count beyond 0..`most`."""
     values = np.asarray(counts)
     if values.ndim != 2 or values.shape[1] != n_features or not np.issubdtype(values.dtype, np.integer):
         raise ValueError(f"counts are {values.dtype} {values.shape}, allowed: integers (n, {n_features})")
-    if shots < 1:
-        raise ValueError(f"shots is {shots}, allowed: 1 or more")
-    if values.size and (int(values.min()) < 0 or int(values.max()) > shots):
-        raise ValueError(f"counts run from {values.min()} to {values.max()}, allowed: 0 to {shots}")
+    if most < 1:
+        raise ValueError(f"shots is {most}, allowed: 1 or more")
+    if values.size and (int(values.min()) < 0 or int(values.max()) > most):
+        raise ValueError(f"counts run from {values.min()} to {values.max()}, allowed: 0 to {most}")
     return values.astype(np.int64)
+
+
+class ScoredDecider:
+    """What back ends share that score many objects at once; a subclass has `_scores`, and perhaps a faster `decide`.
+
+    Where the detector counts photons up to `largest`, one exposure of a number up to L is L exposures that can click.
+    """
+
+    name = ""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.choice: Mapping[str, Any] = {}
+        self.n_features, self.n_classes, self.largest = bundle.n_features, bundle.n_classes, bundle.largest
+
+    def _scores(self, counts: NDArray[np.int64], exposures: int) -> NDArray[np.floating[Any]]:
+        """Scores (n, classes) of counts (n, d_f), each of 0 to `exposures`."""
+        raise NotImplementedError
+
+    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
+        """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots * largest and shots >= 1."""
+        return softmax_winner(self._scores(counts[None], shots * self.largest)[0])
+
+    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
+        """Return the scores, float32 (n, classes), of click counts, integers (n, d_f)."""
+        exposures = shots * self.largest
+        return self._scores(checked_counts(counts, exposures, self.n_features), exposures).astype(
+            np.float32, copy=False
+        )
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """Return the labels, int64 (n,), of click counts, integers (n, d_f)."""
+        return self.verdicts(checked_counts(counts, shots * self.largest, self.n_features), shots).labels.astype(
+            np.int64
+        )
+
+    def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
+        """Return labels and probabilities of click counts, int64 (n, d_f), that are known to be 0..shots * largest."""
+        return softmax_winners(self._scores(counts, shots * self.largest))
 
 
 def demand_golden(name: str, found: NDArray[np.float32], golden: NDArray[np.float32], bundle: Bundle) -> None:

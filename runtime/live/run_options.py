@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pans.runtime.cli.option_fields import option
 from pans.runtime.container import MIB
-from pans.runtime.decide.names import backend_names
+from pans.runtime.decide.backends import backend_names
 from pans.runtime.instrument.calibration import MAX_AGE_H
 from pans.runtime.ranges import Range
 from pans.runtime.run_folder import RUNS

@@ -177,7 +177,7 @@ def _table_differences(bundle: Bundle) -> list[str]:
     for start in range(0, count, at_once):
         words = chosen[start : start + at_once]
         numbers = np.rint(word_means(words, bundle.n_features, bundle.outcomes) * bundle.largest).astype(np.int64)
-        difference = golden_violation(bundle.table[words], decider.scores_batch(numbers, bundle.largest))
+        difference = golden_violation(bundle.table[words], decider.scores_batch(numbers, 1))
         if difference:
             return [f"table and head disagree from word {int(words[0])} on: {difference}"]
     return []

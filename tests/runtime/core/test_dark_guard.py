@@ -18,8 +18,6 @@ from pans.runtime.cli import main
 from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.dark_tables import (
     MAX_MIXED,
-    AdaptedCounts,
-    AdaptedTable,
     HeadAdapter,
     TableAdapter,
     adapted_scores,
@@ -30,6 +28,7 @@ from pans.runtime.core.dark_tables import (
     n_features_of,
     word_prior,
 )
+from pans.runtime.decide.table import TableDecider
 from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import ChannelHealth, DarkMonitor, Finding
@@ -176,7 +175,7 @@ def test_unchanged_detector_leaves_the_table_as_it_is() -> None:
     scores = rng.normal(size=(64, 3)).astype(np.float32)
     made = adapted_scores(scores, word_prior(np.ones(64, np.int64)), np.zeros(6), np.zeros(6, np.bool_))
     assert (made.argmax(axis=1) == scores.argmax(axis=1)).all()
-    table = AdaptedTable(made)
+    table = TableDecider(made, 1)
     assert table.decide(np.array([1, 0, 1, 0, 0, 1]), 1).label == int(scores[0b100101].argmax())
 
 
@@ -257,7 +256,7 @@ class Scored:
     name, n_classes = "scored", 4
 
     def __init__(self, scores: NDArray[np.float64], base: int) -> None:
-        self.table = AdaptedCounts(scores.astype(np.float32), base)
+        self.table = TableDecider(scores.astype(np.float32), base - 1, base - 1)
         self.n_features = self.table.n_features
         self.decide, self.decide_batch = self.table.decide, self.table.decide_batch
         self.scores_batch = self.table.scores_batch

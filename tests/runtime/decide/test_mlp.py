@@ -13,7 +13,7 @@ from pans.runtime.bundle.layers import Int8Head, Layer, int8_reference, quantise
 from pans.runtime.bundle.model import bundle_bytes, parse_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.mlp import Int8Decider, ReferenceDecider, SparseDecider, golden_counts
-from pans.runtime.decide.table import CountTableDecider, fits_count_table
+from pans.runtime.decide.table import count_table, fits_count_table
 from pans.runtime.decide.verdict import softmax_winner, verdicts_of
 from pans.runtime.errors import DamagedFileError, UsageError
 
@@ -129,7 +129,7 @@ def test_golden_means_are_told_as_counts() -> None:
 
 def test_a_table_of_counts_is_exactly_the_head() -> None:
     bundle = head_bundle(random_layers([4, 16, 5]))
-    decider = CountTableDecider(bundle, 3)
+    decider = count_table(bundle, 3)
     every = np.array([[r // 4**i % 4 for i in range(4)] for r in range(256)])
     onnx = make_decider(bundle, backend="onnx")
     assert (decider.scores_batch(every, 3) == onnx.scores_batch(every, 3)).all()
@@ -145,7 +145,7 @@ def test_tables_of_counts_stay_small() -> None:
     assert not fits_count_table(17, 1)
     assert not fits_count_table(4000, 60000)
     with pytest.raises(UsageError, match="rows"):
-        CountTableDecider(head_bundle(random_layers([13, 4])), 4)
+        count_table(head_bundle(random_layers([13, 4])), 4)
 
 
 # -- int8 ------------------------------------------------------------------------------------------------------------------

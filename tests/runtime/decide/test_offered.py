@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pans
-from pans.runtime.decide import Decider, make_decider, names
+from pans.runtime.decide import Decider, backends, make_decider
 from pans.runtime.decide.verdict import softmax_winner, verdicts_of
 from pans.runtime.errors import UsageError
 
@@ -33,8 +33,11 @@ def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Offer:
     def write(body: str) -> None:
         module = f"lab{abs(hash(body))}"
         (tmp_path / f"{module}.py").write_text(body if "\n" in body else LAB.replace("BODY", body))
-        points = [EntryPoint("lab", f"{module}:Lab", names.GROUP), EntryPoint("table", f"{module}:Lab", names.GROUP)]
-        monkeypatch.setattr(names, "entry_points", lambda group: points)
+        points = [
+            EntryPoint("lab", f"{module}:Lab", backends.GROUP),
+            EntryPoint("table", f"{module}:Lab", backends.GROUP),
+        ]
+        monkeypatch.setattr(backends, "entry_points", lambda group: points)
 
     monkeypatch.syspath_prepend(str(tmp_path))
     return write

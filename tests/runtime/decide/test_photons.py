@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import EntryPoint
 from itertools import product
 from types import SimpleNamespace
 from typing import Any
@@ -79,25 +80,28 @@ def test_one_shot_is_looked_up_and_its_choice_told(counted: Bundle) -> None:
     with pytest.raises(UsageError, match="answers single shots, not 2"):
         make_decider(counted, shots=2, backend="table")
     table = made_bundle(2, 2, outcomes=3, table=np.arange(18.0).reshape(9, 2))
-    with pytest.raises(UsageError, match="a table of single shots, which cannot answer 2 shots"):
+    with pytest.raises(UsageError, match="only a table of single shots, which cannot answer 2 shots"):
         make_decider(table, shots=2)
 
 
-def test_a_guest_is_told_numbers_over_shots_times_the_largest(counted: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_packages_back_end_gets_sums_over_shots_times_the_largest(
+    counted: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[tuple[list[int], int]] = []
 
-    class Guest:
-        def __init__(self, point: Any, bundle: Bundle, shots: int) -> None:
-            self.name, self.n_features, self.n_classes = "guest", 3, 4
+    class Lab:
+        def __init__(self, bundle: Bundle) -> None:
+            self.name, self.n_features, self.n_classes = "lab", 3, 4
 
-        def decide(self, counts: np.ndarray, shots: int) -> SimpleNamespace:
+        def decide(self, counts: np.ndarray, shots: int) -> tuple[int, float]:
             asked.append((counts.tolist(), shots))
-            return SimpleNamespace(label=1, probability=1.0)
+            return 1, 1.0
 
-    monkeypatch.setattr(backends, "OfferedDecider", Guest)
-    monkeypatch.setattr(backends, "offered_backends", lambda: {"guest": None})
-    make_decider(counted, shots=5, backend="guest").decide(np.array([10, 0, 3]), 5)
-    assert asked == [([10, 0, 3], 10)]
+    monkeypatch.setattr(backends, "load_guest", lambda point: Lab)
+    monkeypatch.setattr(backends, "offered_backends", lambda: {"lab": EntryPoint("lab", "lab:Lab", backends.GROUP)})
+    make_decider(counted, shots=5, backend="lab").decide(np.array([10, 0, 3]), 5)
+    assert asked[-1] == ([10, 0, 3], 10)
+    assert max(max(counts) for counts, _ in asked) == 10
 
 
 def test_numbers_in_the_library_and_what_takes_clicks_alone(counted: Bundle) -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.decision import Output, joined
 from pans.runtime.core.plan import Plan
-from pans.runtime.decide.table import CountTable
+from pans.runtime.decide.table import TableDecider
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.steps import FlowSteps
 from pans.runtime.instrument.cusum import ChannelWatch
@@ -34,11 +34,11 @@ TAPE = {"kind": "tape", "bars_per_s": 20_000.0}
 FOLLOWED = {"kind": "tape", "bars_per_s": 20_500.0, "track": 3}
 
 
-def table(shots: int) -> CountTable:
+def table(shots: int) -> TableDecider:
     """Of 10 channels and 4 classes; scores that are not finite, and classes that are not sure, are among its rows."""
     scores = np.random.default_rng(shots).normal(0, 2, ((shots + 1) ** 10, 4)).astype(np.float32)
     scores[5::97, 2] = np.nan
-    return CountTable(scores, shots, {})
+    return TableDecider(scores, shots, shots)
 
 
 TABLES = {shots: table(shots) for shots in (1, 2)}
