@@ -105,8 +105,8 @@ def count_table(bundle: Bundle, shots: int, rows_max: int = COUNT_TABLE_ROWS_MAX
         raise UsageError(f"{bundle.name} has no ONNX head to make a table of counts from")
     if not fits_count_table(d_f, exposures, rows_max):
         rows = (exposures + 1) ** d_f
-        found = f"for {shots} shots of {d_f} patterns has {rows:.3g} rows"
-        raise UsageError(f"a table of counts {found}, allowed {rows_max}")
+        what = f"a table of counts for {shots} shots of {d_f} patterns"
+        raise UsageError(f"{what} has {rows:.3g} rows, allowed {rows_max}")
     head = open_head(bundle.head_onnx, d_f, bundle.n_classes, bundle.name)
     demand_golden("count-table", head.scores(bundle.golden_means), bundle.golden_scores, bundle)
     radix = (exposures + 1) ** np.arange(d_f, dtype=np.int64)
