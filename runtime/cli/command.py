@@ -15,14 +15,14 @@ EXIT_INTERNAL = 70  # a fault of pans itself: EX_SOFTWARE of sysexits.h
 class Command:
     """One subcommand: `configure` adds its arguments, `run` does the work and returns the exit code.
 
-    `examples` are command lines for the end of `--help`. `prepare`, if given, sees the parser and the words before they are parsed.
+    `examples` are command lines for the end of `--help`. `prepare`, if given, returns the words to be parsed.
     """
 
     help: str
     configure: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
     examples: tuple[str, ...] = ()
-    prepare: Callable[[argparse.ArgumentParser, Sequence[str]], None] | None = None
+    prepare: Callable[[argparse.ArgumentParser, Sequence[str]], list[str]] | None = None
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:

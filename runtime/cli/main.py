@@ -70,7 +70,7 @@ def _run(words: list[str]) -> int:
         command = load_command(commands[wanted])
         parser = parser_of(wanted, command)
         if command.prepare is not None:
-            command.prepare(parser, rest)
+            rest = command.prepare(parser, rest)
         args = parser.parse_args(rest)
         with logging_of(args):
             note(f"pans {__version__}: {wanted} is {commands[wanted].value}")

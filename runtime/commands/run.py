@@ -12,6 +12,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import EXIT_FINE, Command, emit
@@ -65,13 +66,13 @@ def _run(args: argparse.Namespace) -> int:
     from .one_run import check_together, run_and_report
     from .run_files import input_files
 
-    config = () if args.config is None else (args.config,)
-    args.bundle, args.profile = bundle_path(args.bundle), args.profile or profile_of(args.device)
-    options = _options(args, files_read=config, warns_uncalibrated=True)
+    profile = args.profile or profile_of(args.device)
+    options = _options(args, files_read=() if args.config is None else (args.config,), warns_uncalibrated=True)
+    options = replace(options, bundle=bundle_path(args.bundle), profile=profile)
     if args.write_config is None:
         return run_and_report(args, options)
     check_together(options)
-    load_profile(args.profile)
+    load_profile(profile)
     path = write_options(args, input_files(options))
     emit(args, {"config": str(path)}, f"{path}\nnext: pans run --config {shlex.quote(str(path))}")
     return EXIT_FINE

@@ -24,8 +24,7 @@ NUMBERS = ("3", "0.5", "2048", "1")
 def parsed(*words: str) -> argparse.Namespace:
     """What `pans run` makes of its words."""
     parser = parser_of("run", RUN)
-    prepare_options(parser, words)
-    return parser.parse_args(words)
+    return parser.parse_args(prepare_options(parser, words))
 
 
 def options() -> list[argparse.Action]:
