@@ -14,7 +14,7 @@ from typing import Any
 from pans.firmware_sim.options import add_options, settings_from
 from pans.firmware_sim.trials import TRIALS, load_trial
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit
-from pans.runtime.cli.parser import CommandParser
+from pans.runtime.cli.command import CommandParser
 from pans.runtime.errors import PansError
 from pans.runtime.outputs import check_outputs, write_file
 

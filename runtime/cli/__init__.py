@@ -1,8 +1,8 @@
-"""The `pans` command: finds the commands by entry point, runs one, and turns errors into exit codes.
+"""The `pans` command: it finds a command by entry point, runs it, and turns errors into the exit codes of the contract.
 
-Owns argument parsing of the top level, the options that every command has (`--json`, `--quiet`, `--verbose`, `--debug`), what is printed
-and the exit codes of the contract; never does a command's work. `main` returns the exit status. Only the invoked command's module is
-imported, so that `pans run` never pays for the trainer. Of the standard library only: nothing here loads numpy.
+Words of the command line come in, an answer on stdout and an exit code come out. Start reading at main.py; a command is a `Command`
+(command.py), its options can be fields of a dataclass (option_fields.py). Nothing here loads numpy, and only the module of the command
+that is asked for is imported.
 """
 
 from .command import (
@@ -19,7 +19,7 @@ from .command import (
     new_file,
 )
 from .main import main
-from .talk import emit, note, say, warn
+from .printing import emit, note, say, warn
 
 __all__ = [
     "EXIT_ALERT",

@@ -1,8 +1,4 @@
-"""`pans completion SHELL`: a script that completes commands, options and their values in bash, zsh or fish.
-
-Owns the scripts; commands and options come from the parsers, so that those of other packages are completed too. The script is static: it
-is printed once, and nothing of pans runs when a key is pressed.
-"""
+"""`pans completion SHELL`: a static script that completes commands, options and their values in bash, zsh or fish."""
 
 from __future__ import annotations
 
@@ -13,10 +9,9 @@ from typing import NamedTuple
 from pans.runtime.errors import UsageError
 from pans.runtime.safe_text import one_line
 
-from .command import EXIT_FINE, Command
+from .command import EXIT_FINE, Command, parser_of
 from .finding import find_commands, load_command
-from .parser import parser_of
-from .talk import emit, warn
+from .printing import emit, warn
 
 INSTALL = {
     "bash": "pans completion bash > ~/.local/share/bash-completion/completions/pans",

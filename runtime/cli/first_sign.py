@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from .talk import has_said, say
+from .printing import has_said, say
 
 FIRST_AFTER_S = 0.35
 LOOK_EVERY_S = 0.05

@@ -9,20 +9,17 @@ import shlex
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from importlib.metadata import EntryPoint
 
 from pans.runtime import __version__
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.logs import LOGGER, logging_of
 
-from .command import EXIT_FINE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_USAGE, Command
-from .finding import find_commands, load_command, missing_extra
+from .command import EXIT_FINE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_USAGE, Command, did_you_mean, parser_of
+from .finding import EXTRAS, find_commands, load_command, missing_extra, overview
 from .first_sign import first_sign
-from .overview import overview
-from .parser import parser_of
+from .printing import begin, fail, has_answered, note
 from .reading_bar import reading_bar
-from .talk import begin, fail, has_answered, note
 
 _REMEDIES = {
     errno.ENOSPC: "make room on that disk, or choose another one",
@@ -41,7 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         code = _run(words)
     except KeyboardInterrupt as interrupt:
-        return fail(_interrupted(interrupt), EXIT_INTERRUPTED)
+        return fail(
+            PansError(str(interrupt) or "interrupted"), EXIT_INTERRUPTED
+        )  # a signal's handler says which it was
     except BrokenPipeError:
         _silence()  # the reader of our output went away: nothing more can be said to it
         return EXIT_FINE
@@ -49,8 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "--debug" in words:
             raise
         known = _known(error)
-        if not has_answered() and isinstance(error, OSError) and known is not None and _is_stdout(error):
-            _silence()
+        if not has_answered() and isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+            _silence()  # stdout itself is full: an error of a file names the file
         return fail(known, known.exit_code) if known is not None else fail(_internal(error), EXIT_INTERNAL)
     if code == EXIT_INTERRUPTED and "--json" in words and not has_answered():
         fail(PansError("interrupted"), code)
@@ -84,7 +83,7 @@ def _logged(command: Command, args: argparse.Namespace, words: Sequence[str]) ->
         with reading_bar():
             code = command.run(args)
     except KeyboardInterrupt as interrupt:
-        LOGGER.warning("ends: %s", _interrupted(interrupt).message)
+        LOGGER.warning("ends: %s", str(interrupt) or "interrupted")
         raise
     except BaseException as error:
         LOGGER.error("ends by an error: %s: %s", type(error).__name__, error)
@@ -101,9 +100,8 @@ def _help(words: list[str], commands: Mapping[str, EntryPoint]) -> int:
 
 def _top_level(words: Sequence[str], wanted: str | None, commands: Mapping[str, EntryPoint]) -> int:
     if wanted is not None:
-        near = get_close_matches(wanted, commands, n=2)
-        hint = f"did you mean {' or '.join(near)}? " if near else ""
-        return fail(UsageError(f"unknown command {wanted!r}", remedy=f"{hint}`pans` lists the commands"), EXIT_USAGE)
+        remedy = f"{did_you_mean(wanted, commands)}`pans` lists the commands"
+        return fail(UsageError(f"unknown command {wanted!r}", remedy=remedy), EXIT_USAGE)
     if {"--version", "-V"} & {*words}:
         print(f"pans {__version__}")
         return EXIT_FINE
@@ -129,16 +127,9 @@ def _known(error: Exception) -> PansError | None:
     if isinstance(error, MemoryError):
         return UsageError(f"there is not enough memory: {error}".removesuffix(": "), remedy="ask for less at once")
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("pans"):
-        from .finding import EXTRAS
-
         package = error.name.partition(".")[0]
         return missing_extra("this", package, EXTRAS[package]) if package in EXTRAS else None
     return None
-
-
-def _interrupted(interrupt: KeyboardInterrupt) -> PansError:
-    """Return what ended the command, in words: a signal's handler says which signal it was."""
-    return PansError(str(interrupt) or "interrupted")
 
 
 def _internal(error: Exception) -> PansError:
@@ -148,11 +139,6 @@ def _internal(error: Exception) -> PansError:
         f"internal error: {type(error).__name__}: {error} ({place})",
         remedy="this is a fault of pans: report it with what the same command prints with --debug",
     )
-
-
-def _is_stdout(error: OSError) -> bool:
-    """Whether stdout could not be written: errors of files name the file."""
-    return error.filename is None and error.errno == errno.ENOSPC
 
 
 def _silence() -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from pans.runtime.container import watching_blocks
 
-from .talk import is_quiet
+from .printing import is_quiet
 
 if TYPE_CHECKING:  # a command that answers at once does not load it
     from rich.progress import Progress, TaskID

@@ -19,7 +19,7 @@ from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_TIMING, Command, add_force, emit, say
 from pans.runtime.cli.option_fields import refuse_without
-from pans.runtime.cli.talk import is_quiet
+from pans.runtime.cli.printing import is_quiet
 from pans.runtime.errors import LinkError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import check_outputs

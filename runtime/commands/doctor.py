@@ -24,7 +24,7 @@ import numpy as np
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
-from pans.runtime.cli.talk import is_quiet
+from pans.runtime.cli.printing import is_quiet
 from pans.runtime.errors import UsageError
 from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
 

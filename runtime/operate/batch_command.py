@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
+from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
-from pans.runtime.cli.parser import parser_of
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range

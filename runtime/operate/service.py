@@ -17,8 +17,8 @@ from typing import Any
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, say, warn
+from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
-from pans.runtime.cli.parser import parser_of
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, make_folder, write_file
 from pans.runtime.ranges import Range

@@ -32,7 +32,7 @@ MOST_WORDS = 40  # of a sentence outside measurements and results, which are mos
 
 def parser_of(name: str) -> argparse.ArgumentParser:
     """The parser of one command, as `pans` itself makes it."""
-    return cli.parser.parser_of(name, COMMANDS[name].load())
+    return cli.command.parser_of(name, COMMANDS[name].load())
 
 
 def check(words: list[str], where: str, whole: bool) -> None:

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
-from pans.runtime.cli.parser import parser_of
 from pans.runtime.errors import UsageError
 
 FAST = "sim:oled-qcmos?pace=fast"

@@ -125,7 +125,7 @@ def test_a_full_queue_and_a_full_disk_cost_lines_and_say_so(
 @pytest.mark.skipif(sys.platform == "win32", reason="needs the journal's environment")
 def test_stderr_has_priorities_where_it_is_the_journal(tmp_path: Path) -> None:
     code = (
-        "from pans.runtime.cli import say, warn; from pans.runtime.cli.talk import fail; from pans.runtime.errors import LinkError;"
+        "from pans.runtime.cli import say, warn; from pans.runtime.cli.printing import fail; from pans.runtime.errors import LinkError;"
         "say('a\\nb'); warn('c'); fail(LinkError('d', remedy='e'), 3)"
     )
     for journal, wanted in (

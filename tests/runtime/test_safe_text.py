@@ -42,7 +42,7 @@ def test_the_terminal(text: str, capsys: pytest.CaptureFixture[str]) -> None:
 
     cli.say(f"pans: {text}")
     cli.emit(Args(), {}, f"found {text}")  # type: ignore[arg-type]
-    assert cli.talk.fail(UsageError(f"the device says {text}", remedy=text), 2) == 2
+    assert cli.printing.fail(UsageError(f"the device says {text}", remedy=text), 2) == 2
     found = capsys.readouterr()
     for line in (found.out + found.err).split("\n"):
         assert line.replace("\t", "").isprintable()

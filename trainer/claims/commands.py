@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import entry_points
 
-from pans.runtime.cli import parser
+from pans.runtime.cli import command as parser
 from pans.runtime.errors import PansError
 
 from .prose import GENERATED

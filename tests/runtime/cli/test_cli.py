@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from pans.runtime import __version__, cli
-from pans.runtime.cli import Command, finding, main, talk
-from pans.runtime.cli.parser import parser_of
+from pans.runtime.cli import Command, finding, main, printing
+from pans.runtime.cli.command import parser_of
 from pans.runtime.errors import DamagedFileError, LinkError, PansError, TimingError, UsageError
 
 
@@ -256,7 +256,7 @@ def test_a_slow_command_shows_that_it_began(installed: dict[str, object], capsys
     began = threading.Event()
 
     def run(args: argparse.Namespace) -> int:
-        while not talk.has_said():  # pytest's time limit is the only clock here
+        while not printing.has_said():  # pytest's time limit is the only clock here
             began.wait(0.01)
         return 0
 

@@ -12,7 +12,7 @@ import pytest
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import main
-from pans.runtime.cli.parser import parser_of
+from pans.runtime.cli.command import parser_of
 from pans.runtime.commands.run import RUN
 from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.operate.option_file import HERE, prepare_options, write_options

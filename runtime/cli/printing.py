@@ -1,7 +1,4 @@
-"""What a command prints: its answer on stdout, everything for people on stderr, errors as two lines or as one JSON object.
-
-Owns how much is printed (`--quiet`, `--verbose`) and whether the answer has been given, for one call of `main` at a time.
-"""
+"""What a command prints: its answer on stdout, everything for people on stderr, errors as two lines or as one JSON object."""
 
 from __future__ import annotations
 
@@ -22,7 +19,9 @@ _WHERE = re.compile(r"(?:argument (?P<option>[^:]{1,60})|(?P<place>[^\s:]{1,4096
 
 
 @dataclass(slots=True)
-class _Voice:
+class _State:
+    """Of one call of `main`."""
+
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False
@@ -31,43 +30,43 @@ class _Voice:
     command: str = ""
 
 
-_voice = _Voice()
+_state = _State()
 
 
 def begin(words: list[str]) -> None:
     """Set what is printed from here on, by the command line's words."""
-    _voice.quiet = bool({"-q", "--quiet"} & {*words})
-    _voice.verbose = bool({"-v", "--verbose"} & {*words})
-    _voice.as_json = "--json" in words
-    _voice.said = _voice.answered = False
-    _voice.command = next((word for word in words if not word.startswith("-")), "")
+    _state.quiet = bool({"-q", "--quiet"} & {*words})
+    _state.verbose = bool({"-v", "--verbose"} & {*words})
+    _state.as_json = "--json" in words
+    _state.said = _state.answered = False
+    _state.command = next((word for word in words if not word.startswith("-")), "")
 
 
 def is_quiet() -> bool:
     """Return whether `--quiet` was given."""
-    return _voice.quiet
+    return _state.quiet
 
 
 def has_said() -> bool:
     """Return whether anything has been printed since `begin`."""
-    return _voice.said
+    return _state.said
 
 
 def has_answered() -> bool:
     """Return whether the answer has been printed since `begin`."""
-    return _voice.answered
+    return _state.answered
 
 
 def say(text: str) -> None:
     """Print for people, on stderr: stdout belongs to the JSON object or the answer itself. Nothing with `--quiet`."""
     LOGGER.info("%s", text)
-    if not _voice.quiet:
+    if not _state.quiet:
         _print_error(text)
 
 
 def note(text: str) -> None:
     """Print for people who asked for more with `--verbose`."""
-    if _voice.verbose:
+    if _state.verbose:
         say(text)
 
 
@@ -87,11 +86,11 @@ def emit(args: argparse.Namespace, payload: Mapping[str, Any], text: str = "") -
 
 def fail(error: PansError, exit_code: int) -> int:
     """Print an error on stderr, with `--json` also as one object on stdout unless the answer is there; return `exit_code`."""
-    advice = error.remedy or error.usual_remedy.replace("COMMAND", one_line(_voice.command, 20) or "COMMAND")
+    advice = error.remedy or error.usual_remedy.replace("COMMAND", one_line(_state.command, 20) or "COMMAND")
     remedy = f"\n  remedy: {one_line(advice)}" if advice else ""
     # no line of a message can pass for one of ours
     _print_error(f"pans: {error.message}".replace("\n", "\n    ") + remedy, logging.ERROR)
-    if _voice.as_json and not _voice.answered:
+    if _state.as_json and not _state.answered:
         facts = {"message": error.message, "where": where_of(error), "remedy": advice, "exit": exit_code}
         _answer(json.dumps({"error": facts}))
     return exit_code
@@ -110,12 +109,12 @@ def where_of(error: PansError) -> str:
 
 
 def _answer(text: str) -> None:
-    _voice.said = _voice.answered = True
+    _state.said = _state.answered = True
     print(text, flush=True)
 
 
 def _print_error(text: str, level: int = logging.INFO) -> None:
-    _voice.said = True
+    _state.said = True
     print(stderr_line(lines(text), level), file=sys.stderr, flush=True)
 
 
