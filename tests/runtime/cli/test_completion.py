@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 import shutil
 import subprocess
@@ -24,15 +26,10 @@ def scripts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("scripts")
     found = {}
     for shell in ("bash", "zsh", "fish"):
-        with pytest.MonkeyPatch.context() as patch:
-            printed: list[str] = []
-            patch.setattr(
-                "builtins.print",
-                lambda text, file=None, flush=False, to=printed: to.append(text) if file is None else None,
-            )
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
             assert main(["completion", shell]) == 0
         found[shell] = folder / shell
-        found[shell].write_text("\n".join(printed) + "\n")
+        found[shell].write_text(printed.getvalue())
     return found
 
 
