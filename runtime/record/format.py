@@ -26,6 +26,7 @@ MESSAGE_MAX_BYTES = MIB
 LONG_VERDICT = 0xFFFF  # the code of a verdict that has no number, since so many others have one
 RUN_ROWS_MAX = 1 << 31
 MESSAGE = struct.Struct("<qI")
+PART_EVENT = "part"  # the first event of a part: where in the run it begins
 
 
 class Kind(IntEnum):

@@ -1,15 +1,13 @@
-"""Reading recordings that come in parts: a part's place in the run, the chain from one to the next, a folder of them.
+"""Recordings in parts: a part's place in the run, the chain from one to the next, a folder of them as one recording.
 
-Owns the questions across files; blocks are recording.py's, the index part_index.py's, what one file promises is verify.py's, and writing
-parts parted_recorder.py's. `chain_violations` says what is wrong between parts; a deleted beginning is no fault, a hole is.
+`chain_violations` says what is wrong between parts; a beginning that the run deleted itself is no fault, a hole is.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from glob import escape
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,13 +19,11 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.container import Block
 from pans.runtime.errors import DamagedFileError, UsageError
 
-from .format import Kind
-from .part_keeper import INDEX_SUFFIX, chained
-from .parted_recorder import PART_EVENT
+from .format import PART_EVENT, Kind
+from .part_names import chained, find_parts, is_of_parts, part_number, part_path, stem_of
 from .recording import Recording, read_recording
 
 REPEATED = frozenset((Kind.HEADER, Kind.BUNDLE))  # in each part
-NUMBER_DIGITS_MAX = 10  # the index of a block is a u32, and a part has several
 
 
 def part_of(recording: Recording) -> Mapping[str, Any] | None:
@@ -56,38 +52,6 @@ def first_decision(recording: Recording) -> int:
     """Return the number of the first decision: 0 but in a later part."""
     part = part_of(recording)
     return 0 if part is None else int(part["first_decision"])
-
-
-def is_of_parts(path: str | Path) -> bool:
-    """Say whether `path` stands for a recording in parts: a folder, or the index beside the parts."""
-    return Path(path).is_dir() or Path(path).name.endswith(INDEX_SUFFIX)
-
-
-def parts_in(place: str | Path) -> list[Path]:
-    """Return the parts in a folder, or those beside an index, in order; UsageError if there are none."""
-    if paths := find_parts(place):
-        return paths
-    raise UsageError(f"{place}: no parts of a recording are here", remedy="parts are named like run-0001.pansrec")
-
-
-def find_parts(place: str | Path) -> list[Path]:
-    """Return the parts in a folder, or those beside an index, in order."""
-    folder, stem = Path(place), "*"
-    if folder.name.endswith(INDEX_SUFFIX) and not folder.is_dir():
-        folder, stem = folder.parent, escape(folder.name.removesuffix(INDEX_SUFFIX))
-    found = [path for path in folder.glob(f"{stem}-[0-9]*.pansrec") if part_number(path) is not None]
-    return sorted(found, key=lambda path: (stem_of(path), part_number(path)))
-
-
-def part_number(path: Path) -> int | None:
-    """Return the number in the name of a part: 12 for `run-0012.pansrec`; None for other names."""
-    digits = path.stem.rpartition("-")[2]
-    return int(digits) if digits.isdecimal() and len(digits) <= NUMBER_DIGITS_MAX else None
-
-
-def stem_of(path: Path) -> str:
-    """Return what the parts of one run have in common: `run` for `run-0012.pansrec`."""
-    return path.stem.rpartition("-")[0]
 
 
 def chain_violations(recordings: list[Recording]) -> list[str]:
@@ -122,6 +86,23 @@ def chain_violations(recordings: list[Recording]) -> list[str]:
         if second["first_decision"] != first["first_decision"] + earlier.n_decisions:
             violations.append(f"{where}: it begins with decision {second['first_decision']}, which does not follow")
     return violations
+
+
+def missing_parts(recordings: Sequence[Recording]) -> Iterator[str]:
+    """Yield what is missing at the beginning and at the end of one run's parts, and what is there although the run had ended."""
+    known = [(recording, part) for recording in recordings if (part := part_of(recording)) is not None]
+    for place, (recording, part) in enumerate(known):
+        following = recording.summary.get("next") if "part_ended" in recording.summary else None
+        name, is_last = recording.path.name, place + 1 == len(known)
+        if following is not None and is_last:
+            yield f"{ascii(following)[:80]} is missing: {name} continues in it"
+        if recording.complete and following is None and not is_last:
+            yield f"{known[place + 1][0].path.name} is surplus: the run ended with {name}"
+        if place == 0:
+            gone = max(int((one.get("deleted") or {}).get("parts", 0)) for _, one in known)
+            first = recording.path.with_name(f"{stem_of(recording.path)}{recording.path.suffix}")
+            for number in range(gone + 1, int(part["number"])):
+                yield f"{part_path(first, number).name} is missing: the run did not delete it"
 
 
 def _chain_before(part: Mapping[str, Any]) -> str:

@@ -1,18 +1,19 @@
-"""Append-only recordings: everything a run saw and decided, in one file that survives a power cut.
+"""Append-only recordings: everything a run saw and decided, in one file or in parts, which survive a power cut.
 
-Owns the writing, in bounded batches; reading is recording.py's. Never decides what is worth keeping
-and never converts a time. `Recorder.close` returns the SHA-256 of the decision log, which a replay must give again.
+What is added is buffered; full buffers and `flush` write blocks to a `RecordingFile`. `Recorder.close` returns the SHA-256 of the decision
+log, which a replay must give again. Reading is recording.py's.
 """
 
 from __future__ import annotations
 
-import hashlib
-import itertools
-import os
+import secrets
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
@@ -20,19 +21,21 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import MIB, block_ends, canonical_json, file_prologue
+from pans.runtime.container import MIB
 from pans.runtime.core.decision import DECISION_DTYPE, NumberedDecisions
+from pans.runtime.core.plan import Plan
+from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import PansError, RecordingError, UsageError
-from pans.runtime.outputs import beside_name, place_new, refuse_existing, sync_folder
+from pans.runtime.outputs import refuse_existing
 from pans.runtime.timing.clock import CLOCK_DTYPE
+from pans.runtime.wire.commands import Arm, pack_arm
 from pans.runtime.wire.frame import Messages
+from pans.runtime.wire.messages import Opcode, encode_command
 
-from .buffers import BUFFER_ROWS, ByteBuffer, RowBuffer
 from .format import (
-    LIMITS,
-    MAGIC,
     MESSAGE,
     MESSAGE_MAX_BYTES,
+    PART_EVENT,
     RUNS_VERSION,
     TIMING_DTYPE,
     TIMING_ROWS_MAX,
@@ -42,139 +45,207 @@ from .format import (
     version_for,
 )
 from .log import LogEncoder
+from .part_names import chained, files_of_parts, part_path
+from .recording_file import RecordingFile
 
+BUFFER_ROWS = 4096
+RESERVE_PARTS = 2  # of free disk, below which the oldest parts are deleted before their time
+RETRY_S = 5.0  # after a part could not be made
 _MESSAGE_BUFFER_BYTES = MIB // 4
 _EVENT_BUFFER_BYTES = MIB // 16
 _FIRST_KINDS = (Kind.MESSAGES, Kind.DECISIONS, Kind.END)  # with them a run has begun
 _COPIED_BYTES = MIB // 4  # of a block that is put together before it is written, in one call
 
 
+@dataclass(frozen=True, slots=True)
+class PartLimits:
+    """A part is closed once it has `rotate_bytes`; closed and open ones together stay within `keep_bytes` (0: no cap)."""
+
+    rotate_bytes: int
+    keep_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rotate_bytes < 1:
+            raise UsageError(f"a part must hold at least 1 byte, found {self.rotate_bytes}")
+        if self.keep_bytes and self.keep_bytes < 2 * self.rotate_bytes:
+            raise UsageError(
+                f"{self.keep_bytes} bytes are to be kept in parts of {self.rotate_bytes}",
+                remedy="keep at least two parts: the open one is never deleted",
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class PartFacts:
+    """What the next part says of the one before."""
+
+    name: str
+    bytes: int
+    first_decision: int
+    decisions: int
+    decisions_sha256: str
+    chain_sha256: str
+
+
+def repeated_setup(plan: Plan, arm: Arm, nonce: int) -> list[bytes]:
+    """Return plan, states and ARM as frames of session `nonce`: with them at its beginning a part can be replayed by itself."""
+    bodies = [*plan_commands(plan), (Opcode.ARM, pack_arm(arm))]
+    return [encode_command(number, opcode, body, nonce) for number, (opcode, body) in enumerate(bodies, 1)]
+
+
+class _RowBuffer:
+    """A preallocated table of `BUFFER_ROWS` rows that is emptied into a block."""
+
+    def __init__(self, kind: Kind, dtype: np.dtype[np.void]) -> None:
+        self.kind = kind
+        self.rows = np.full(BUFFER_ROWS, 0, dtype=dtype)  # touched, which np.zeros leaves to the first use
+        self.used = 0
+
+    def room(self) -> int:
+        return len(self.rows) - self.used
+
+    def add(self, row: Sequence[Any]) -> bool:
+        """Store one row; True when the table is full."""
+        self.rows[self.used] = row
+        self.used += 1
+        return not self.room()
+
+    def add_many(self, rows: NDArray[np.void]) -> int:
+        """Store as many rows as there is room for; return how many."""
+        n = min(len(rows), self.room())
+        self.rows[self.used : self.used + n] = rows[:n]
+        self.used += n
+        return n
+
+    def empty(self) -> bytes:
+        data = self.rows[: self.used].tobytes()
+        self.used = 0
+        return data
+
+
+class _ByteBuffer:
+    """A preallocated byte buffer that is emptied into a block."""
+
+    def __init__(self, kind: Kind, size: int) -> None:
+        self.kind = kind
+        self.data = bytearray(size)
+        self.array = np.frombuffer(self.data, np.uint8)  # the same bytes
+        self.array[:] = 0  # touched
+        self.used = 0
+
+    def room(self) -> int:
+        return len(self.data) - self.used
+
+    def add(self, piece: bytes | bytearray | memoryview) -> None:
+        self.data[self.used : self.used + len(piece)] = piece
+        self.used += len(piece)
+
+    def empty(self) -> bytes:
+        data = bytes(memoryview(self.data)[: self.used])
+        self.used = 0
+        return data
+
+
 class Recorder:
-    """Writes one recording; one thread at a time. Adding buffers, a full buffer is written at once, `flush` writes the rest.
+    """Writes one recording, in parts where `limits` are given; one thread at a time.
 
     Left by an exception or not closed at all, the recording has no END block and reads as incomplete, which it is.
     """
 
     def __init__(
-        self, path: str | Path, header: Mapping[str, Any], *, bundle: bytes = b"", overwrite: bool = False
+        self,
+        path: str | Path,
+        header: Mapping[str, Any],
+        *,
+        bundle: bytes = b"",
+        overwrite: bool = False,
+        limits: PartLimits | None = None,
     ) -> None:
-        """Create `path` (UsageError if it exists, unless `overwrite`) and write header and bundle to it.
+        """Create `path`, or part 1 beside it (`part_path`); UsageError if it exists, unless `overwrite`.
 
-        The file is there with both or not at all. One that is replaced stays until there are messages, decisions or an end to write: a
-        device that refuses before that costs nobody a recording.
-        `header` is JSON-able; `format_version`, `created_utc` and `bundle_sha256` are added where they are missing.
+        Header and bundle are in the file, or it is not there. What is replaced stays until there are messages, decisions or an end to
+        write: a device that refuses before that costs nobody a recording. `header` is JSON-able; `format_version`, `created_utc` and
+        `bundle_sha256` are added where they are missing.
         """
-        self.path = Path(path)
+        self.path, self.limits = Path(path), limits
         self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
-        self.before_first: Callable[[], None] | None = (
-            None  # called once, before messages, decisions or END are written
-        )
-        self._unplaced: Path | None = None  # where the file is until then, if it is to replace another one
-        self._messages = ByteBuffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
-        self._commands = ByteBuffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
-        self._answers = ByteBuffer(Kind.ANSWERS, _EVENT_BUFFER_BYTES)
-        self._events = ByteBuffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
-        self._decisions = RowBuffer(Kind.DECISIONS, DECISION_DTYPE)
-        self._timings = RowBuffer(Kind.TIMINGS, TIMING_DTYPE)
-        self._timing_runs = RowBuffer(Kind.TIMING_RUNS, TIMING_RUN_DTYPE)
+        self.parts = 0  # 0: one file
+        self._header = {"created_utc": datetime.now(UTC).isoformat(timespec="seconds"), **header}
+        self._bundle = bundle
+        self._version = version_for(header)
+        self._messages = _ByteBuffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
+        self._commands = _ByteBuffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
+        self._answers = _ByteBuffer(Kind.ANSWERS, _EVENT_BUFFER_BYTES)
+        self._events = _ByteBuffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
+        self._decisions = _RowBuffer(Kind.DECISIONS, DECISION_DTYPE)
+        self._timings = _RowBuffer(Kind.TIMINGS, TIMING_DTYPE)
+        self._timing_runs = _RowBuffer(Kind.TIMING_RUNS, TIMING_RUN_DTYPE)
         self._in_runs = 0  # decisions in these
-        # A decision goes out behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
+        # A decision is written behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
         self._first = (self._commands, self._answers, self._messages, self._decisions)
         self._in_order = (*self._first, self._timings, self._timing_runs)
-        self._log = LogEncoder()
         self._pack, self._pack_stamped = _packing()
-        self._n_decisions = self._n_blocks = 0
-        self.first_decision = 0  # of a run in parts
-        self._version = version = version_for(header)
-        facts = {"format_version": version, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
-        facts |= {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
-        text = canonical_json({**facts, **header})
-        if not overwrite and os.path.lexists(self.path):
-            raise refuse_existing(self.path)
-        beside = beside_name(self.path)
-        self._file = _create(beside, self.path)
-        self._has_names = os.fstat(self._file.fileno()).st_nlink > 0  # not every file system counts them
-        start, self._chain = file_prologue(MAGIC, version)
-        self._end = 0
+        self._replaced = self._files_in_the_way(overwrite)
+        self._kept: Path | None = None  # the open file, continued elsewhere: its folder was deleted
+        if limits is None:
+            self.open_file = RecordingFile(self.path, self._header, bundle)
+        else:
+            self._begin_parts()
         try:
-            self._write(start)
-            self._write_block(Kind.HEADER, text)
-            if bundle:
-                self._write_block(Kind.BUNDLE, bundle)
-            self.sync()
-            if overwrite and os.path.lexists(self.path):
-                self.before_first, self._unplaced = self._take_place, beside
-                return
-            _place(beside, self.path, overwrite=False)
+            if not self._replaced:
+                self.open_file.take_name()
         except BaseException:
-            self._file.close()
-            with suppress(OSError):
-                beside.unlink(missing_ok=True)
+            self._abandon()
             raise
-        sync_folder(self.path.parent)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        if self._file.closed:
-            return self._drop_unplaced()
         try:
-            self.keep_deleted()
-            self.flush()
-            self._close_file()
+            if not self.open_file.is_closed:
+                self.keep_deleted()
+                self.flush()
+                self.open_file.close()
         except PansError:
             if error[1] is None:
                 raise
         finally:
-            with suppress(OSError):
-                self._file.close()  # where `flush` failed
-            self._drop_unplaced()
+            self._abandon()
 
     @property
-    def size_bytes(self) -> int:
-        """Bytes in the file, all of them in whole blocks."""
-        return self._end
+    def open_path(self) -> Path:
+        """The file that is being written."""
+        return self.open_file.path
 
     @property
     def written(self) -> tuple[int, str]:
-        """Number of the decisions in the file and the SHA-256 (hex) of their log; all of them after `flush`."""
-        return self._n_decisions, self._log.hexdigest()
+        """Number of the decisions in the open file and the SHA-256 (hex) of their log; all of them after `flush`."""
+        return self.open_file.n_decisions, self.open_file.log.hexdigest()
 
     @property
     def n_written(self) -> int:
-        """Number of the decisions in the file, for another thread too."""
-        return self.first_decision + self._n_decisions
+        """Number of the decisions on disk, for another thread too."""
+        return self.open_file.first_decision + self.open_file.n_decisions
 
     @property
     def is_deleted(self) -> bool:
-        """Whether the open file has no name any more; for another thread too."""
-        try:
-            return self._has_names and os.fstat(self._file.fileno()).st_nlink == 0
-        except (OSError, ValueError):  # it is closed
-            return False
+        """Whether somebody has deleted the open file; for another thread too."""
+        return self.open_file.is_deleted
 
     def keep_deleted(self) -> Path | None:
-        """Go on in a copy beside the folder of a file that was deleted; return its path, None where nothing was deleted.
+        """Continue in a copy beside the folder of a file that was deleted; return its path, None where nothing was deleted.
 
-        A file without a name cannot be given one again (link(2) refuses it), but it can be read as long as it is open.
+        Parts that were closed before cannot be kept.
         """
         if not self.is_deleted:
             return None
-        self.before_first = self._unplaced = None
+        self._replaced = []
         self.flush()
-        deleted, path = self._file, self.path.absolute()
-        try:
-            self.path = _folder_beside(path.parent) / path.name.removeprefix(".")
-            self._file = _create(self.path, self.path)
-            deleted.seek(0)
-            shutil.copyfileobj(deleted, self._file, MIB)
-        except OSError as error:
-            raise self._broken(error) from error
-        finally:
-            deleted.close()
-        self.sync()
-        return self.path
+        self.open_file.keep_deleted()
+        self._kept = self.open_file.path
+        if not self.parts:
+            self.path = self._kept
+        return self._kept
 
     def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
@@ -215,11 +286,11 @@ class Recorder:
     def add_decision(self, record: Sequence[Any]) -> None:
         """Keep one decision: a tuple in the order of DECISION_DTYPE."""
         if self._decisions.add(record):
-            self._empty(self._decisions)
+            self._write_up_to(self._decisions)
 
     def prepare(self, decisions: NumberedDecisions) -> None:
         """Be ready for many decisions by the same verdicts, before arming."""
-        self._log.prepare(decisions)
+        self.open_file.log.prepare(decisions)
 
     def add_decisions(self, many: NDArray[np.void] | NumberedDecisions) -> None:
         """Keep many decisions, rows DECISION_DTYPE (n,) or numbered; more than a buffer holds go out at once."""
@@ -227,16 +298,16 @@ class Recorder:
             self._decisions.add_many(many.rows if isinstance(many, NumberedDecisions) else many)
             return
         n, blocks = self._decisions.used + len(many), self._blocks_of(*self._first)
-        for payload in self._log.blocks(many):
+        for payload in self.open_file.log.blocks(many):
             blocks += self._framed(Kind.DECISIONS, payload)
         self._write(b"".join(blocks))  # a few long writes take half the time of many short ones
-        self._n_decisions += n
+        self.open_file.n_decisions += n
 
     def add_timing(self, record: Sequence[Any]) -> None:
         """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
         self._end_runs()
         if self._timings.add(record):
-            self._empty(self._timings)
+            self._write_up_to(self._timings)
 
     def add_timing_runs(self, runs: NDArray[np.void]) -> None:
         """Keep the host times of many decisions, TIMING_RUN_DTYPE (n,), at most 2^16 of each run."""
@@ -244,7 +315,7 @@ class Recorder:
             self._add_rows(self._timings, expand_timings(runs))
             return
         if self._timings.used:
-            self._empty(self._timings)  # the order of time
+            self._write_up_to(self._timings)  # the order of time
         self._in_runs += int(runs["count"].sum())
         self._add_rows(self._timing_runs, runs)
         if self._in_runs > TIMING_ROWS_MAX // 2:
@@ -252,14 +323,14 @@ class Recorder:
 
     def _end_runs(self) -> None:
         if self._timing_runs.used:
-            self._empty(self._timing_runs)
+            self._write_up_to(self._timing_runs)
 
-    def _add_rows(self, buffer: RowBuffer, rows: NDArray[np.void]) -> None:
+    def _add_rows(self, buffer: _RowBuffer, rows: NDArray[np.void]) -> None:
         done = 0
         while done < len(rows):
             done += buffer.add_many(rows[done:])
             if not buffer.room():
-                self._empty(buffer)
+                self._write_up_to(buffer)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
         """Keep one JSON-able event: a gap, an alarm, a late decision, a link that went away."""
@@ -267,7 +338,7 @@ class Recorder:
         if len(line) > len(self._events.data):
             raise UsageError(f"an event of {len(line)} bytes, allowed at most {len(self._events.data)}")
         if len(line) > self._events.room():
-            self._empty(self._events)
+            self._write_up_to(self._events)
         self._events.add(line)
 
     def add_clock(self, samples: NDArray[np.void]) -> None:
@@ -282,74 +353,192 @@ class Recorder:
 
     def flush_decisions(self) -> None:
         """Write what the decisions so far are made of, and these: as much as an action upon them needs on record before it."""
-        self._empty(self._decisions)
-
-    def _flush(self, *buffers: RowBuffer | ByteBuffer) -> None:
-        n_decisions = self._decisions.used if self._decisions in buffers else 0
-        if blocks := self._blocks_of(*buffers):
-            self._write(b"".join(blocks))
-            self._n_decisions += n_decisions
-
-    def _blocks_of(self, *buffers: RowBuffer | ByteBuffer) -> list[bytes | memoryview]:
-        """Empty buffers into the pieces of blocks, which must be written next."""
-        return [piece for buffer in buffers if buffer.used for piece in self._block_of(buffer)]
+        self._write_up_to(self._decisions)
 
     def sync(self) -> None:
         """Flush, and wait until it survives a power cut: milliseconds, never on the hot path."""
         self.flush()
-        try:
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            raise self._broken(error) from error
+        self.open_file.sync()
 
     def close(self, summary: Mapping[str, Any]) -> str:
-        """Flush, write END with `summary` (JSON-able), sync, close; return the SHA-256 (hex) of the decision log."""
+        """Flush, write END with `summary` (JSON-able), sync, close; return the SHA-256 (hex) of the decision log.
+
+        Of parts it is the hash over all their logs (`chained`), and RecordingError says that one of them has no END.
+        """
         self.keep_deleted()
         self.flush()
-        digest = self._log.hexdigest()
-        end = {"blocks": self._n_blocks, "decisions": self._n_decisions, "decisions_sha256": digest, "summary": summary}
-        self._write_block(Kind.END, canonical_json(end))
-        self.sync()
-        self._close_file()
-        return digest
-
-    def _close_file(self) -> None:
-        """Close the file; RecordingError, which names it, where the disk fails only then."""
-        try:
-            self._file.close()
-        except OSError as error:
+        self.replace_old()
+        digest = self.open_file.finish(summary)
+        if not self.parts:
+            return digest
+        self._worker.shutdown(wait=True)
+        self._note_finished()
+        if self._trouble and self._kept is None:
             raise RecordingError(
-                f"{self.path}: the disk failed when the recording was closed: {error.strerror or error}",
-                remedy="check the disk, and the file with `pans verify`",
-            ) from error
+                f"the run has ended, and its recording is not whole: {self._trouble}", remedy="verify the folder of parts"
+            )
+        return chained(self._chain, digest)
 
-    def begin(self) -> None:
-        """Take the place of what is replaced, if that has not been done; RecordingError if it cannot be."""
-        taking, self.before_first = self.before_first, None
+    # -- parts ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def wants_part(self) -> bool:
+        """Whether the open part is full and the next one has been made; a deleted one is the last (`keep_deleted`)."""
+        if self.limits is None or self.open_file.size_bytes < self.limits.rotate_bytes or self.open_file.is_deleted:
+            return False
+        if not self._next.done():
+            return False
+        if (error := self._next.exception()) is None:
+            return True
+        if time.monotonic() - self._tried_s > RETRY_S:  # the open part continues; on a full disk its next write says so
+            self._news.append({"kind": "parts_trouble", "message": str(error)})
+            self._make_next()
+        return False
+
+    def next_part(self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int) -> None:
+        """Continue in the next part, which begins at `place` (of the core); `commands` repeat the plan and ARM, so that it stands alone."""
+        self.replace_old()
+        self.flush()
+        full, made = self.open_file, self._next.result()
+        decisions, digest = self.written
+        chain = chained(self._chain, digest)
+        facts = PartFacts(full.path.name, full.size_bytes, full.first_decision, decisions, digest, chain)
+        made.first_decision, self._chain, self.open_file = full.first_decision + decisions, chain, made
+        self._closed.append(facts)
+        struck = self._strike_oldest()
+        self._begin_part(place, commands, host_ns, facts)
         try:
-            if taking is not None:
-                taking()
+            made.take_name()
+        except UsageError as error:
+            raise RecordingError(
+                f"{made.path}: the part cannot be begun: {error.message}", remedy="the parts before it are readable"
+            ) from error
+        self._finishing.append(self._worker.submit(_finish_part, full, made.path.name, struck))
+        self._make_next()
+
+    def news(self) -> list[dict[str, Any]]:
+        """Return what has happened to the parts since the last call, as events."""
+        self._note_finished()
+        news, self._news = self._news, []
+        return news
+
+    def replace_old(self) -> None:
+        """Take the place of what is replaced, if that has not been done; RecordingError if it cannot be."""
+        if self.open_file.has_name:
+            return
+        try:
+            if self.parts:
+                for old in self._replaced:
+                    _remove(old)
+            self.open_file.take_name(overwrite=bool(self._replaced))
+            self._replaced = []
         except PansError as error:
-            self._file.close()
+            self.open_file.discard()
             raise RecordingError(error.message, remedy=error.remedy) from error
 
-    def _take_place(self) -> None:
-        assert self._unplaced is not None
-        _place(self._unplaced, self.path, overwrite=True)
-        self._unplaced = None
-        sync_folder(self.path.parent)
+    def _files_in_the_way(self, overwrite: bool) -> list[Path]:
+        """Return the files that this recording will replace; what was only made ahead is deleted at once."""
+        there = [self.path] * self.path.exists() if self.limits is None else files_of_parts(self.path)
+        if there and not overwrite:
+            raise refuse_existing(there[0])
+        for ahead in (one for one in there if one.name.startswith(".")):
+            _remove(ahead)
+        return [one for one in there if not one.name.startswith(".")]
 
-    def _drop_unplaced(self) -> None:
-        if self._unplaced is not None:
-            with suppress(OSError):
-                self._unplaced.unlink(missing_ok=True)
+    def _begin_parts(self) -> None:
+        self._run, self._chain, self._trouble, self._tried_s = secrets.token_hex(8), "", "", 0.0
+        self._closed: deque[PartFacts] = deque()
+        self._deleted = {"parts": 0, "bytes": 0, "decisions": 0}
+        self._news: list[dict[str, Any]] = []
+        self._finishing: list[Future[None]] = []
+        # files are made and closed by another thread, so that the loop never waits for a disk over a rotation
+        self._worker = ThreadPoolExecutor(1, "pans-parts")
+        self.open_file = self._make_part(1)
+        try:
+            self._begin_part({"decisions": 0}, (), 0, None)
+            self.open_file.sync()  # a part with a name says where it begins; later ones cannot be waited for (`parts.part_of`)
+        except BaseException:
+            self._abandon()
+            raise
 
-    def _add_bytes(self, buffer: ByteBuffer, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+    def _begin_part(
+        self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int, before: PartFacts | None
+    ) -> None:
+        self.parts += 1
+        self.add_event(
+            {
+                "kind": PART_EVENT,
+                "number": self.parts,
+                "utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+                "first_decision": self.open_file.first_decision,
+                "before": None if before is None else asdict(before),
+                "deleted": dict(self._deleted),
+                "place": dict(place),
+            }
+        )
+        for data in commands:
+            self.add_command(host_ns, data)
+        self._flush(self._events, *self._in_order)
+        if before is None:
+            self._make_next()
+
+    def _make_part(self, number: int) -> RecordingFile:
+        path = part_path(self.path, number)
+        header = {**self._header, "part": {"number": number, "run": self._run, "file": path.name}}
+        return RecordingFile(path, header, self._bundle)
+
+    def _make_next(self) -> None:
+        self._tried_s = time.monotonic()
+        self._next = self._worker.submit(self._make_part, self.parts + 1)
+
+    def _strike_oldest(self) -> list[Path]:
+        """Return the parts to delete, so that those that stay keep within the limits; the part that begins now says how many are gone."""
+        assert self.limits is not None
+        struck = []
+        needed = RESERVE_PARTS * self.limits.rotate_bytes
+        free = shutil.disk_usage(self.path.parent).free
+        while len(self._closed) > 1:
+            kept = sum(part.bytes for part in self._closed) + self.limits.rotate_bytes
+            if self.limits.keep_bytes and kept > self.limits.keep_bytes:
+                why = "the cap"
+            elif free < needed:
+                why = "the disk is nearly full"
+            else:
+                break
+            oldest = self._closed.popleft()
+            free += oldest.bytes
+            for key, value in (("parts", 1), ("bytes", oldest.bytes), ("decisions", oldest.decisions)):
+                self._deleted[key] += value
+            self._news.append({"kind": "part_deleted", "name": oldest.name, "bytes": oldest.bytes, "why": why})
+            struck.append(self.path.with_name(oldest.name))
+        return struck
+
+    def _note_finished(self) -> None:
+        """Look at what the other thread has done."""
+        if not self.parts:
+            return
+        for done in [one for one in self._finishing if one.done()]:
+            self._finishing.remove(done)
+            if (error := done.exception()) is not None:
+                self._trouble = getattr(error, "message", str(error))
+                self._news.append({"kind": "parts_trouble", "message": self._trouble})
+
+    def _abandon(self) -> None:
+        """Leave nothing behind that has no name."""
+        self.open_file.discard()
+        if self.limits is not None:
+            self._worker.shutdown(wait=True)
+            with suppress(Exception):  # it could not be made
+                self._next.result().discard()
+
+    # -- blocks --------------------------------------------------------------------------------------------------------
+
+    def _add_bytes(self, buffer: _ByteBuffer, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         if len(data) > MESSAGE_MAX_BYTES:
             raise UsageError(f"a message of {len(data)} bytes, allowed at most {MESSAGE_MAX_BYTES}")
         needed = MESSAGE.size + len(data)
         if needed > buffer.room():
-            self._empty(buffer)
+            self._write_up_to(buffer)
         if needed > buffer.room():
             self._write_block(buffer.kind, MESSAGE.pack(host_ns, len(data)) + bytes(data))
             return
@@ -357,21 +546,31 @@ class Recorder:
         buffer.used += MESSAGE.size
         buffer.add(data)
 
-    def _empty(self, buffer: RowBuffer | ByteBuffer) -> None:
+    def _write_up_to(self, buffer: _RowBuffer | _ByteBuffer) -> None:
         """Write a buffer to the file, and before it what must stand before it."""
         if buffer in self._in_order:
             self._flush(*self._in_order[: self._in_order.index(buffer) + 1])
         else:
             self._flush(buffer)
 
-    def _block_of(self, buffer: RowBuffer | ByteBuffer) -> tuple[bytes | memoryview, ...]:
+    def _flush(self, *buffers: _RowBuffer | _ByteBuffer) -> None:
+        n_decisions = self._decisions.used if self._decisions in buffers else 0
+        if blocks := self._blocks_of(*buffers):
+            self._write(b"".join(blocks))
+            self.open_file.n_decisions += n_decisions
+
+    def _blocks_of(self, *buffers: _RowBuffer | _ByteBuffer) -> list[bytes | memoryview]:
+        """Empty buffers into the pieces of blocks, which must be written next."""
+        return [piece for buffer in buffers if buffer.used for piece in self._block_of(buffer)]
+
+    def _block_of(self, buffer: _RowBuffer | _ByteBuffer) -> tuple[bytes | memoryview, ...]:
         if buffer is self._decisions:
             rows = self._decisions.rows[: self._decisions.used]
             self._decisions.used = 0
-            return self._framed(Kind.DECISIONS, self._log.block(rows))
+            return self._framed(Kind.DECISIONS, self.open_file.log.block(rows))
         if buffer is self._timing_runs:
             self._in_runs = 0
-        return self._framed(buffer.kind, buffer.take())
+        return self._framed(buffer.kind, buffer.empty())
 
     def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:
         pieces = self._framed(kind, payload)
@@ -381,42 +580,15 @@ class Recorder:
             self._write(b"".join(pieces))
 
     def _framed(self, kind: Kind, payload: bytes | memoryview) -> tuple[bytes, bytes | memoryview, bytes]:
-        """Return what stands before a payload, the payload, and what stands behind it: the next block."""
-        if self.before_first is not None and kind in _FIRST_KINDS:
-            self.begin()
-        if len(payload) > LIMITS[kind]:
-            raise UsageError(f"a {kind.name} block of {len(payload)} bytes, allowed at most {LIMITS[kind]}")
-        head, tail, self._chain = block_ends(kind, self._n_blocks, self._chain, payload)
-        self._n_blocks += 1
-        return head, payload, tail
+        if kind in _FIRST_KINDS:
+            self.replace_old()
+        return self.open_file.framed(kind, payload)
 
     def _write(self, *pieces: bytes | memoryview) -> None:
-        """Write one whole block (or the prologue); `_end` moves when all of it is there."""
-        if self._file.closed:
-            raise UsageError(f"{self.path}: this recording is closed")
         began_ns = time.perf_counter_ns()
-        try:
-            for piece in pieces:
-                view = memoryview(piece)
-                while view:
-                    view = view[self._file.write(view) :]
-        except OSError as error:
-            raise self._broken(error) from error
-        self._end += sum(len(piece) for piece in pieces)
+        self.open_file.write(*pieces)
         if self.watch_write is not None:
             self.watch_write(began_ns, time.perf_counter_ns())
-
-    def _broken(self, error: OSError) -> RecordingError:
-        """Close at the last whole block: a torn one in the middle would make everything behind it unreadable."""
-        with suppress(OSError):  # otherwise the reader stops at the torn block by itself
-            self._file.truncate(self._end)
-        with suppress(OSError):  # the first error says what is wrong
-            self._file.close()
-        reason = error.strerror or str(error)
-        return RecordingError(
-            f"{self.path}: the recording stops after {self._end} bytes: {reason}",
-            remedy="make room on the disk; what was written before is readable",
-        )
 
 
 def load_kernels() -> None:
@@ -434,31 +606,18 @@ def _packing() -> tuple[Any, Any]:
     return pack_messages, pack_stamped
 
 
-def _create(beside: Path, path: Path) -> Any:
+def _finish_part(full: RecordingFile, following: str, struck: list[Path]) -> None:
+    """Write END to a full part, and delete the oldest ones."""
     try:
-        return open(beside, "x+b", buffering=0)  # one write per block, nothing half written behind our back
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        full.finish({"part_ended": "full", "next": following})
+    finally:
+        full.discard()
+        for path in struck:
+            path.unlink(missing_ok=True)
 
 
-def _folder_beside(folder: Path) -> Path:
-    """Make a new folder beside `folder`, which may be gone itself."""
-    for number in itertools.count(1):
-        kept = folder.with_name(f"{folder.name}-kept" + (f"-{number}" if number > 1 else ""))
-        with suppress(FileExistsError):
-            kept.mkdir(parents=True)
-            return kept
-    raise AssertionError
-
-
-def _place(beside: Path, path: Path, overwrite: bool) -> None:
-    """Give the file its name, now that what makes it readable is on the disk."""
+def _remove(old: Path) -> None:
     try:
-        if overwrite:
-            os.replace(beside, path)
-        else:
-            place_new(beside, path)
-    except FileExistsError as error:
-        raise refuse_existing(path) from error
+        old.unlink(missing_ok=True)
     except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(f"{old}: cannot be replaced: {error.strerror or error}") from error
