@@ -77,5 +77,5 @@ def test_a_recording_of_any_length(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_json_of_many_values(tmp_path: Path) -> None:
-    large_files.large_json(tmp_path / "run.parts.json")
-    demand_small(tmp_path, (1, 2), "verify", "run.parts.json")
+    large_files.large_json(tmp_path / "lab.json")
+    demand_small(tmp_path, (1, 2), "verify", "lab.json")

@@ -204,8 +204,8 @@ def host(url: str, script_path: str, recording: str) -> None:
     disturber = Disturber(make_decider(bundle, backend="table"), script)
     core = Core(plan, disturber, 1, 0)  # type: ignore[arg-type]
     with Recorder(recording, {"simulated": True}, bundle=bundle_bytes(bundle)) as recorder:
-        piped = PipedFile(recorder._file)
-        recorder._file = piped
+        piped = PipedFile(recorder.open_file._file)
+        recorder.open_file._file = piped
 
         def prepared(run: LiveRun) -> None:
             disturber.prepared(run)

@@ -27,7 +27,7 @@ from pans.runtime.cli import EXIT_FINE, say
 from pans.runtime.errors import PansError
 from pans.runtime.live.continuous import ASKED_TO_STOP
 from pans.runtime.record import read_recording, replay
-from pans.runtime.record.parts import parts_in
+from pans.runtime.record.part_names import parts_in
 from pans.runtime.report.verify import verify_parts
 
 from . import Report, Trial, figures_text

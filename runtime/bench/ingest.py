@@ -23,7 +23,7 @@ from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import DarkMonitor
 from pans.runtime.record import Recorder, read_recording, replay
-from pans.runtime.record.parted_recorder import repeated_setup
+from pans.runtime.record.recorder import repeated_setup
 from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.watch import resources_used
 from pans.runtime.wire.bulk import BulkDecoder

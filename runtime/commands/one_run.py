@@ -32,7 +32,6 @@ from pans.runtime.live.continuous import (
     RECORDING_DELETED,
     REFUSED,
     Stop,
-    open_recorder,
     stop_signals,
 )
 from pans.runtime.live.run_options import FLOW, RunOptions
@@ -55,7 +54,7 @@ if TYPE_CHECKING:
     from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.monitor import Monitor
-    from pans.runtime.record import AnyRecorder
+    from pans.runtime.record import Recorder
     from pans.runtime.registration.use import InUse
     from pans.runtime.report.summary import Summary
     from pans.runtime.watch import Watchdog
@@ -412,6 +411,8 @@ def _monitor_of(options: RunOptions) -> Monitor:
 
 def _recorded(options: RunOptions, ready: _Prepared, link: Link, around: _Around) -> Outcome:
     """Run with a recording, if one is asked for."""
+    from pans.runtime.record import Recorder
+
     if options.recording is None:
         result = _watched(options, ready, link, None, around)
         return _conclude(options, ready, result, _summary(options, ready, result))
@@ -420,8 +421,12 @@ def _recorded(options: RunOptions, ready: _Prepared, link: Link, around: _Around
         opened.enter_context(gone_if_refused(options))
         # the bundle's bytes are not held by a name: they may have 64 MiB, and the run begins here
         recorder = opened.enter_context(
-            open_recorder(
-                options.recording, header, _same_bundle(options, ready), part_limits(options), force=options.force
+            Recorder(
+                options.recording,
+                header,
+                bundle=_same_bundle(options, ready),
+                overwrite=options.force,
+                limits=part_limits(options),
             )
         )
         result = _watched(options, ready, link, recorder, around)
@@ -446,7 +451,7 @@ def _same_bundle(options: RunOptions, ready: _Prepared) -> bytes:
 
 
 def _watched(
-    options: RunOptions, ready: _Prepared, link: Link, recorder: AnyRecorder | None, around: _Around
+    options: RunOptions, ready: _Prepared, link: Link, recorder: Recorder | None, around: _Around
 ) -> RunResult:
     """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
     from pans.runtime.live import Observers, Recovery
@@ -523,15 +528,12 @@ def _summary(options: RunOptions, ready: _Prepared, result: RunResult) -> Summar
 
 def _conclude(options: RunOptions, ready: _Prepared, result: RunResult, summary: Summary) -> Outcome:
     """Write the page and return what came of the run."""
-    from pans.runtime.record.part_keeper import index_path
     from pans.runtime.report.summary_page import write_markdown
 
     confusion, page, bundle = result.tally.confusion, options.page, ready.bundle
     if ready.flow_run is not None:
         confusion = confusion + ready.flow_run.core.matcher.confusion
     recording = options.recording
-    if recording is not None and options.rotate_bytes:
-        recording = index_path(recording)
     if page is not None:
         facts = what_was_run(
             options, ready.profile, bundle.name, ready.bundle_sha256, ready.decider.name, recording, summary

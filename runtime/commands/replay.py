@@ -35,7 +35,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from pans.runtime.record.parts import is_of_parts
+    from pans.runtime.record.part_names import is_of_parts
 
     if args.pictures is not None:
         check_outputs([args.pictures], inputs=[args.recording, args.bundle, args.truth], force=args.force)
@@ -66,7 +66,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def _run_parts(args: argparse.Namespace) -> int:
     """Replay each part of a recording by itself."""
-    from pans.runtime.record.parts import parts_in
+    from pans.runtime.record.part_names import parts_in
 
     rows: list[dict[str, Any]] = []
     lines: list[str] = []

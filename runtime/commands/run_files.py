@@ -24,7 +24,8 @@ from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.live.run_options import RunOptions
 from pans.runtime.outputs import check_outputs, make_folder, refuse_existing
-from pans.runtime.record.part_keeper import PartLimits, files_of_parts, index_path
+from pans.runtime.record.part_names import files_of_parts
+from pans.runtime.record.recorder import PartLimits
 from pans.runtime.run_folder import locked, new_run_folder
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ def check_run_files(options: RunOptions) -> None:
     inputs = input_files(options)
     outputs = [path for path in (options.recording, options.page, options.trace) if path is not None]
     if options.recording is not None and options.rotate_bytes:
-        outputs = [index_path(path) if path == options.recording else path for path in outputs]
         parts = files_of_parts(options.recording)
         if parts and not options.force:
             raise refuse_existing(parts[0])

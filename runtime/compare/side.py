@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pans.runtime.container import parse_json_object, read_file
 from pans.runtime.errors import UsageError
 from pans.runtime.record import Recording, read_recording
-from pans.runtime.record.parts import find_parts
+from pans.runtime.record.part_names import find_parts
 
 SUMMARY_MAX_BYTES = 1 << 24
 RECORDING = "run.pansrec"
@@ -51,7 +51,7 @@ class Side:
 def read_side(path: str | Path) -> Side:
     """Return the run at `path`; UsageError where there is none, DamagedFileError for a damaged file."""
     place = Path(path)
-    if place.suffix == ".json" and place.is_file() and not place.name.endswith(".parts.json"):
+    if place.suffix == ".json" and place.is_file():
         return _of_summary(place)
     files = _recordings(place)
     found = [read_recording(one, salvage=True) for one in files]
@@ -76,8 +76,8 @@ def _recordings(place: Path) -> list[Path]:
         raise UsageError(
             f"{place}: {len(whole)} recordings in this folder, expected one run", remedy="name the recording itself"
         )
-    if place.name.endswith(".parts.json"):
-        return list(find_parts(place))
+    if not place.is_file() and (parts := find_parts(place)):
+        return parts
     if not place.is_file():
         raise UsageError(f"{place}: no such file or folder", remedy="name a run's folder, a recording or a summary")
     return [place]

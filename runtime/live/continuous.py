@@ -10,15 +10,13 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the options must not load what a run needs
-    from pans.runtime.record import AnyRecorder
-    from pans.runtime.record.part_keeper import PartLimits
+    pass
 
 INTERRUPTED = "interrupted"
 ASKED_TO_STOP = "stopped by SIGTERM"
@@ -27,17 +25,6 @@ RECORDING_DELETED = "the recording was deleted during the run"
 REFUSED = "the device refused: "  # and what it said
 LOADERS = frozenset(("numba", "llvmlite", "importlib", "_frozen_importlib"))  # top-level modules
 AGAIN_S = 0.02
-
-
-def open_recorder(
-    path: Path, header: Mapping[str, Any], bundle: bytes, limits: PartLimits | None, *, force: bool = False
-) -> AnyRecorder:
-    """Begin the recording, in parts where they are asked for."""
-    from pans.runtime.record import PartedRecorder, Recorder
-
-    if limits is None:
-        return Recorder(path, header, bundle=bundle, overwrite=force)
-    return PartedRecorder(path, header, limits, bundle=bundle, overwrite=force)
 
 
 class Stop:

@@ -21,7 +21,7 @@ from pans.runtime.core.decision import Action
 from pans.runtime.errors import DeviceError, LinkError, UsageError
 from pans.runtime.guests import load_guest
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.record import AnyRecorder
+from pans.runtime.record import Recorder
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire.commands import Gate, pack_gate
 from pans.runtime.wire.messages import Opcode
@@ -61,7 +61,7 @@ class GateCounters:
 class GateQueue:
     """Takes actions from outputs and gets them done within the session's window; `failed` is told the decision of each that was not."""
 
-    def __init__(self, recorder: AnyRecorder | None, journal: Journal) -> None:
+    def __init__(self, recorder: Recorder | None, journal: Journal) -> None:
         self.counters = GateCounters()
         self.actuator: Actuator | None = None  # None: a GATE command, to the instrument itself or to the second one
         self.second: SecondInstrument | None = None

@@ -14,7 +14,7 @@ from pans.runtime.core.decision import CoreEvent
 from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import Connection
 from pans.runtime.logs import log_event
-from pans.runtime.record import AnyRecorder
+from pans.runtime.record import Recorder
 from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.session import Refusal
 
@@ -37,7 +37,7 @@ TROUBLE = (
 class Journal:
     """The notes of one run, across reconnections."""
 
-    def __init__(self, recorder: AnyRecorder | None) -> None:
+    def __init__(self, recorder: Recorder | None) -> None:
         self.events: list[dict[str, Any]] = []
         self.trouble: dict[str, Any] | None = None  # the latest
         self.recorder = recorder
@@ -95,7 +95,7 @@ class Reconciled:
     decoded: Counter[str]  # what the connections that are gone have counted
     contradictions: Counter[str]  # between messages and the clock, or the host's own books
     failed: list[Connection]  # those that broke before they could be armed
-    recorder: AnyRecorder | None
+    recorder: Recorder | None
     ended: str
     link_lost: bool
     taken_here: int  # messages of the present connection that the core was given, or came before ARM

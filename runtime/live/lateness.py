@@ -13,7 +13,7 @@ from pans.runtime.core.decision import RowDecisions
 from pans.runtime.core.plan import Plan
 from pans.runtime.link.base import Link
 from pans.runtime.link.connection import Connection
-from pans.runtime.record import AnyRecorder
+from pans.runtime.record import Recorder
 from pans.runtime.record.format import TIMING_RUN_DTYPE
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.timing.evidence import (
@@ -43,7 +43,7 @@ LEAST_WAIT_S = 0.0002
 class Lateness:
     """The evidence of one run, across reconnections; `attach` before each ARM, `close` at the end."""
 
-    def __init__(self, plan: Plan, deadline_ns: int, link: Link, recorder: AnyRecorder | None) -> None:
+    def __init__(self, plan: Plan, deadline_ns: int, link: Link, recorder: Recorder | None) -> None:
         pause_ns = longest_pause_ns(plan)
         self.evidence = Evidence(link.now_ns, deadline_ns, pause_ns=pause_ns, virtual=link.virtual)
         self.incidents = Incidents(self.evidence)

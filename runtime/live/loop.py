@@ -32,7 +32,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, descriptor_of, link_facts
 from pans.runtime.link.connection import Connection, check_device
 from pans.runtime.link.scene_fit import check_scene
-from pans.runtime.record import AnyRecorder
+from pans.runtime.record import Recorder
 from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime
 from pans.runtime.timing.page_faults import ThreadCounts
@@ -77,7 +77,7 @@ def run_live(
     plan: Plan,
     core: LiveCore,
     config: RunOptions,
-    recorder: AnyRecorder | None = None,
+    recorder: Recorder | None = None,
     recovery: Recovery | None = None,
     observers: Observers = NO_OBSERVERS,
 ) -> RunResult:
@@ -94,7 +94,7 @@ def running(
     plan: Plan,
     core: LiveCore,
     config: RunOptions,
-    recorder: AnyRecorder | None = None,
+    recorder: Recorder | None = None,
     recovery: Recovery | None = None,
     observers: Observers = NO_OBSERVERS,
 ) -> Iterator[RunResult]:
@@ -196,7 +196,7 @@ def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoi
 
 def open_session(
     link: Link,
-    recorder: AnyRecorder | None,
+    recorder: Recorder | None,
     plan: Plan,
     bundle: Bundle,
     tick_hz: int,

@@ -17,8 +17,8 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
-from pans.runtime.record import AnyRecorder, PartedRecorder
-from pans.runtime.record.parted_recorder import repeated_setup
+from pans.runtime.record import Recorder
+from pans.runtime.record.recorder import repeated_setup
 from pans.runtime.timing.clock_check import future_tick
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
@@ -62,7 +62,7 @@ class LiveRun(Reconciled):
         core: LiveCore,
         n_classes: int,
         config: RunOptions,
-        recorder: AnyRecorder | None,
+        recorder: Recorder | None,
         started_ns: int,
     ) -> None:
         self.connection, self.plan, self.core, self.config = connection, plan, core, config
@@ -163,7 +163,7 @@ class LiveRun(Reconciled):
         self.connection.session.submit(Opcode.ARM, pack_arm(arm))
         if self.driver is not None:
             self.driver.begin(self.connection)
-        if isinstance(self.recorder, PartedRecorder):
+        if self.recorder is not None and self.recorder.limits is not None:
             self._setup = repeated_setup(self.plan, arm, self.connection.session.nonce)
         self.last_data_ns = start_ns
         planned_ns = round((arm.n_cycles + 1) * self.plan.cycle_us * NS_PER_US)
@@ -417,9 +417,9 @@ class LiveRun(Reconciled):
     def _turn_page(self, now_ns: int) -> None:
         """Go on in the recording's next part when this one is full and no window is open."""
         recorder = self.recorder
-        if not isinstance(recorder, PartedRecorder):
+        if recorder is None or recorder.limits is None:
             return
-        for event in recorder.keeper.news():
+        for event in recorder.news():
             self.journal.note(**event)
         if recorder.wants_part and (place := self.core.part()) is not None:
             recorder.next_part(place.facts(), self._setup, now_ns)

@@ -207,6 +207,6 @@ class RunOptions:
 
     @property
     def stop_below(self) -> int:
-        """Bytes of free disk below which a run ends. Where parts can be deleted that comes first (part_keeper.py)."""
+        """Bytes of free disk below which a run ends. Where parts can be deleted that comes first."""
         reserve = round(self.disk_reserve_mb * MIB)
         return min(reserve, self.rotate_bytes // 2) if self.rotate_bytes else reserve

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.decision import Decision, Output
     from pans.runtime.live import LiveRun
-    from pans.runtime.record import AnyRecorder
+    from pans.runtime.record import Recorder
 
     from .snapshot import Snapshots
 
@@ -46,7 +46,7 @@ class Monitor:
         self._child: subprocess.Popen[str] | None = None
         self._snapshots: Snapshots | None = None
         self._facts: dict[str, Any] = {}
-        self._wanted: tuple[Bundle, AnyRecorder | None] | None = None
+        self._wanted: tuple[Bundle, Recorder | None] | None = None
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self._latest: deque[Decision] = deque(maxlen=12)
@@ -75,7 +75,7 @@ class Monitor:
         host = parse_address(self._address, "--serve")[0]
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{said['port']}/"
 
-    def begin(self, bundle: Bundle, recorder: AnyRecorder | None, facts: dict[str, Any]) -> None:
+    def begin(self, bundle: Bundle, recorder: Recorder | None, facts: dict[str, Any]) -> None:
         """Start to take pictures, in a thread that inherits no privileges of the loop; `facts` are begin_facts'."""
         self._wanted, self._facts = (bundle, recorder), facts
         if self._child is None and not self._lines:

@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.decision import Decision
     from pans.runtime.live import LiveRun
-    from pans.runtime.record import AnyRecorder
+    from pans.runtime.record import Recorder
 
 LATEST = 12  # decisions
 PIXELS_MAX = 64  # of a side, as it is shown
@@ -54,7 +53,7 @@ def begin_facts(bundle: Bundle, **facts: Any) -> dict[str, Any]:
 class Snapshots:
     """Takes pictures of one run; `latest` are the decisions made last."""
 
-    def __init__(self, run: LiveRun, bundle: Bundle, recorder: AnyRecorder | None, latest: deque[Decision]) -> None:
+    def __init__(self, run: LiveRun, bundle: Bundle, recorder: Recorder | None, latest: deque[Decision]) -> None:
         self._run, self._bundle, self._recorder, self._latest = run, bundle, recorder, latest
         self._began_s = time.monotonic()
         self._counts = np.zeros(0, np.int64)
@@ -189,7 +188,7 @@ class Snapshots:
         now_s = time.monotonic()
         if now_s >= self._disk_due_s:
             self._disk_due_s = now_s + DISK_EVERY_S
-            path = Path(getattr(recorder, "open_path", recorder.path))
+            path = recorder.open_path
             with suppress(OSError):
                 self._disk = {"disk_free_bytes": shutil.disk_usage(path.parent).free, "recording": path.name}
                 self._disk["recording_bytes"] = os.stat(path).st_size

@@ -1,7 +1,7 @@
-"""Append-only recordings: writing one as a whole or in parts, reading it back, deciding it again.
+"""Recordings: writing one, in one file or in parts, reading it back, deciding it again.
 
-Owns the file format (docs/reference/formats.md) and the way from a recording to a core. Everything a run saw and decided is in one file
-that survives a power cut; never judges what is in it (report) and never runs a device (live).
+A recording holds everything that a run saw and decided, in blocks that survive a power cut (docs/reference/formats.md). Start with
+`Recorder` to see what is written, with `read_recording` for the way back, and with `replay` for deciding again.
 
 >>> from pans.runtime.record import read_recording
 >>> read_recording("none.pansrec")
@@ -16,19 +16,16 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .any_recorder import AnyRecorder
-    from .parted_recorder import PartedRecorder
-    from .recorder import Recorder
+    from .recorder import PartLimits, Recorder
     from .recording import Recording, read_recording
     from .replaying import replay
 
-__all__ = ["AnyRecorder", "PartedRecorder", "Recorder", "Recording", "read_recording", "replay"]
+__all__ = ["PartLimits", "Recorder", "Recording", "read_recording", "replay"]
 
 __getattr__ = lazy_names(
     __name__,
     {
-        "AnyRecorder": ".any_recorder",
-        "PartedRecorder": ".parted_recorder",
+        "PartLimits": ".recorder",
         "Recorder": ".recorder",
         "Recording": ".recording",
         "read_recording": ".recording",

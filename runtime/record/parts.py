@@ -95,7 +95,7 @@ def missing_parts(recordings: Sequence[Recording]) -> Iterator[str]:
         following = recording.summary.get("next") if "part_ended" in recording.summary else None
         name, is_last = recording.path.name, place + 1 == len(known)
         if following is not None and is_last:
-            yield f"{ascii(following)[:80]} is missing: {name} continues in it"
+            yield f"{ascii(following)[1:81].rstrip(chr(39))} is missing: {name} continues in it"
         if recording.complete and following is None and not is_last:
             yield f"{known[place + 1][0].path.name} is surplus: the run ended with {name}"
         if place == 0:

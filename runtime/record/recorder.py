@@ -6,6 +6,7 @@ log, which a replay must give again. Reading is recording.py's.
 
 from __future__ import annotations
 
+import os
 import secrets
 import shutil
 import time
@@ -21,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import MIB
+from pans.runtime.container import MIB, canonical_json
 from pans.runtime.core.decision import DECISION_DTYPE, NumberedDecisions
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_commands
@@ -170,7 +171,6 @@ class Recorder:
         self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
         self.parts = 0  # 0: one file
         self._header = {"created_utc": datetime.now(UTC).isoformat(timespec="seconds"), **header}
-        self._bundle = bundle
         self._version = version_for(header)
         self._messages = _ByteBuffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
         self._commands = _ByteBuffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
@@ -185,11 +185,16 @@ class Recorder:
         self._in_order = (*self._first, self._timings, self._timing_runs)
         self._pack, self._pack_stamped = _packing()
         self._replaced = self._files_in_the_way(overwrite)
+        self._closed: deque[PartFacts] = deque()
+        self._deleted = {"parts": 0, "bytes": 0, "decisions": 0}
+        self._chain = self._trouble = ""
+        self._news: list[dict[str, Any]] = []
+        self._finishing: list[Future[None]] = []
         self._kept: Path | None = None  # the open file, continued elsewhere: its folder was deleted
         if limits is None:
             self.open_file = RecordingFile(self.path, self._header, bundle)
         else:
-            self._begin_parts()
+            self._begin_parts(bundle)
         try:
             if not self._replaced:
                 self.open_file.take_name()
@@ -375,11 +380,16 @@ class Recorder:
         self._note_finished()
         if self._trouble and self._kept is None:
             raise RecordingError(
-                f"the run has ended, and its recording is not whole: {self._trouble}", remedy="verify the folder of parts"
+                f"the run has ended, and its recording is not whole: {self._trouble}",
+                remedy="verify the folder of parts",
             )
         return chained(self._chain, digest)
 
     # -- parts ---------------------------------------------------------------------------------------------------------
+
+    _worker: ThreadPoolExecutor
+    _next: Future[RecordingFile]  # the part that is made ahead
+    _tried_s: float
 
     @property
     def wants_part(self) -> bool:
@@ -427,9 +437,8 @@ class Recorder:
         if self.open_file.has_name:
             return
         try:
-            if self.parts:
-                for old in self._replaced:
-                    _remove(old)
+            for old in self._replaced if self.parts else ():
+                _remove(old)
             self.open_file.take_name(overwrite=bool(self._replaced))
             self._replaced = []
         except PansError as error:
@@ -438,19 +447,16 @@ class Recorder:
 
     def _files_in_the_way(self, overwrite: bool) -> list[Path]:
         """Return the files that this recording will replace; what was only made ahead is deleted at once."""
-        there = [self.path] * self.path.exists() if self.limits is None else files_of_parts(self.path)
+        there = [self.path] if os.path.lexists(self.path) else []
+        there += [] if self.limits is None else files_of_parts(self.path)
         if there and not overwrite:
             raise refuse_existing(there[0])
         for ahead in (one for one in there if one.name.startswith(".")):
             _remove(ahead)
         return [one for one in there if not one.name.startswith(".")]
 
-    def _begin_parts(self) -> None:
-        self._run, self._chain, self._trouble, self._tried_s = secrets.token_hex(8), "", "", 0.0
-        self._closed: deque[PartFacts] = deque()
-        self._deleted = {"parts": 0, "bytes": 0, "decisions": 0}
-        self._news: list[dict[str, Any]] = []
-        self._finishing: list[Future[None]] = []
+    def _begin_parts(self, bundle: bytes) -> None:
+        self._run, self._bundle = secrets.token_hex(8), bundle
         # files are made and closed by another thread, so that the loop never waits for a disk over a rotation
         self._worker = ThreadPoolExecutor(1, "pans-parts")
         self.open_file = self._make_part(1)

@@ -37,9 +37,7 @@ class RecordingFile:
         self.first_decision = self.n_decisions = self.n_blocks = self.size_bytes = 0
         self.log = LogEncoder()
         version = version_for(header)
-        facts = {"format_version": version} | (
-            {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
-        )
+        facts = {"format_version": version} | ({"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {})
         text = canonical_json({**facts, **header})
         self._hidden: Path | None = beside_name(path)
         self._file = _create(self._hidden, path)

@@ -20,7 +20,7 @@ from pans.runtime.container import MIB, open_regular
 from pans.runtime.core.decision import Decision, DecisionFlag
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.record import Recording, read_recording, replay
-from pans.runtime.record.parts import is_of_parts, parts_in
+from pans.runtime.record.part_names import is_of_parts, parts_in
 from pans.runtime.record.replaying import ASKED, ClickLog
 from pans.runtime.wire.messages import MalformedMessage, MessageType, decode_welcome, unpack_body
 

@@ -28,9 +28,8 @@ from pans.runtime.instrument.calibration import find_warnings, load_calibration,
 from pans.runtime.instrument.profile import load_profile, parse_profile, shipped_profiles
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
-from pans.runtime.record.part_index import compare_with_index
-from pans.runtime.record.part_keeper import INDEX_SUFFIX
-from pans.runtime.record.parts import chain_violations, find_parts, first_decision, is_of_parts, parts_in, stem_of
+from pans.runtime.record.part_names import is_of_parts, parts_in, stem_of
+from pans.runtime.record.parts import chain_violations, first_decision, missing_parts
 from pans.runtime.record.replaying import replay_faults
 from pans.runtime.registration.file import age_warnings, is_registration, load_registration
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
@@ -107,35 +106,28 @@ def verify_file(path: str | Path) -> FileVerdict:
 
 
 def verify_parts(place: str | Path) -> list[FileVerdict]:
-    """Check each part of the recordings in the folder `place`, or beside the index `place`: the parts, the chain, the index.
+    """Check each part of the recordings in the folder `place`, or of the recording `place`, and the chain from part to part.
 
-    UsageError if neither parts nor an index are there.
+    UsageError if no parts are there.
     """
-    paths = find_parts(place)
-    folder = Path(place) if Path(place).is_dir() else Path(place).parent
-    indices = sorted(folder.glob(f"*{INDEX_SUFFIX}")) if Path(place).is_dir() else [Path(place)]
-    stems = sorted({stem_of(path) for path in paths} | {path.name.removesuffix(INDEX_SUFFIX) for path in indices})
-    if not paths and not any(path.exists() for path in indices):
-        parts_in(place)  # says what is not there
+    paths = parts_in(place)
     verdicts = [verify_file(path) for path in paths]
     damaged = {verdict.path for verdict in verdicts if verdict.damaged}
     chain = FileVerdict(str(place), "parts")
-    for stem in stems:
-        _verify_chain(folder, stem, [path for path in paths if stem_of(path) == stem], damaged, chain)
+    for stem in sorted({stem_of(path) for path in paths}):
+        _verify_chain([path for path in paths if stem_of(path) == stem], damaged, chain)
     return [*verdicts, chain]
 
 
-def _verify_chain(folder: Path, stem: str, paths: list[Path], damaged: set[str], chain: FileVerdict) -> None:
-    """Check what is between the parts of one recording, and what its index says of them."""
-    whole = {path.name: read_recording(path) for path in paths if str(path) not in damaged}
+def _verify_chain(paths: list[Path], damaged: set[str], chain: FileVerdict) -> None:
+    """Check what is between the parts of one recording, and what is missing."""
+    whole = [read_recording(path) for path in paths if str(path) not in damaged]
     try:
-        found = compare_with_index(folder, stem, paths, whole)
-        chain.violations += found.violations
-        chain.alerts += found.alerts
+        chain.violations += missing_parts(whole)
         if len(whole) < len(paths):
             chain.violations.append("the chain cannot be checked: a part is damaged")
         else:
-            chain.violations += chain_violations(list(whole.values()))
+            chain.violations += chain_violations(whole)
     except DamagedFileError as error:
         chain.violations.append(error.message)
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
     from pans.runtime.live.continuous import Stop
     from pans.runtime.live.run_options import RunOptions
-    from pans.runtime.record import AnyRecorder
+    from pans.runtime.record import Recorder
 
     from .host import HostWatch
     from .metrics import MetricsServer
@@ -30,7 +30,7 @@ class Attendants:
     def __init__(
         self,
         wanted: RunOptions,
-        recorder: AnyRecorder | None,
+        recorder: Recorder | None,
         watchdog: Watchdog | None = None,
         stop: Stop | None = None,
         metrics: MetricsServer | None = None,
@@ -103,7 +103,7 @@ class Attendants:
     def _recorded(self) -> Path | None:
         """Return the file that is being written."""
         recorder = self._recorder
-        return None if recorder is None else Path(getattr(recorder, "open_path", recorder.path))
+        return None if recorder is None else recorder.open_path
 
     def _is_deleted(self) -> bool:
         return self._recorder is not None and self._recorder.is_deleted

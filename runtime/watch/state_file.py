@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime.container import canonical_json
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
-from pans.runtime.record import PartedRecorder
 
 from .heartbeat import is_stalled, loop_age_s
 
 if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
-    from pans.runtime.record import AnyRecorder
+    from pans.runtime.record import Recorder
 
 FORMAT = "pans-state 1"
 EVERY_S = 1.0
@@ -31,7 +30,7 @@ GOODBYE_S = 5.0
 OTHER_WRITER_S = 1.0
 
 
-def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: float) -> dict[str, Any]:
+def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float) -> dict[str, Any]:
     """Return the run's figures as they are now, JSON-able, units in the keys; `started_s` is on time.monotonic's scale."""
     picture: dict[str, Any] = {
         "format": FORMAT,
@@ -41,10 +40,9 @@ def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: flo
         "uptime_s": round(time.monotonic() - started_s, 3),
         **resources_used(),
     }
-    if isinstance(recorder, PartedRecorder):
-        picture |= {"recording": str(recorder.open_path), "parts": recorder.parts}
-    elif recorder is not None:
-        picture["recording"] = str(recorder.path)
+    if recorder is not None:
+        picture["recording"] = str(recorder.open_path)
+        picture |= {"parts": recorder.parts} if recorder.parts else {}
     if run is None:
         return picture
     timing, stream, tallies = run.timing, run.core.tracker.counters, run.core.tallies

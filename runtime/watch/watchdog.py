@@ -24,7 +24,7 @@ from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED
 
 if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
-    from pans.runtime.record import AnyRecorder
+    from pans.runtime.record import Recorder
 
 # A loop that turns reads the signal within 20 ms and takes at most 1 s to hear that the device is dark.
 LIGHT_OFF_AFTER_S = 1.5
@@ -40,7 +40,7 @@ class Watchdog:
     def __init__(self, *, continuous: bool) -> None:
         self.run: LiveRun | None = None
         self._continuous = continuous
-        self._recorder: AnyRecorder | None = None
+        self._recorder: Recorder | None = None
         self._told: Callable[[str], None] | None = None
         self._closing = False
         self._done = threading.Event()
@@ -64,7 +64,7 @@ class Watchdog:
         self._thread.join()
         self._hears.close()
 
-    def watch(self, recorder: AnyRecorder | None, told: Callable[[str], None]) -> None:
+    def watch(self, recorder: Recorder | None, told: Callable[[str], None]) -> None:
         """Know what is to be flushed, and whom to tell why the process ends."""
         self._recorder, self._told = recorder, told
 

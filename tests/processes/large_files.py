@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -161,11 +162,6 @@ def long_recording(path: Path, decisions: int) -> Path:
 
 
 def large_json(path: Path) -> Path:
-    """An index of parts with as many values as it may have, each as large in memory as it can be."""
-    entry = (
-        '{"name":"run-%04d.pansrec","bytes":1,"first_decision":0,"decisions":0,"decisions_sha256":"","chain_sha256":""}'
-    )
-    parts = ",".join(entry % number for number in range(1, JSON_VALUES_MAX // 8))
-    deleted = '{"parts":0,"bytes":0,"decisions":0}'
-    path.write_text(f'{{"format":"pans-parts 1","run":"x","deleted":{deleted},"parts":[{parts}]}}')
+    """A calibration with as many values as it may have, each as large in memory as it can be."""
+    path.write_text(json.dumps({"name": [f"run-{number:04d}.pansrec" for number in range(1, JSON_VALUES_MAX - 8)]}))
     return path

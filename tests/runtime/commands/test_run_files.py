@@ -35,7 +35,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 BEFORE = {  # what is there already
     "out": ["taken/run.pansrec"],
     "summary": ["taken/summary.md"],
-    "parts": ["taken/run-0001.pansrec", "taken/run.parts.json", "taken/run-0007.pansrec"],
+    "parts": ["taken/run-0001.pansrec", "taken/run.pansrec", "taken/run-0007.pansrec"],
     "trace": ["trace.txt"],
     "state": ["notes.json"],
 }
@@ -82,12 +82,10 @@ def test_force_replaces_and_only_what_is_written(folder: Path, capsys: pytest.Ca
     json_of(capsys, *words("--out", "a", "--force", "--shots", "2"))
     assert read_recording("a/run.pansrec").decisions_sha256 != first
     parted = json_of(capsys, *words("--out", "a", "--force", "--rotate-mb", "0.3"))
-    assert parted["recording"] == "a/run.parts.json"
+    assert parted["recording"] == "a/run.pansrec"
     assert sorted(os.listdir("a")) == [
         "run-0001.pansrec",
         "run-2notes.pansrec",
-        "run.pansrec",
-        "run.parts.json",
         "summary.md",
     ]
 

@@ -39,7 +39,7 @@ def record(path: Path, faults: str = "", seed: int = 1) -> Path:
 @pytest.fixture
 def small_buffers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Buffers that are full now and then, each in its own time."""
-    monkeypatch.setattr("pans.runtime.record.buffers.BUFFER_ROWS", 23)
+    monkeypatch.setattr("pans.runtime.record.recorder.BUFFER_ROWS", 23)
     monkeypatch.setattr("pans.runtime.record.recorder._MESSAGE_BUFFER_BYTES", 3001)
     monkeypatch.setattr("pans.runtime.live.run.FLUSH_EVERY_NS", 50_000_000)
 

@@ -52,7 +52,7 @@ def test_parts_are_one_recording(folder: Path) -> None:
     assert np.array_equal(clicks.start_tick, wanted.start_tick)
     assert clicks.exposures == wanted.exposures
     assert joined.bundle().classes == one.bundle().classes
-    assert open_recording(folder / "parts/r.parts.json").n_decisions == 150
+    assert open_recording(folder / "parts/r.pansrec").n_decisions == 150
 
 
 def test_a_page_reads_each_part_as_often_however_many_there_are(
@@ -99,8 +99,8 @@ def test_a_folder_stands_for_its_only_recording(folder: Path, tmp_path: Path) ->
 
 
 def test_commands_take_parts_as_one(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    index = str(folder / "parts/r.parts.json")
-    assert main(["export", index, "--format", "csv", "-o", str(tmp_path / "csv")]) == 0
+    name = str(folder / "parts/r.pansrec")
+    assert main(["export", name, "--format", "csv", "-o", str(tmp_path / "csv")]) == 0
     assert "150 decisions" in capsys.readouterr().out
-    assert main(["info", index]) == 0
+    assert main(["info", name]) == 0
     assert "decisions " in capsys.readouterr().out

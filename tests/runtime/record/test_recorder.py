@@ -370,7 +370,7 @@ def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeyp
         def __getattr__(self, name: str) -> Any:
             return getattr(self.file, name)
 
-    monkeypatch.setattr(recorder, "_file", FullDisk(recorder._file))
+    monkeypatch.setattr(recorder.open_file, "_file", FullDisk(recorder.open_file._file))
     recorder.add_decision(decision(1))
     with pytest.raises(PansError, match="recording stops after"):
         recorder.flush()
@@ -382,7 +382,7 @@ def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeyp
 def test_short_writes_are_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.pansrec"
     with Recorder(path, HEADER) as recorder:
-        real = recorder._file
+        real = recorder.open_file._file
 
         class Trickle:
             def write(self, data: memoryview) -> int:
@@ -391,7 +391,7 @@ def test_short_writes_are_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             def __getattr__(self, name: str) -> Any:
                 return getattr(real, name)
 
-        monkeypatch.setattr(recorder, "_file", Trickle())
+        monkeypatch.setattr(recorder.open_file, "_file", Trickle())
         recorder.add_message(1, b"hello" * 20)
         recorder.close({})
     assert list(read_recording(path).messages()) == [(1, b"hello" * 20)]
@@ -466,11 +466,11 @@ class FailsAtClose:
 def test_a_disk_that_fails_at_close_is_told_with_the_files_name(leaves: bool, tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
     recorder = Recorder(path, HEADER)
-    recorder._file = FailsAtClose(recorder._file)  # type: ignore[assignment]
+    recorder.open_file._file = FailsAtClose(recorder.open_file._file)  # type: ignore[assignment]
     with pytest.raises(RecordingError, match=r"a\.pansrec: the disk failed when the recording was closed"):
         if leaves:
             with recorder:
                 pass
         else:
             recorder.close({})
-    assert recorder._file.closed
+    assert recorder.open_file._file.closed

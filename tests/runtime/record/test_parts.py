@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,9 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DamagedFileError, RecordingError, UsageError
 from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
-from pans.runtime.record import PartedRecorder, read_recording, replay
-from pans.runtime.record.part_keeper import PartLimits, index_path, part_path
-from pans.runtime.record.parts import chain_violations, first_decision, part_of, parts_in
+from pans.runtime.record import PartLimits, Recorder, read_recording, replay
+from pans.runtime.record.part_names import part_path, parts_in
+from pans.runtime.record.parts import chain_violations, first_decision, part_of
 from pans.runtime.report.verify import verify_parts
 
 KIB = 1024
@@ -40,11 +39,11 @@ def record(
     core = Core(plan, make_decider(bundle, backend="table"), 1, cycles)
     config = RunOptions(n_cycles=cycles, deadline_us=1e9, realtime=False)
     folder.mkdir(exist_ok=True)
-    with PartedRecorder(folder / "run.pansrec", header, limits, bundle=bundle_bytes(bundle)) as recorder:
+    with Recorder(folder / "run.pansrec", header, bundle=bundle_bytes(bundle), limits=limits) as recorder:
 
         def wait(run: LiveRun, output: Any) -> None:
-            if recorder.open_part.size_bytes >= limits.rotate_bytes and recorder.keeper.ready.empty():
-                recorder.keeper.ready.put(recorder.keeper.ready.get(timeout=20))
+            if recorder.open_file.size_bytes >= limits.rotate_bytes:
+                recorder._next.result(timeout=20)
 
         observers, recovery = Observers(wait, prepared), Recovery.of(link, url, 10.0)
         with pytest.MonkeyPatch.context() as patch:
@@ -109,15 +108,18 @@ def test_parts_replay_under_faults(tmp_path: Path, faults: str) -> None:
 def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> None:
     result = record(tmp_path, PartLimits(48 * KIB, 192 * KIB))
     paths = parts_in(tmp_path)
-    assert part_of(read_recording(paths[0]))["number"] > 1  # type: ignore[index]
+    first, last = part_of(read_recording(paths[0])), part_of(read_recording(paths[-1]))
+    assert first is not None
+    assert last is not None
+    assert first["number"] > 1
     assert sum(path.stat().st_size for path in paths) <= 192 * KIB + 48 * KIB
-    index = json.loads(index_path(tmp_path / "run.pansrec").read_text())
-    assert [entry["name"] for entry in index["parts"]] == [path.name for path in paths]
-    assert index["deleted"]["parts"] + len(paths) == part_of(read_recording(paths[-1]))["number"]  # type: ignore[index]
-    assert index["deleted"]["decisions"] + sum(entry["decisions"] for entry in index["parts"]) == result.tally.decisions
-    assert index["parts"][-1]["chain_sha256"] == result.decisions_sha256
+    assert last["deleted"]["parts"] + len(paths) == last["number"]
+    kept = sum(read_recording(path).n_decisions for path in paths)
+    assert last["deleted"]["decisions"] == first["first_decision"] == result.tally.decisions - kept
     assert all(verdict.ok for verdict in verify_parts(tmp_path)), verify_parts(tmp_path)
     assert "part_deleted" in {event["kind"] for event in result.events}
+    paths[0].unlink()
+    assert f"{paths[0].name} is missing" in " ".join(verify_parts(tmp_path)[-1].violations)
 
 
 def test_a_hole_and_a_strange_part_are_found(parts: Path, tmp_path: Path) -> None:
@@ -133,62 +135,39 @@ def test_a_hole_and_a_strange_part_are_found(parts: Path, tmp_path: Path) -> Non
 
 def test_a_part_that_is_missing_is_found_wherever_it_was(parts: Path, tmp_path: Path) -> None:
     names = [path.name for path in parts_in(parts)]
-    for place, name in enumerate(names):
-        for with_index in (True, False):
-            folder = tmp_path / f"{place}-{with_index}"
-            shutil.copytree(parts, folder)
-            (folder / name).unlink()
-            if not with_index:
-                index_path(folder / "run.pansrec").unlink()
-            *others, found = verify_parts(folder)
-            assert all(other.ok for other in others)
-            assert found.violations, (name, with_index)
-            if with_index:
-                assert f"{name} is missing" in " ".join(found.violations)
+    for name in names[:-1]:
+        folder = tmp_path / name
+        shutil.copytree(parts, folder)
+        (folder / name).unlink()
+        *others, found = verify_parts(folder)
+        assert all(other.ok for other in others)
+        assert "missing" in " ".join(found.violations), name
+    (tmp_path / names[0] / names[-1]).unlink()
+    assert f"{names[-1]} is missing" in " ".join(verify_parts(tmp_path / names[0])[-1].violations)
 
 
 def test_a_surplus_part_is_found_wherever_it_is(parts: Path, tmp_path: Path) -> None:
     paths = parts_in(parts)
     record(tmp_path / "other", PartLimits(48 * KIB), cycles=1500)
     stranger = parts_in(tmp_path / "other")[0]
-    for place, number in enumerate((2, len(paths), len(paths) + 1, 99)):
-        folder = tmp_path / str(place)
+    for number in (2, len(paths) + 1, 99):
+        folder = tmp_path / str(number)
         shutil.copytree(parts, folder)
         shutil.copy(stranger, folder / f"run-{number:04d}.pansrec")
-        *_, found = verify_parts(folder)
-        text = " ".join(found.violations)
-        assert "the index of run" in text, number
+        text = " ".join(verify_parts(folder)[-1].violations)
+        assert "parts of 2 runs" in text, number
         assert "renamed" in text
         if number > len(paths):
             assert "is surplus: the run ended with" in text
 
 
-def test_the_index_stands_for_its_parts(parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "parts"
-    shutil.copytree(parts, folder)
-    index_file = index_path(folder / "run.pansrec")
-    assert json_of(capsys, "verify", index_file)["ok"]
-    assert json_of(capsys, "replay", index_file)["identical"]
-    index = json.loads(index_file.read_text())
-    for change, words in (
-        (lambda it: it["parts"][0].update(decisions=7), "the index says decisions = 7"),
-        (lambda it: it["parts"].pop(1), "is surplus: it is not in the index"),
-        (lambda it: it["deleted"].update(parts=1), "as part 2"),
-        (lambda it: it.update(run="0"), "the index of run '0'"),
-        (lambda it: it.update(format="x"), "not an index of the form"),
-        (lambda it: it["parts"][0].update(name="../run-0001.pansrec"), "not an index of the form"),
-    ):
-        changed = json.loads(json.dumps(index))
-        change(changed)
-        index_file.write_text(json.dumps(changed))
-        found = json_of(capsys, "verify", index_file, code=1)
-        assert words in " ".join(violation["message"] for violation in found["violations"]), words
-    for path in parts_in(folder):
-        path.unlink()
-    index_file.write_text(json.dumps(index))
-    assert len(json_of(capsys, "verify", folder, code=1)["violations"]) == len(index["parts"])
-    index_file.unlink()
-    assert main(["verify", str(folder)]) == main(["verify", str(index_file)]) == 2
+def test_the_name_of_the_recording_stands_for_its_parts(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = parts / "run.pansrec"
+    assert json_of(capsys, "verify", name)["ok"]
+    assert json_of(capsys, "replay", name)["identical"]
+    assert main(["verify", str(tmp_path / "run.pansrec")]) == main(["verify", str(tmp_path)]) == 2
 
 
 def test_a_part_without_its_place_is_refused(parts: Path) -> None:
@@ -206,10 +185,10 @@ def test_a_part_without_its_place_is_refused(parts: Path) -> None:
 
 def test_parts_of_another_run_are_not_overwritten(parts: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="exists already"):
-        PartedRecorder(parts / "run.pansrec", {}, PartLimits(KIB))
+        Recorder(parts / "run.pansrec", {}, limits=PartLimits(KIB))
     path = tmp_path / "run.pansrec"
     for _ in range(2):
-        with PartedRecorder(path, {}, PartLimits(KIB), overwrite=True) as recorder:
+        with Recorder(path, {}, limits=PartLimits(KIB), overwrite=True) as recorder:
             recorder.close({})
     assert parts_in(tmp_path) == [part_path(path, 1)]
 
@@ -224,7 +203,7 @@ def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
     link_states = []
 
     def prepared(run: LiveRun) -> None:
-        file = run.recorder.open_part._file  # type: ignore[union-attr]
+        file = run.recorder.open_file._file  # type: ignore[union-attr]
 
         class Full:
             closed = False
@@ -239,7 +218,7 @@ def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
                 self.closed = True
                 file.close()
 
-        run.recorder.open_part._file = Full()  # type: ignore[union-attr]
+        run.recorder.open_file._file = Full()  # type: ignore[union-attr]
         link_states.append(run)
 
     with pytest.raises(RecordingError, match="No space left on device"):
