@@ -255,7 +255,7 @@ def _check_scene(options: SimOptions, profile: Profile) -> None:
 
 def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
     # TCP, not a pseudo-terminal: a busy machine's kernel hands the bytes of a terminal on tens of milliseconds late
-    # (docs/measurements/timing.md), and a terminal cannot be unplugged.
+    # (docs/measurements/index.md), and a terminal cannot be unplugged.
     listen = ["--listen", "tcp:127.0.0.1:0"]
     words = [sys.executable, "-m", "pans.firmware_sim", *words_of(options), *listen, "--until-stdin-closes"]
     # One BLAS thread: the instrument shares the machine with the host that it is to measure. A session of its own: Ctrl-C is

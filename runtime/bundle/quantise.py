@@ -31,7 +31,7 @@ class QuantisedPatterns:
 
 
 # Rounding keeps the shape better at many levels, error diffusion the light at few: on float patterns of Fashion-MNIST it decided better
-# at 2 and 4 levels, and as well at more (docs/measurements/training.md).
+# at 2 and 4 levels, and as well at more (docs/measurements/index.md).
 DITHER_LEVELS_MAX = 8
 
 

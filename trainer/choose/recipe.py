@@ -1,7 +1,7 @@
 """The size of a training, from the images: how many varied copies, the budget, exposures, states, batch and epochs, with reasons.
 
 Owns the rules and their words; never trains. They were chosen on held-back parts of made-up folders of 300 to 3000 images
-(docs/measurements/training.md), never on held-out images.
+(docs/measurements/index.md), never on held-out images.
 
 Which changes leave the class of an image as it is: asked of the images themselves, not of the user.
 

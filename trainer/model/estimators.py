@@ -15,7 +15,7 @@ the mean loss of the batch and whose gradient is the estimate. Heads normalise b
 | `loo` | REINFORCE, other samples as the baseline (Kool, van Hoof, Welling 2019): unbiased | `LOO_SAMPLES` passes |
 
 The true gradient is dp/dlambda * E[L(1) - L(0)], with dp/dlambda = exp(-lambda) for a plain detector (science of the paper's
-appendix on gradient estimation, which calls `ste` unbiased; it is not, see docs/results/estimators.md).
+appendix on gradient estimation, which calls `ste` unbiased; it is not).
 
 What an exposure says, clicks or photon numbers, as one stochastic layer: its chances, its mean, samples, and all words of a shot.
 

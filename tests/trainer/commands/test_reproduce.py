@@ -11,17 +11,17 @@ from tree import ROOT
 pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.cli import main
-from pans.trainer.commands.reproduce import PAGES
+from pans.trainer.commands.reproduce import NAMES
 
 
 def test_the_command_lists_collects_and_refuses(tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
     assert main(["reproduce", "list", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["rows"] == list(PAGES)
+    assert json.loads(capsys.readouterr().out)["rows"] == list(NAMES)
     words = ["reproduce", "mnist", "--collect", "--cache", str(tmp_path / "cache"), "--json"]
     assert main([*words, "-o", str(tmp_path / "out")]) == 0
     assert json.loads(capsys.readouterr().out)["rows"] == []
-    assert (tmp_path / "out" / "mnist.md").read_text().startswith("# mnist")
+    assert (tmp_path / "out" / "mnist.md").read_text().startswith("# MNIST")
     assert main([*words, "--rows", "5"]) == 2
     assert "mnist has 4, 9, 16" in capsys.readouterr().err
 
@@ -38,15 +38,21 @@ def test_what_is_not_drawn_has_no_other_draws(name, capsys):
 
 
 def test_tables_are_written_again_from_their_json(tmp_path, capsys):
-    words = ["reproduce", "time", "--from-json", "--json"]
+    words = ["reproduce", "sequence", "--from-json", "--json"]
     assert main(words) == 2
     assert "name it by -o DIR" in capsys.readouterr().err
     assert main([*words, "-o", str(tmp_path)]) == 2
-    assert "measure it: pans reproduce time" in capsys.readouterr().err
-    for ending in ("json", "md"):
-        shutil.copy(ROOT / "docs" / "results" / f"time.{ending}", tmp_path)
-    whole = (tmp_path / "time.md").read_text()
-    (tmp_path / "time.md").write_text(whole.replace("| 10 | 74.31 |", "| 10 | 99.99 |"))
+    assert "measure it: pans reproduce sequence" in capsys.readouterr().err
+    for name in ("sequence.json", "sequence.png", "sequence-patterns.png", "cells.md"):
+        shutil.copy(ROOT / "docs" / "results" / name, tmp_path)
+    whole = (tmp_path / "cells.md").read_text()
+    (tmp_path / "cells.md").write_text(whole.replace("63.91", "99.99"))
     assert main([*words, "-o", str(tmp_path)]) == 0
-    assert [row["features"] for row in json.loads(capsys.readouterr().out)["rows"]] == [10, 32]
-    assert (tmp_path / "time.md").read_text() == whole
+    assert json.loads(capsys.readouterr().out)["rows"][0]["way"] == "one frame, cell in the middle"
+    assert (tmp_path / "cells.md").read_text() == whole
+
+
+def test_all_pages_are_written_to_one_folder(tmp_path, capsys):
+    shutil.copytree(ROOT / "docs" / "results", tmp_path / "all")
+    assert main(["reproduce", "all", "--from-json", "-o", str(tmp_path / "all"), "--json"]) == 0
+    assert {row["table"] for row in json.loads(capsys.readouterr().out)["rows"]} > {"shots", "budgets"}

@@ -13,7 +13,7 @@ from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.model.field_basis import discriminant_basis, turns
 from pans.trainer.options import Options
-from pans.trainer.paper.passive import measure
+from pans.trainer.reproduce.passive import measure
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.anomaly_search import descend, joint, judge, search
 

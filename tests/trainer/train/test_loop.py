@@ -76,7 +76,7 @@ def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
     words = torch.tensor([[float(w >> i & 1) for i in range(4)] for w in range(16)])
     decided = trained.head(words).argmax(dim=1)
     right = joint_distribution(p, torch.from_numpy(task.test.labels), 4)[torch.arange(16), decided].sum()
-    # by chance 0.25; undamped gradients learn less where photons are few (docs/results/ablations.md)
+    # by chance 0.25; undamped gradients learn less where photons are few (`git show 930d92f:docs/results/ablations.md`)
     assert float(right) > (0.35 if estimator == "identity" else 0.5)
     assert trained.quantised.pattern_levels.max() < PROFILE.projector.levels
     assert [report.epoch for report in reports] == list(range(1, 11))

@@ -1,0 +1,110 @@
+"""The active tables: rows trained, resumed, told from those of another recipe, and put beside the paper's and direct imaging."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.trainer.options import Options, plain_options
+from pans.trainer.reproduce import active
+from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
+from pans.trainer.reproduce.printed import ACTIVE, ActiveRow
+from pans.trainer.tasks.registry import Objects, Task
+
+ROW = ActiveRow(3, 1.5, 9.0, (40.0,) * 4, (1.0,) * 4, (40.0,) * 4, (1.0,) * 4)
+
+
+@pytest.fixture
+def bars(monkeypatch):
+    """A table of one row with a second seed: bright columns name the class."""
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 3, 500)
+    images = rng.integers(0, 60, (500, 4, 4), dtype=np.uint8)
+    images[np.arange(500), :, labels] = 255
+    parts = [Objects(images[at], labels[at]) for at in (slice(280), slice(280, 500))]
+    task = Task("mnist", ("a", "b", "c"), *parts, "0" * 64, "")
+    small = Options(features=3, clicks=1.5, epochs=6, hidden=8, batch=50, front_rate=5e-2, head_rate=2e-2, shots=2)
+    monkeypatch.setattr(active, "load_task", lambda *_: task)
+    monkeypatch.setattr(active, "TRIALS", {200: 3, 10_000: 3})
+    monkeypatch.setattr(active, "recipe", lambda *_: small)
+    monkeypatch.setattr(active, "ACTIVE", {"mnist": (ROW,)})
+    monkeypatch.setattr(active, "OTHER_SEEDS", {("mnist", 3): (1000,)})
+
+
+def figures_of(accuracy, clicks, photons=20.0):
+    one = {"accuracy_mean": accuracy, "accuracy_std": 0.01, "accuracy_se_objects": 0.02, "clicks_mean": clicks}
+    one |= {"photons_mean": photons, "illumination": 80.0, "objects": 200, "trials": 0}
+    of_part = {str(shots): one for shots in (1, 2, 3, 5)}
+    return {"first_200": of_part, "all": of_part, "cpu_seconds": 60.0, "options": {"seed": 1000}}
+
+
+def test_a_row_is_told_from_one_of_another_recipe(tmp_path):
+    row, path = ACTIVE["mnist"][0], active.row_path(tmp_path, "mnist", 4)
+    assert active.finished_row(tmp_path, "mnist", row) is None
+    path.write_text(json.dumps({"options": plain_options(active.options_of("mnist", row))}))
+    assert active.finished_row(tmp_path, "mnist", row) is not None
+    path.write_text(json.dumps({"options": plain_options(active.options_of("mnist", row, seed=1))}))
+    assert active.finished_row(tmp_path, "mnist", row) is None
+
+
+def test_a_row_stands_beside_the_papers_direct_imaging_and_another_seed():
+    rows = active.row_beside("mnist", ACTIVE["mnist"][0], [figures_of(0.6, 2.1), figures_of(0.61, 2.2)])
+    one = rows[0]
+    assert (one["simulation"], one["experiment"], one["first_200"]) == (60.28, 58.33, 60.0)
+    assert one["ahead"] == pytest.approx(-0.28)
+    # 2 points from our objects, 0.71 between two trainings that differ by 1, and the paper's on 200 images: 3.46
+    assert one["error"] == pytest.approx(np.sqrt(2**2 + 0.5 + 3.46**2), abs=0.01)
+    assert (one["verdict"], one["experiment_ahead"]) == ("level", pytest.approx(1.67))
+    assert [row["paper_clicks"] for row in of_table(rows, "shots")] == pytest.approx([2.164, 4.328, 6.492, 10.82])
+    (direct,) = of_table(rows, "direct")
+    assert direct["direct"] == pytest.approx(active.direct_at("mnist", 20.0))
+    assert (direct["verdict"], direct["trainings"]) == ("below", 2)
+    assert [row["value"] for row in of_table(rows, "seeds")] == pytest.approx([61.0] * 4)
+    assert (
+        len(active.row_beside("mnist", ACTIVE["mnist"][0], [figures_of(0.6, 2.1)])) == 5
+    )  # no other seed, no rows of it
+
+
+def test_direct_imaging_is_interpolated_and_never_extrapolated():
+    assert active.direct_at("mnist", 5) == pytest.approx(54.43)
+    assert active.direct_at("mnist", np.sqrt(100 * 300)) == pytest.approx((95.29 + 96.42) / 2)
+    assert active.direct_at("mnist", 1e4) == pytest.approx(96.42)
+    assert active.direct_at("mnist", 1.0, "error_objects") == pytest.approx(0.47)
+
+
+def test_a_row_is_trained_measured_and_resumed(bars, tmp_path):
+    stop = []
+
+    def interrupt(_line):
+        if not stop:
+            stop.append(True)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        active.make_row(Asked("mnist", tmp_path, report=interrupt), ROW)
+    found = active.make_row(Asked("mnist", tmp_path, report=lambda _line: None), ROW)
+    assert found["first_200"]["1"]["accuracy_mean"] > 0.5  # by chance a third
+    assert found["first_200"]["1"]["objects"] == 200
+    assert found["all"]["5"]["shots"] == 5
+    assert active.finished_row(tmp_path, "mnist", ROW) == json.loads(json.dumps(found))
+    assert {path.name for path in tmp_path.iterdir()} == {"mnist-3.json", "mnist-3.pans", "mnist-3.seconds"}
+
+
+def test_a_page_trains_every_row_from_its_seeds_and_collects_them_again(bars, tmp_path):
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
+    asked = Asked("mnist", tmp_path / "cache", report=lambda _line: None)
+    (tmp_path / "cache").mkdir()
+    collecting = dataclasses.replace(asked, collect=True)
+    assert active.active_page(collecting).rows == []
+    made = active.active_page(asked)
+    assert [row["table"] for row in made.rows] == 4 * ["shots"] + ["direct"] + 4 * ["seeds"]
+    assert made.rows[-1]["seed"] == 1000
+    assert active.active_page(collecting).rows == json.loads(json.dumps(made.rows))
+    (row,) = active.trained_rows(asked, "mnist")
+    assert row.bundle.n_features == 3
+    write_page(tmp_path, page_of("mnist"), made)
+    assert (tmp_path / "mnist.png").stat().st_size > 5000

@@ -1,0 +1,276 @@
+"""Pages of the alternatives, of readouts and of trainings that are followed: measured once, read between levels, drawn."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import argparse
+import dataclasses
+from functools import partial
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+pytest.importorskip("matplotlib", reason="needs the plot extra")
+pytest.importorskip("sklearn", reason="needs the plot extra")
+
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.baselines.common import measure
+from pans.trainer.baselines.networks import clean_mlp, patterns
+from pans.trainer.baselines.options import BaselineOptions
+from pans.trainer.commands import baseline as cmd_baseline
+from pans.trainer.options import Options
+from pans.trainer.reproduce import curves, dynamics, readouts
+from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
+from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.train import head_fit
+from pans.trainer.train.history import follow
+from pans.trainer.train.loop import train
+
+
+def bars(n, seed):
+    """A bright column of a faint picture tells the class."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, 3, n)
+    images = rng.integers(0, 60, (n, 6, 6), dtype=np.uint8)
+    images[np.arange(n), :, 2 * labels] = 230
+    return Objects(images, labels)
+
+
+@pytest.fixture(scope="module")
+def task():
+    return Task("bars", ("a", "b", "c"), bars(600, 1), bars(240, 2), "0" * 64, "")
+
+
+@pytest.fixture
+def asked(tmp_path):
+    (tmp_path / "cache").mkdir()
+    said = []
+    return Asked("page", tmp_path / "cache", report=said.append), said
+
+
+def write(folder, name, made):
+    write_page(folder, page_of(name), made)
+    assert all((folder / f"{name}{ending}.png").stat().st_size > 3000 for ending in made.pictures)
+
+
+# ---- baselines over photons ----
+
+
+def test_every_curve_is_a_command_that_the_baselines_take():
+    parser = argparse.ArgumentParser()
+    cmd_baseline.BASELINE.configure(parser)
+    assert len({curve.way for curve in curves.CURVES}) == len(curves.CURVES)
+    for curve in curves.CURVES:
+        args = parser.parse_args([curve.words[0], "--task", curves.TASK, *curve.words[1:]])
+        cmd_baseline._check(args)
+        assert cmd_baseline._options(args) == curve.options
+        assert tuple(args.photons) == curve.levels == tuple(sorted(curve.levels))
+
+
+def test_a_curve_is_measured_once_and_none_when_collecting(task, asked, monkeypatch):
+    monkeypatch.setattr(curves, "load_task", lambda *_: task)
+    page, said = asked
+    curve = curves.Curve("end-to-end, d_f = 3", BaselineOptions("e2e", "qat", 3, epochs=60, trials=2), (5.0, 1e4))
+    assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == []
+    assert "pans baseline e2e --task fashion-mnist --features 3" in said[0]
+    few, many = curves.curve_rows(page, curve)
+    assert (few["photons_asked"], few["photons"]) == (5, pytest.approx(5, rel=1e-5))
+    assert few["value"] < many["value"]
+    assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == [few, many]
+
+
+def row(way, photons, value, features=10):
+    light = {"clicks": photons / 2, "photons": photons, "illumination": 3 * photons}
+    return {"way": way, "features": features, "photons_asked": photons, "value": value, "error_objects": 0.4} | light
+
+
+def test_the_envelope_is_the_best_at_each_level():
+    rows = [row("a", 5.0, 30.0, 3), row("b", 5.0, 20.0, 32), row("a", 100.0, 60.0, 3), row("b", 100.0, 80.0, 32)]
+    best = curves.envelope(rows)
+    assert [(r["photons_asked"], r["value"], r["features"]) for r in best] == [(5.0, 30.0, 3), (100.0, 80.0, 32)]
+    assert {r["way"] for r in best} == {curves.ENVELOPE}
+
+
+def test_pans_stands_beside_the_others_at_its_own_light(asked, monkeypatch):
+    page, said = asked
+    direct = [row(curves.POSTERIOR.way, n, a, 784) | {"table": "curves"} for n, a in ((10.0, 50.0), (1000.0, 90.0))]
+    end_to_end = [row("e2e", n, a, 6) | {"table": "curves"} for n, a in ((5.0, 30.0), (5000.0, 83.0))]
+    pans = {3: row("PANS", 100.0, 72.0, 3), 32: row("PANS", 2000.0, 90.0, 32)}
+    monkeypatch.setattr(curves, "CURVES", (curves.POSTERIOR,))
+    monkeypatch.setattr(curves, "DIRECT", {curves.TASK: []})  # no levels but those of these rows
+    monkeypatch.setattr(curves, "curve_rows", lambda *_: direct)
+    monkeypatch.setattr(curves, "end_to_end_rows", lambda *_: end_to_end)
+    monkeypatch.setattr(curves, "finished_row", lambda _cache, _task, printed: pans.get(printed.features))
+    monkeypatch.setattr(curves, "shot_figures", lambda figures: figures)
+    made = curves.fig_2e_page(page)
+    first, last = of_table(made.rows, "pans")
+    assert (first["direct_photons_value"], first["direct_photons_verdict"]) == (pytest.approx(70), "above")
+    assert first["direct_photons_ahead"] == pytest.approx(2)
+    assert first["direct_photons_error"] == pytest.approx(0.4 * 2**0.5)
+    assert first["envelope_illumination_verdict"] == "above"
+    assert "direct_photons_value" not in last  # beyond the curve
+    assert "PANS d_f = 24: not trained yet (pans reproduce fashion-mnist --rows 24)" in said
+
+
+def test_pages_of_curves_are_put_together_from_what_is_finished(task, asked, tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "load_task", lambda *_: task)
+    monkeypatch.setattr(curves, "LEVELS", (5.0, 30.0, 5000.0))
+    page, _ = asked
+    made = curves.end_to_end_page(dataclasses.replace(page, rows=(3,)))
+    assert [r["way"] for r in made.rows] == [curves.ENVELOPE] * 3 + ["end-to-end, d_f = 3"] * 3
+    write(tmp_path, "end-to-end", made)
+    collected = curves.fig_2e_page(dataclasses.replace(page, rows=(3,), collect=True))
+    assert [r["way"] for r in collected.rows] == [curves.ENVELOPE] * 3
+    write(tmp_path, "fig-2e", collected)
+
+
+# ---- compressive sensing ----
+
+
+def test_watching_a_training_changes_nothing(task):
+    measurement = measure(task, patterns("binary", 6, task.image_shape, 0))
+    seen = []
+    before = torch.random.get_rng_state()
+    watched = clean_mlp(measurement, seed=3, epochs=2, watch=lambda epoch, decide: seen.append((epoch, decide)))
+    assert torch.equal(torch.random.get_rng_state(), before)
+    alone = clean_mlp(measurement, seed=3, epochs=2)
+    clean = measurement.photoelectrons(measurement.test, 50.0)
+    assert np.array_equal(watched(50.0, "counting")(clean), alone(50.0, "counting")(clean))
+    assert seen[1][0].loss < seen[0][0].loss
+
+
+def test_compressive_sensing_learns_on_clean_light_and_fails_on_little(task, asked, tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "load_task", lambda *_: task)
+    wanted = (("binary", False, 30, 4), ("binary", False, 30, 16), ("gaussian", True, 10, 16))
+    monkeypatch.setattr(curves, "SENSINGS", wanted)
+    page, said = asked
+    made = curves.compressive_page(page)
+    trainings, cells = of_table(made.rows, "trainings"), of_table(made.rows, "cells")
+    assert trainings[1]["held_out"] > 80  # by chance 33
+    values = [cell["value"] for cell in cells if (cell["family"], cell["features"]) == ("binary", 16)]
+    assert values[0] < 60 < values[-1]
+    assert (trainings[2]["classifier"], len(cells)) == ("convolutions", 3 * len(curves.PHOTONS))
+    assert curves.compressive_page(dataclasses.replace(page, collect=True)).rows == made.rows
+    write(tmp_path, "compressive", made)
+    (tmp_path / "cache" / "compressive-binary-16.json").unlink()
+    partly = curves.compressive_page(dataclasses.replace(page, collect=True))
+    assert [one["features"] for one in of_table(partly.rows, "trainings")] == [4, 16]
+    assert "compressive, binary, d_f = 16: not measured yet" in said
+
+
+# ---- readouts ----
+
+
+def test_frames_are_drawn_mapped_and_judged(task, asked, tmp_path, monkeypatch):
+    monkeypatch.setattr(readouts, "load_task", lambda *_: task)
+    monkeypatch.setattr(readouts, "MAPPED_FRAMES", 120)
+    page, _ = asked
+    made = readouts.frames_page(page)
+    many, *_, few = made.rows
+    assert many["map_neighbours"] > 90
+    assert few["map_value"] > 50  # the posterior sees what the map does not
+    frames = readouts.drawn_frames(task)
+    assert [drawn.shape for drawn in frames.values()] == [(3, draws, 6, 6) for draws in readouts.SHOWN.values()]
+    assert frames[1e3].sum() / 9 == pytest.approx(1000, rel=0.3)  # some objects are brighter than others
+    write(tmp_path, "direct-frames", made)
+
+
+def test_readouts_of_the_shipped_patterns_stand_beside_frames(asked, tmp_path, monkeypatch):
+    rng = np.random.default_rng(3)
+    labels = rng.integers(0, 10, 700)
+    images = np.zeros((700, 28, 28), np.uint8)
+    images[np.arange(700), 2 * labels + 4, 4:24] = 255
+    parts = [Objects(images[at], labels[at]) for at in (slice(500), slice(500, 700))]
+    task = Task("fashion-mnist", tuple("abcdefghij"), *parts, "0" * 64, "")
+    monkeypatch.setattr(readouts, "load_task", lambda *_: task)
+    monkeypatch.setattr(readouts, "PHOTONS", (3.0, 1e4))
+    page, _ = asked
+    made = readouts.information_page(page)
+    frames, _, words, more = made.rows
+    assert words["bits"] < np.log2(10)
+    assert words["photons"] == frames["photons"] == 3.0
+    assert words["ahead"] == pytest.approx(words["value"] - frames["value"])
+    assert "ahead" not in more  # frames have no posterior there
+    write(tmp_path, "fig-2c", made)
+    maps = readouts.maps_page(page)
+    assert [row["way"] for row in maps.rows] == 2 * [*readouts.WAYS]
+    assert maps.rows[0]["photons"] == pytest.approx(maps.rows[1]["photons"])
+    assert ["verdict" in row for row in maps.rows] == [False, True, False, True]
+    assert readouts.maps_page(dataclasses.replace(page, collect=True)).rows == maps.rows
+    write(tmp_path, "fig-2f", maps)
+
+
+def test_a_table_of_words_is_their_chance_under_every_class():
+    p, labels = np.array([[0.2, 0.5], [0.4, 0.5], [1.0, 0.0]]), np.array([0, 0, 1])
+    table = np.exp(readouts.class_table(p, labels, 2))
+    assert table[0b01, 0] == pytest.approx((0.2 + 0.4) * 0.5 / 3, abs=1e-8)  # pattern 0 alone
+    assert table[:, 1] == pytest.approx([0, 1 / 3, 0, 0], abs=1e-8)
+
+
+# ---- trainings that are followed ----
+
+
+@pytest.fixture
+def short_fits(monkeypatch):
+    """The last stage of a training takes 1500 steps however small the task is; nothing here asks for a good head."""
+    monkeypatch.setattr(head_fit, "fit_head_exactly", partial(head_fit.fit_head_exactly, steps=30))
+
+
+SMALL = Options(features=3, estimator="ste", alpha=1e-3, epochs=6, hidden=8, batch=25, front_rate=5e-2, head_rate=2e-2)
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_a_followed_training_ends_where_an_ordinary_one_does(task):
+    profile = load_profile("ideal")
+    course = follow(task, profile, SMALL, patterns_after=(1, 6))
+    plain = train(task, profile, SMALL)
+    assert np.array_equal(course.trained.quantised.pattern_levels, plain.quantised.pattern_levels)
+    assert course.trained.validation_loss == plain.validation_loss
+    columns = course.columns()
+    assert columns["loss"][-1] < columns["loss"][0]
+    assert list(course.patterns) == [1, 6]
+    assert columns["peak"][-1] == pytest.approx(course.patterns[6].max() / course.patterns[6].mean(), rel=1e-4)
+    with pytest.raises(ValueError, match="'coherent'"):
+        follow(task, profile, dataclasses.replace(SMALL, encoder="coherent"))
+
+
+def test_a_stage_tells_how_uneven_patterns_are():
+    epochs = {key: [1.0, 2.0] for key in ("held_out", "held_out_first_200", "clicks", "photons", "illumination")}
+    even = dynamics.stage_row(epochs, 1, np.ones((2, 10)))
+    assert (even["peak"], even["half_of_light"], even["dark_pixels"]) == (1, pytest.approx(50), 0)
+    spot = np.zeros((2, 10))
+    spot[0, 3] = 20.0
+    uneven = dynamics.stage_row(epochs, 2, spot)
+    assert (uneven["peak"], uneven["least"], uneven["most"], uneven["value"]) == (20, 0.0, 2.0, 2.0)
+    assert (uneven["half_of_light"], uneven["dark_pixels"]) == pytest.approx((5, 95))
+
+
+def test_growth_is_over_the_last_epochs():
+    assert dynamics.growth([1.0] * 5 + [100.0] + [110.0] * dynamics.LATE) == pytest.approx(10)
+    assert dynamics.growth([4.0, 5.0]) == pytest.approx(25)
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_pages_of_trainings_are_made_once_and_collected(task, asked, tmp_path, monkeypatch):
+    monkeypatch.setattr(dynamics, "load_task", lambda *_: task)
+    monkeypatch.setattr(dynamics, "CELLS", {dynamics.SHORT: ((3, 0.0), (3, 0.1)), dynamics.PAPER: ((3, 0.1),)})
+    monkeypatch.setattr(dynamics, "SHOWN", (3, 0.1))
+    monkeypatch.setattr(dynamics, "STAGES", (1, 6))
+    more = {dynamics.SHORT: 0, dynamics.PAPER: 1}
+
+    def options(_features, alpha, schedule=dynamics.SHORT):
+        return dataclasses.replace(SMALL, alpha=alpha, epochs=SMALL.epochs + more[schedule])
+
+    monkeypatch.setattr(dynamics, "options_of", options)
+    page, _ = asked
+    assert dynamics.evolution_page(dataclasses.replace(page, collect=True)).rows == []
+    made = dynamics.alpha_page(page)
+    free, held, longer = made.rows
+    assert held["illumination"] < free["illumination"]
+    assert (held["of_epochs"], longer["of_epochs"]) == (6, 7)
+    assert held["ahead"] == pytest.approx(held["value"] - free["value"])
+    assert "ahead" not in free
+    assert set(made.pictures) == {"-3", "-paper"}
+    stages = dynamics.evolution_page(dataclasses.replace(page, collect=True))
+    assert [row["epoch"] for row in stages.rows] == [1, 6]
+    write(tmp_path, "evolution", stages)
+    write(tmp_path, "alpha", made)

@@ -1,0 +1,175 @@
+"""The frontier: points of its recipes, means and margins against figures by hand, rows of every kind measured once."""
+
+# ruff: noqa: E402  (what follows needs torch)
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive import train as adaptive_train
+from pans.trainer.adaptive.options import AutomatonOptions
+from pans.trainer.options import Options, check_options
+from pans.trainer.reproduce import frontier
+from pans.trainer.reproduce.frontier import EXACT, STOPPING, Point
+from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
+from pans.trainer.reproduce.printed import ACTIVE
+from pans.trainer.tasks.registry import Objects, Task
+
+QUICK = {"exposures": 4, "states": 3, "grow_epochs": 1, "tune_epochs": 1, "epochs": 1, "reroutes": 0}
+GROWN = Point("mnist", "automaton", 2.0, "automaton", (("photons", 2.0), *QUICK.items()))
+
+
+@pytest.fixture(scope="module")
+def halves() -> Task:
+    rng = np.random.default_rng(8)
+    labels = rng.integers(0, 2, 1500)
+    bright = 190 * (np.arange(4)[None, None] // 2 == labels[:, None, None])
+    images = (rng.integers(0, 60, (1500, 4, 4)) + bright).astype(np.uint8)
+    parts = [Objects(images[at], labels[at]) for at in (slice(1200), slice(1200, 1500))]
+    return Task("mnist", ("left", "right"), *parts, "0" * 64, "made here")
+
+
+@pytest.fixture
+def asked(halves, tmp_path, monkeypatch):
+    monkeypatch.setattr(frontier, "_task", lambda *_: halves)
+    return Asked("frontier", tmp_path, report=lambda _: None, seeds=1)
+
+
+def made(way: str, level: float, photons: float, value: float, clicks: float = 1.0, task: str = "mnist"):
+    shared = {"task": task, "way": way, "level": level, "exposures": 5}
+    light = {"clicks": clicks, "photons": photons, "illumination": 10.0}
+    return shared | light | {"value": value, "error_objects": 0.3, "first_200": value + 1}
+
+
+def test_the_points_can_be_trained_and_every_start_is_there():
+    found = list(frontier.points())
+    assert len({(point.task, point.way, point.level) for point in found}) == len(found)
+    for point in found:
+        assert point.task in ACTIVE
+        if point.kind == "fixed":
+            check_options(Options(**dict(point.options)), load_profile("ideal"))
+        if point.kind == "automaton":
+            AutomatonOptions(**dict(point.options))
+    twice = next(point for point in found if point.way == "larger automaton, trained on twice")
+    assert twice.start.start.way == "larger automaton"
+    assert twice.training_seed(0) == 2  # other distortions each time
+
+
+def test_seeds_are_put_together_with_their_standard_error():
+    rows = [made("automaton", 10, 9.9, value) for value in (80.0, 82.0, 84.0)]
+    (found,) = frontier.by_point(rows)
+    assert (found["seeds"], found["value"], found["first_200"]) == (3, pytest.approx(82), pytest.approx(83))
+    assert found["error_seeds"] == pytest.approx(2 / math.sqrt(3))
+    assert frontier.error_of(found) == pytest.approx(math.hypot(2 / math.sqrt(3), 0.3))
+    (one,) = frontier.by_point(rows[:1])
+    assert one["error_seeds"] is None
+    assert frontier.error_of(one) == 0.3
+
+
+def test_margins_are_over_direct_imaging_at_the_same_photons():
+    rows = [made(EXACT, 4, 4.0, 40.0), made(EXACT, 16, 16.0, 60.0), made("automaton", 8, 8.0, 75.0)]
+    rows += [made("automaton", 40, 40.0, 90.0), made("masks", 4, 4.0, 50.0)]  # 40 is beyond direct imaging's levels
+    rows += [made(EXACT, 8, 8.0, 10.0, task="fashion-mnist")]
+    rows += [made(STOPPING, 6, 6.0, 60.0), made(STOPPING, 10, 32 / 3, 80.0)]  # not for 4 photons
+    found = {(row["way"], row["level"]): row for row in frontier.beside_direct(frontier.by_point(rows))}
+    automaton = found["automaton", 8]
+    assert (automaton["direct"], automaton["ahead"]) == pytest.approx((50, 25))  # half way in the logarithm
+    assert automaton["error"] == pytest.approx(0.3 * math.sqrt(2))
+    assert (automaton["sure_ahead"], automaton["sure_verdict"]) == (pytest.approx(5), "above")
+    assert (found["masks", 4]["ahead"], "sure_ahead" in found["masks", 4]) == (pytest.approx(10), False)
+    assert "ahead" not in found["automaton", 40]
+    assert "ahead" not in found[EXACT, 4]
+
+
+def test_click_budgets_take_the_automaton_that_spends_most_within_them_and_not_the_best():
+    rows = [made("automaton", 4, 4.0, 99.0, clicks=2.0), made("automaton", 6, 6.0, 70.0, clicks=2.1)]
+    rows += [made("automaton, held to clicks", 9, 9.0, 80.0, clicks=4.9)]
+
+    def budgets():
+        return {(row["task"], row["features"]): row for row in frontier.click_budgets(frontier.by_point(rows))}
+
+    found = budgets()
+    assert len(found) == 13
+    assert "value" not in found["fashion-mnist", 3]
+    assert found["mnist", 4]["value"] == 70.0  # 2.164 clicks in the paper
+    assert found["mnist", 9]["ahead"] == pytest.approx(80 - 81.23)
+    assert found["mnist", 4]["paper_photons"] == pytest.approx(frontier.photons_at_least(2.164, 4))
+    rows += [made("automaton, trained on", 6, 6.0, 75.0, clicks=1.9)]  # it takes the place of that of 6
+    assert budgets()["mnist", 4]["value"] == 99.0
+
+
+def test_no_photons_give_those_clicks_with_less_than_the_bound():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        light = rng.gamma(0.7, 2.0, 10)
+        clicks = float(-np.expm1(-light).sum())
+        assert light.sum() >= frontier.photons_at_least(clicks, 10) - 1e-12
+    assert frontier.photons_at_least(float(-10 * np.expm1(-0.4)), 10) == pytest.approx(4.0)  # equal light reaches it
+    with pytest.raises(ValueError, match="allowed: below 10"):
+        frontier.photons_at_least(10.0, 10)
+
+
+def test_an_automaton_is_trained_once_and_trained_on_from_the_one_in_the_cache(asked, monkeypatch):
+    on = Point("mnist", "automaton, trained on", 2.0, "automaton", (("photons", 1.5), ("epochs", 2)), GROWN)
+    first, second = frontier.point_row(asked, GROWN, 0), frontier.point_row(asked, on, 0)
+    assert first is not None
+    assert first["value"] > 60
+    assert first["exposures"] <= 4
+    assert second is not None
+    assert second["photons"] == pytest.approx(1.5, rel=0.1)
+    start, digest = load_bundle(asked.cache / f"{GROWN.stem}-seed0.pans")
+    assert start.provenance["command"] == "pans reproduce frontier"
+    trained_on = load_bundle(asked.cache / f"{on.stem}-seed0.pans")[0].provenance["options"]
+    assert (trained_on["start"], trained_on["seed"], trained_on["epochs"]) == (digest, 1, 2)
+    collect = replace(asked, collect=True)
+    assert (frontier.point_row(collect, GROWN, 0), frontier.point_row(collect, on, 0)) == (first, second)
+    assert frontier.point_row(collect, GROWN, 1) is None
+    assert frontier.point_row(collect, replace(GROWN, options=(*GROWN.options, ("patterns", 3))), 0) is None
+
+    def never(*_args, **_named):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(adaptive_train, "train_automaton", never)
+    (asked.cache / f"{on.stem}-seed0.json").unlink()
+    again = frontier.point_row(asked, on, 0)  # measured again, from its bundle
+    assert again is not None
+    assert again["value"] == pytest.approx(second["value"], rel=1e-12)
+    with pytest.raises(AssertionError, match="trained again"):
+        frontier.point_row(asked, GROWN, 1)
+
+
+def test_a_bundle_that_was_not_made_for_a_page_is_not_replaced(asked):
+    path = asked.cache / f"{GROWN.stem}-seed0.pans"
+    path.write_bytes(b"something of somebody")
+    with pytest.raises(Exception, match=r"automaton-2-seed0\.pans"):
+        frontier.point_row(asked, GROWN, 0)
+    assert path.read_bytes() == b"something of somebody"
+
+
+def test_the_page_measures_every_kind_of_point_and_is_drawn(asked, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
+    bayes = {"paradigm": "direct", "method": "bayes", "trials": 1}
+    stopping = bayes | {"method": "stopping"}
+    fixed = {"features": 3, "alpha": 0.0, "photons": 3.0, "epochs": 2, "hidden": 8, "batch": 50}
+    ways = [
+        {"name": EXACT, "kind": "baseline", "options": bayes, "levels": {"mnist": {"1": {}, "100": {}}}},
+        {"name": STOPPING, "kind": "baseline", "options": stopping, "levels": {"mnist": {"3": {}, "1000": {}}}},
+        {"name": "fixed", "kind": "fixed", "options": fixed, "levels": {"mnist": {"3": {}}}},
+    ]
+    monkeypatch.setattr(frontier, "WAYS", ways)
+    page = frontier.frontier_page(asked)
+    points = {(row["way"], row["level"]): row for row in of_table(page.rows, "mnist")}
+    assert set(points) == {(EXACT, 1), (EXACT, 100), (STOPPING, 3), ("fixed", 3)}  # stopping cannot spend 1000 photons
+    assert points[EXACT, 1]["photons"] == pytest.approx(1, rel=1e-4)
+    assert points["fixed", 3]["exposures"] == 3
+    assert "ahead" in points["fixed", 3]
+    assert frontier.frontier_page(replace(asked, collect=True)).rows == page.rows
+    write_page(tmp_path, page_of("frontier"), page)
+    assert (tmp_path / "frontier.png").stat().st_size > 5000

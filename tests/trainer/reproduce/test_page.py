@@ -1,0 +1,184 @@
+"""Pages: tables made of rows, files that are written and those that are left alone, parts kept, and docs/results against its JSON."""
+
+import json
+import re
+
+import pytest
+from tree import ROOT
+
+pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.runtime.errors import UsageError
+from pans.trainer.reproduce.page import (
+    NAMES,
+    Column,
+    Made,
+    Page,
+    Table,
+    against,
+    cached_row,
+    check_cached_bundle,
+    generated,
+    interpolated,
+    is_page_file,
+    kept,
+    page_of,
+    read_rows,
+    rewrite_page,
+    write_page,
+)
+from pans.trainer.reproduce.printed import ACTIVE, PASSIVE
+
+RESULTS = ROOT / "docs" / "results"
+COLUMNS = (Column("d_f", "{features}"), Column("all", "{value:.2f}"), Column("clicks", "{clicks:.1f}"))
+ROWS = [
+    {"table": "a", "features": 3, "value": 50.0, "unused": 1, "verdict": "above"},
+    {"table": "a", "features": 4, "value": 60.0, "clicks": 2.0, "verdict": "level"},
+    {"table": "b", "way": "x", "photons": 5, "value": 10.0},
+    {"table": "b", "way": "x", "photons": 9, "value": 20.0},
+    {"table": "b", "way": "y", "photons": 9, "value": 30.0},
+]
+TABLES = (
+    Table("a", COLUMNS, "Rows", (("Ours", "theirs", "verdict"),)),
+    Table("b", (Column("way", "{way}"),), "", (), Column("photons", "{photons}"), "{value:.0f}"),
+    Table("a", COLUMNS[:1], "With clicks", needs="clicks"),
+)
+PAGE = Page("name", "A page", "file", "", TABLES, {"-x": "a picture"}, "one")
+TEXT = """SIMULATED. Command: `pans reproduce name`. Trainings: one.
+
+### Rows
+
+d_f | all | clicks
+---|---|---
+3 | 50.00 | -
+4 | 60.00 | 2.0
+
+Ours against theirs: 1 above, 1 level, 0 below, of 2.
+
+way | 5 | 9
+---|---|---
+x | 10 | 20
+y | - | 30
+
+### With clicks
+
+d_f
+---
+4
+
+![a picture](name-x.png)
+"""
+
+
+def made():
+    return Made(ROWS, {"-x": lambda path: path.write_bytes(b"png")})
+
+
+def test_a_new_page_has_a_title_its_command_tables_and_pictures_and_nothing_else(tmp_path):
+    write_page(tmp_path, PAGE, made())
+    begin, end = PAGE.markers
+    assert (tmp_path / "file.md").read_text() == f"# A page\n\n{begin}\n\n{TEXT}\n{end}\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"name.json", "file.md", "name-x.png"}
+    found = json.loads((tmp_path / "name.json").read_text())
+    assert found["tables"]["a"]["columns"] == [
+        "features",
+        "value",
+        "verdict",
+        "clicks",
+    ]  # what no table shows is left out
+    assert read_rows(tmp_path, "name")[0] == {
+        "table": "a",
+        "features": 3,
+        "value": 50.0,
+        "verdict": "above",
+        "clicks": None,
+    }
+    assert generated(tmp_path, PAGE) == f"{begin}\n\n{TEXT}\n{end}"
+
+
+def test_what_is_written_by_hand_and_other_pages_of_the_file_stay(tmp_path):
+    path, (begin, end) = tmp_path / "file.md", PAGE.markers
+    path.write_text(f"# By hand\n\nBefore.\n\n{begin}\nold\n{end}\n\nAfter.\n")
+    write_page(tmp_path, PAGE, made())
+    whole = f"# By hand\n\nBefore.\n\n{begin}\n\n{TEXT}\n{end}\n\nAfter.\n"
+    assert path.read_text() == whole
+    path.write_text(whole.replace("60.00", "99.99"))
+    rewrite_page(tmp_path, PAGE)
+    assert path.read_text() == whole
+    other = Page("other", "Another page", "file", "", TABLES[:1], {}, "one")
+    write_page(tmp_path, other, Made(ROWS))
+    assert path.read_text().startswith(whole)
+    assert "# Another page" in path.read_text()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_tables_of_the_results_are_those_of_their_json(name):
+    page = page_of(name)
+    text = (RESULTS / f"{page.file}.md").read_text(encoding="utf-8")
+    block = generated(RESULTS, page)
+    assert block in text
+    assert all(f"({name}{ending}.png)" in block for ending in page.captions)
+    assert " | " in block
+
+
+def test_the_results_have_no_file_that_no_page_shows():
+    text = "\n".join(path.read_text(encoding="utf-8") for path in RESULTS.glob("*.md"))
+    for path in RESULTS.iterdir():
+        shown = path.suffix == ".md" or path.stem in NAMES or f"({path.name})" in text
+        assert shown, path
+    index = (RESULTS / "README.md").read_text(encoding="utf-8")
+    assert {page_of(name).file for name in NAMES} == set(re.findall(r"\]\(([\w-]+)\.md\)", index))
+
+
+def test_every_table_of_the_paper_has_a_page():
+    assert set(NAMES) > {*ACTIVE, *PASSIVE}
+
+
+def test_a_verdict_needs_two_combined_errors():
+    assert against(52.0, 50.0, 0.6, 0.8) == {"ahead": 2.0, "error": 1.0, "verdict": "level"}
+    assert against(52.1, 50.0, 0.6, 0.8)["verdict"] == "above"
+    assert against(47.9, 50.0, 0.6, 0.8, prefix="x_")["x_verdict"] == "below"
+
+
+def test_curves_are_read_between_their_ends_only():
+    curve = [{"photons": 1000.0, "value": 80.0}, {"photons": 10.0, "value": 40.0}]
+    assert interpolated(curve, 100.0, "photons") == pytest.approx(60)
+    assert interpolated(curve, 10.0, "photons") == pytest.approx(40)
+    assert interpolated(curve, 9.0, "photons") is None
+    assert interpolated(curve, 1001.0, "photons") is None
+    assert interpolated([], 5.0, "photons") is None
+
+
+def test_a_part_is_made_once_and_again_when_asked_for_otherwise(tmp_path):
+    calls = []
+
+    def make():
+        calls.append(1)
+        return {"value": (1, 2)}
+
+    path = tmp_path / "part.json"
+    assert kept(path, {"n": 1}, make, collect=True) is None
+    first = kept(path, {"n": 1}, make, collect=False)
+    assert first["value"] == [1, 2]  # as JSON gives it back, from the start
+    assert kept(path, {"n": 1}, make, collect=True) == first
+    assert kept(path, {"n": 2}, make, collect=True) is None
+    kept(path, {"n": 2}, make, collect=False)
+    assert len(calls) == 2
+
+
+def test_files_that_are_not_ours_are_left_alone(tmp_path):
+    assert not any(is_page_file(path) for path in PAGE.files(tmp_path))
+    write_page(tmp_path, PAGE, made())
+    assert all(is_page_file(path) for path in PAGE.files(tmp_path))
+    for text in ("notes", "[1]", '{"rows": 1}'):
+        (tmp_path / "name.json").write_text(text)
+        (tmp_path / "file.md").write_text(text)
+        assert not any(is_page_file(path) for path in PAGE.files(tmp_path))
+        with pytest.raises(UsageError, match="no finished row"):
+            cached_row(tmp_path / "name.json", "made_with")
+        with pytest.raises(UsageError, match="no page of results"):
+            read_rows(tmp_path, "name")
+    (tmp_path / "row.pans").write_bytes(b"somebody's")
+    with pytest.raises(UsageError, match="exists already"):
+        check_cached_bundle(tmp_path / "row.pans")
+    check_cached_bundle(tmp_path / "none.pans")

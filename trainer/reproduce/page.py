@@ -1,0 +1,412 @@
+"""A page of results: the request, its rows, the tables made of them, and the files they become.
+
+The rows of NAME.json suffice to write the tables of a page again. Text outside of a page's two markers is written by hand and stays.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.resources
+import itertools
+import json
+import math
+import re
+import time
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.cli import say
+from pans.runtime.errors import PansError, UsageError
+from pans.runtime.outputs import check_outputs, make_folder, replace_file
+from pans.trainer.options import Options, same_options
+
+Row = dict[str, Any]  # flat; "table" names the table of the page that it belongs to
+Rows = list[Row]
+Draw = Callable[[Path], None]
+
+VERDICTS = ("above", "level", "below")
+ERRORS = 2.0  # combined standard errors that a difference must exceed
+FIRST_OBJECTS = 200  # test images, by which the paper judges FashionMNIST and MNIST
+
+
+def read_toml(name: str) -> Row:
+    """Return a TOML file of this package."""
+    return tomllib.loads((importlib.resources.files(__package__) / name).read_text(encoding="utf-8"))
+
+
+_FILE = read_toml("pages.toml")
+NAMES: tuple[str, ...] = tuple(_FILE["page"])
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """One page: finished parts are in `cache`; `rows` are the only numbers of patterns wanted; with `collect` nothing is measured.
+
+    `dark` (dark counts wanted) and `data_seed` (draw of the generator) are for the tables over dark counts, `seeds` (how many) is for
+    the frontier.
+    """
+
+    name: str
+    cache: Path
+    rows: tuple[int, ...] | None = None
+    data_dir: str | None = None
+    collect: bool = False
+    report: Callable[[str], None] = say
+    dark: tuple[float, ...] | None = None
+    data_seed: int = 0
+    seeds: int = 5
+
+    def wants(self, features: int) -> bool:
+        """Return whether the row of that many patterns was asked for."""
+        return self.rows is None or features in self.rows
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """The rows of a page, and for each picture (by the end of its file's name) the function that draws it to a path."""
+
+    rows: Rows
+    pictures: Mapping[str, Draw] = field(default_factory=dict)
+
+
+def of_table(rows: Rows, name: str) -> Rows:
+    """Return the rows of one table of a page."""
+    return [row for row in rows if row["table"] == name]
+
+
+# ---- verdicts ----
+
+
+def against(ours: float, theirs: float, *errors: float, prefix: str = "") -> Row:
+    """Return `ahead`, `error` (independent `errors` of both sides, added in squares) and `verdict`, each key after `prefix`.
+
+    >>> against(75.0, 70.0, 1.5, 2.0)
+    {'ahead': 5.0, 'error': 2.5, 'verdict': 'level'}
+    """
+    ahead, error = ours - theirs, math.hypot(*errors)
+    verdict = "level" if abs(ahead) <= ERRORS * error else "above" if ahead > 0 else "below"
+    return {f"{prefix}ahead": ahead, f"{prefix}error": error, f"{prefix}verdict": verdict}
+
+
+def sampling_error(percent: float, objects: int) -> float:
+    """Return the binomial standard error in points of an accuracy on so many objects, for a figure that was printed without one.
+
+    >>> round(sampling_error(74.31, 200), 2)
+    3.09
+    """
+    share = percent / 100
+    return 100 * math.sqrt(share * (1 - share) / objects)
+
+
+def flat(whole: Row, first: Row) -> Row:
+    """Return the figures of all objects and of the first 200 (rows as `row_of` gives them) under one set of keys; accuracies in %."""
+    keys = {"accuracy_mean": "value", "accuracy_std": "spread_trials", "accuracy_se_objects": "error_objects"}
+    firsts = {"accuracy_mean": "first_200", "accuracy_std": "first_spread", "accuracy_se_objects": "first_error"}
+    parts = ((keys, whole), (firsts, first))  # an exact expectation over walks has no spread of trials
+    found = {new: 100 * row[key] for names, row in parts for key, new in names.items() if key in row}
+    light = {"clicks": whole["clicks_mean"], "photons": whole["photons_mean"], "illumination": whole["illumination"]}
+    found |= light | {"first_clicks": first["clicks_mean"], "first_photons": first["photons_mean"]}
+    return found | {key: whole[key] for key in ("objects", "trials") if key in whole}
+
+
+def interpolated(curve: Rows, place: float, of: str, value: str = "value") -> float | None:
+    """Return a curve's `value` where its figure `of` is `place`, linear in the logarithm of `of`; None outside of the curve."""
+    known = sorted((float(row[of]), float(row[value])) for row in curve)
+    if not known or not known[0][0] <= place <= known[-1][0]:
+        return None
+    for (x0, y0), (x1, y1) in itertools.pairwise(known):
+        if place <= x1:
+            return y0 + (y1 - y0) * (math.log(place / x0) / math.log(x1 / x0) if x1 > x0 else 0.0)
+    return known[-1][1]
+
+
+# ---- tables ----
+
+_KEY = re.compile(r"\{(\w+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column: its header, and the template of its cells.
+
+    >>> Column("all", "{value:.2f} %").cell({"value": 50})
+    '50.00 %'
+    >>> Column("trials", "{spread:.2f}").cell({"spread": None})
+    '-'
+    """
+
+    header: str
+    template: str
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys of a row that the column needs."""
+        return _KEY.findall(self.template)
+
+    def cell(self, row: Row) -> str:
+        """Return the cell of `row`: "-" where the row lacks a figure."""
+        return "-" if any(row.get(key) is None for key in self.keys) else self.template.format(**row)
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Columns over the rows of one table that have `needs`; with `across` one column per value of that column, its cells by `cell`.
+
+    `claims` name columns of verdicts, which are counted below the table: (ours, the other side, key).
+    """
+
+    of: str
+    columns: tuple[Column, ...]
+    heading: str = ""
+    claims: tuple[tuple[str, str, str], ...] = ()
+    across: Column | None = None
+    cell: str = ""
+    needs: str = "table"
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys of a row that the table needs."""
+        every = (*self.columns, Column("", self.cell), *((self.across,) if self.across else ()))
+        return [key for column in every for key in column.keys] + [key for *_, key in self.claims]
+
+    def rows(self, rows: Rows) -> Rows:
+        """Return the rows of a page that the table shows."""
+        return [row for row in of_table(rows, self.of) if row.get(self.needs)]
+
+    def lines(self, rows: Rows) -> list[str]:
+        """Return the table of a page's rows as lines of Markdown; nothing without rows."""
+        mine = self.rows(rows)
+        if not mine:
+            return []
+        heads, body = [column.header for column in self.columns], self._body(mine)
+        if self.across:
+            heads += dict.fromkeys(self.across.cell(row) for row in mine)
+        return [
+            *([f"### {self.heading}", ""] if self.heading else []),
+            " | ".join(heads),
+            "|".join(["---"] * len(heads)),
+            *(" | ".join(cells) for cells in body),
+            "",
+            *(line for claim in self.claims for line in (_counted(*claim, mine), "")),
+        ]
+
+    def _body(self, mine: Rows) -> Iterator[list[str]]:
+        if self.across is None:
+            yield from ([column.cell(row) for column in self.columns] for row in mine)
+            return
+        groups: dict[tuple[str, ...], dict[str, str]] = {}
+        for row in mine:
+            cells = groups.setdefault(tuple(column.cell(row) for column in self.columns), {})
+            cells[self.across.cell(row)] = Column("", self.cell).cell(row)
+        heads = dict.fromkeys(self.across.cell(row) for row in mine)
+        yield from ([*group, *(cells.get(head, "-") for head in heads)] for group, cells in groups.items())
+
+
+def _counted(ours: str, theirs: str, key: str, rows: Rows) -> str:
+    found = [row[key] for row in rows if row.get(key)]
+    counts = ", ".join(f"{found.count(one)} {one}" for one in VERDICTS)
+    return f"{ours} against {theirs}: {counts}, of {len(found)}."
+
+
+def _columns(parts: Iterable[Any]) -> tuple[Column, ...]:
+    """Return columns from pages.toml: the name of a group, or a header and a template."""
+    groups = [_columns(_FILE["columns"][part]) if isinstance(part, str) else (Column(*part),) for part in parts]
+    return tuple(column for group in groups for column in group)
+
+
+# ---- pages ----
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """An entry of pages.toml: title, Markdown file (without .md), function that measures it, tables, captions of pictures."""
+
+    name: str
+    title: str
+    file: str
+    make: str
+    tables: tuple[Table, ...]
+    captions: Mapping[str, str]
+    trainings: str
+
+    def measure(self, asked: Asked) -> Made:
+        """Measure the page, or collect what is finished."""
+        module, _, function = self.make.partition(":")
+        made: Made = getattr(importlib.import_module(f".{module}", __package__), function)(asked)
+        return made
+
+    @property
+    def markers(self) -> tuple[str, str]:
+        """The lines of the Markdown file between which the page is generated."""
+        return f"<!-- {self.name}: begin -->", f"<!-- {self.name}: end -->"
+
+    def block(self, rows: Rows, pictures: Iterable[str]) -> str:
+        """Return what is generated: command, tables and pictures, between the markers."""
+        lines = [f"SIMULATED. Command: `pans reproduce {self.name}`. Trainings: {self.trainings}.", ""]
+        for table in self.tables:
+            lines += table.lines(rows)
+        for ending in pictures:
+            lines += [f"![{self.captions.get(ending, ending)}]({self.name}{ending}.png)", ""]
+        begin, end = self.markers
+        return "\n".join([begin, "", *lines, end])
+
+    def whole(self, rows: Rows, pictures: Iterable[str]) -> str:
+        """Return the page where nothing was written by hand."""
+        return f"# {self.title}\n\n{self.block(rows, pictures)}\n"
+
+    def files(self, folder: Path) -> list[Path]:
+        """Return the page's files in `folder`."""
+        ends = (f"{self.name}.json", f"{self.file}.md", *(f"{self.name}{one}.png" for one in self.captions))
+        return [folder / end for end in ends]
+
+
+def page_of(name: str) -> Page:
+    """Return the page of that name; KeyError for a name that is not in `NAMES`."""
+    facts: Row = dict(_FILE["page"][name])
+    tables = []
+    for one in facts.get("tables", ()):
+        across = Column(*one["across"]) if "across" in one else None
+        claims = tuple(tuple(claim) for claim in one.get("claims", ()))
+        columns = _columns(one["columns"])
+        tables.append(
+            Table(
+                one["of"],
+                columns,
+                one.get("heading", ""),
+                claims,
+                across,
+                one.get("cell", ""),
+                one.get("needs", "table"),
+            )
+        )
+    captions, trainings = facts.get("pictures", {}), facts["trainings"]
+    return Page(name, facts["title"], facts.get("file", name), facts["make"], tuple(tables), captions, trainings)
+
+
+def page_json(page: Page, rows: Rows) -> str:
+    """Return NAME.json: per table a header and one line per row, with the rows and keys that the tables of the page show."""
+    parts = []
+    for name in dict.fromkeys(table.of for table in page.tables):
+        tables = [table for table in page.tables if table.of == name]
+        used = {key for table in tables for key in (table.needs, *table.keys)} - {"table"}
+        mine = [row for row in of_table(rows, name) if any(row.get(table.needs) for table in tables)]
+        keys = [key for key in dict.fromkeys(key for row in mine for key in row) if key in used]
+        lines = ",\n".join(json.dumps([row.get(key) for key in keys]) for row in mine)
+        parts.append(f'{json.dumps(name)}: {{"columns": {json.dumps(keys)}, "rows": [\n{lines}\n]}}')
+    return '{"simulated": true, "tables": {\n' + ",\n".join(parts) + "\n}}\n"
+
+
+def read_rows(folder: Path, name: str) -> Rows:
+    """Return the rows of NAME.json; UsageError where it is not there or no page of results."""
+    path = folder / f"{name}.json"
+    try:
+        tables = json.loads(path.read_text(encoding="utf-8"))["tables"]
+        return [{"table": t, **dict(zip(of["columns"], row))} for t, of in tables.items() for row in of["rows"]]
+    except FileNotFoundError as error:
+        raise UsageError(f"{path} is not there", remedy=f"measure it: pans reproduce {name} -o {folder}") from error
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise UsageError(f"{path} is no page of results", remedy="remove it and measure it again") from error
+
+
+def is_page_file(path: Path) -> bool:
+    """Return whether a file was written by `write_page`, and may be written again; a picture is where its page's JSON file is."""
+    try:
+        if path.suffix == ".png":
+            return any(is_page_file(one) for one in path.parent.glob("*.json") if path.stem.startswith(one.stem))
+        text = path.read_text(encoding="utf-8")
+        return ": begin -->" in text if path.suffix == ".md" else {"tables", "simulated"} <= json.loads(text).keys()
+    except (OSError, ValueError, RecursionError, AttributeError):
+        return False
+
+
+def write_page(folder: Path, page: Page, made: Made) -> None:
+    """Write NAME.json, the page's part of its Markdown file, and its pictures, each whole or not at all."""
+    make_folder(folder)
+    replace_file(folder / f"{page.name}.json", page_json(page, made.rows).encode())
+    _put(folder, page, made.rows, made.pictures)
+    for ending, draw in made.pictures.items():
+        try:
+            draw(folder / f"{page.name}{ending}.png")
+        except ModuleNotFoundError as error:
+            words = "the picture needs matplotlib, which is not installed"
+            raise UsageError(words, remedy="pip install 'pans-runtime[plot]'") from error
+
+
+def generated(folder: Path, page: Page) -> str:
+    """Return the generated part of a page as NAME.json and the pictures in `folder` give it."""
+    there = [ending for ending in page.captions if (folder / f"{page.name}{ending}.png").is_file()]
+    return page.block(read_rows(folder, page.name), there)
+
+
+def rewrite_page(folder: Path, page: Page) -> None:
+    """Write the generated part of a page again, from NAME.json."""
+    there = [ending for ending in page.captions if (folder / f"{page.name}{ending}.png").is_file()]
+    _put(folder, page, read_rows(folder, page.name), there)
+
+
+def _put(folder: Path, page: Page, rows: Rows, pictures: Iterable[str]) -> None:
+    path, pictures = folder / f"{page.file}.md", list(pictures)
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    begin, end = page.markers
+    if begin in text and end in text:
+        whole = text[: text.index(begin)] + page.block(rows, pictures) + text[text.index(end) + len(end) :]
+    else:
+        whole = f"{text}\n" * bool(text) + page.whole(rows, pictures)
+    replace_file(path, whole.encode())
+
+
+# ---- finished parts ----
+
+
+def kept(path: Path, made_with: Row, make: Callable[[], Row], *, collect: bool) -> Row | None:
+    """Return the part in `path` if it was made with `made_with`, else the part that `make` returns, after writing it there.
+
+    `cpu_seconds` (of this process) is added. With `collect` nothing is made: None.
+    """
+    plain = json.loads(json.dumps(made_with))
+    found = cached_row(path, "made_with")
+    if found is not None and found.get("made_with") == plain:
+        return found
+    if collect:
+        return None
+    started = time.process_time()
+    part = make()
+    text = json.dumps({"made_with": plain, "cpu_seconds": time.process_time() - started, **part})
+    replace_file(path, text.encode())
+    whole: Row = json.loads(text)  # a part just made and one read again are the same to the caller
+    return whole
+
+
+def finished(path: Path, options: Options) -> Row | None:
+    """Return the figures in `path` if they are of a training with `options`, or None."""
+    found = cached_row(path, "options")
+    return found if found is not None and same_options(found["options"], options) else None
+
+
+def cached_row(path: Path, *keys: str) -> Row | None:
+    """Return the content of a file of the cache, None if it is not there; UsageError for one that is no finished row with `keys`."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or not found.keys() >= set(keys):
+        raise UsageError(f"{path}: is no finished row", remedy="remove it, or name another folder with --cache")
+    return found
+
+
+def check_cached_bundle(path: Path) -> None:
+    """Refuse to replace a bundle in the cache that was not made for a page: UsageError, before a row is trained."""
+
+    def ours(found: Path) -> bool:
+        try:
+            return str(load_bundle(found)[0].provenance.get("command", "")).startswith("pans reproduce ")
+        except PansError:
+            return False
+
+    check_outputs([path], ours=ours)

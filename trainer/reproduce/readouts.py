@@ -1,0 +1,243 @@
+"""Readouts of frames and of patterns on FashionMNIST: information (paper, Fig. 2C), maps (Fig. 2F), frames of direct imaging.
+
+Frames are counted by perfect pixels and decided by the exact posterior over all training images; patterns are those of the shipped
+bundle with all light scaled, behind a detector without dark counts or read noise. Nothing is trained here.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle, load_bundle
+from pans.runtime.instrument.click_law import ClickLaw, click_probability
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.baselines.bayes import log_joint
+from pans.trainer.baselines.common import detect, measure
+from pans.trainer.evaluate.accuracy import light_of
+from pans.trainer.evaluate.information import fisher, fisher_of_frames, posterior_information, word_information
+from pans.trainer.evaluate.pictures import tsne
+from pans.trainer.tasks.registry import Task, load_task
+
+from . import plots
+from .curves import CLEAN, POSTERIOR, curve_rows
+from .page import FIRST_OBJECTS, Asked, Draw, Made, Row, Rows, against, kept, sampling_error
+from .trained import neighbours_agree
+
+PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5)  # of the page fig-2c
+POSTERIOR_MAX = 1e3  # beyond it the mixture of the training objects is a nearest neighbour and knows nothing new
+FLOOR = 5e-3  # of full transmission, by which the posterior lifts every pixel
+FRAMES = 1000  # test objects whose frames are read out, and that are mapped on the page fig-2f
+FISHER_OBJECTS = 6000
+MAP_PHOTONS = (10.0, 30.0)  # of the page fig-2f
+SHOWN = {1e6: 1, 1e3: 3, 1e2: 3, 1e1: 3}  # photons: frames drawn of each object, on the page direct-frames
+MAPPED = (1e6, 1e2, 1e1)
+MAPPED_FRAMES = 600
+WAYS = ("camera frames", "clicks of ten patterns")
+_LEAST = 1e-9  # of a word's chance under a class
+
+F64 = NDArray[np.float64]
+
+
+def shipped_bundle() -> Bundle:
+    """Return the bundle that comes with the package: ten patterns, FashionMNIST."""
+    return load_bundle(Path(str(importlib.resources.files("pans.runtime") / "shipped" / "fashion10.pans")))[0]
+
+
+def shipped_light(task: Task) -> tuple[F64, F64]:
+    """Return photoelectrons (n, d_f) of the training and of the test objects through the shipped patterns."""
+    bundle = shipped_bundle()
+    profile = load_profile(str(bundle.provenance["profile"]))
+    train, test = (light_of(bundle, profile, part.images).photoelectrons for part in (task.train, task.test))
+    return train, test
+
+
+# ---- information (Fig. 2C) ----
+
+
+def information_page(asked: Asked) -> Made:
+    """Return one row per way and photon level; accuracies of both ways beside each other, with binomial errors."""
+    task = load_task(shipped_bundle().task, asked.data_dir)
+    frames = _information_of_frames(replace(task, test=task.test.first(FRAMES)))
+    there = {row["photons"]: row for row in frames if "value" in row}
+    words = _information_of_words(task)
+    for row in words:
+        other = there.get(row["photons"])
+        if other is not None:
+            errors = [sampling_error(one["value"], one["objects"]) for one in (row, other)]
+            row |= against(row["value"], other["value"], *errors)
+    rows = frames + words
+    return Made(rows, {"": partial(plots.information, rows=rows)})
+
+
+def _information_of_frames(task: Task) -> Rows:
+    measurement = measure(task, None)
+    light = measurement.photoelectrons(measurement.train[:FISHER_OBJECTS], 1.0).astype(np.float64)
+    ratios = fisher_of_frames(light, measurement.train_labels[:FISHER_OBJECTS], PHOTONS)
+    rows = []
+    for photons, ratio in zip(PHOTONS, ratios):
+        row: Row = {"table": "information", "way": WAYS[0], "photons": photons, "objects": FRAMES}
+        row |= {
+            "trace": ratio.trace,
+            "discriminant": ratio.discriminant,
+            "illumination": measurement.illumination(photons),
+        }
+        if photons <= POSTERIOR_MAX:
+            lit = measurement.photoelectrons(measurement.test, photons)
+            readouts = detect(lit, "counting", np.random.default_rng([0, 4]))
+            joint = log_joint(measurement, readouts, photons, "counting", floor=FLOOR)
+            known = posterior_information(joint, measurement.test_labels)
+            right = 100 * float((joint.argmax(axis=1) == measurement.test_labels).mean())
+            clicks = float((readouts > 0).sum(axis=1).mean())
+            row |= {"bits": known.lower_bits, "bits_se": known.lower_bits_se, "value": right, "clicks": clicks}
+        rows.append(row)
+    return rows
+
+
+def _information_of_words(task: Task) -> Rows:
+    law, (train, test), illumination = ClickLaw(), shipped_light(task), shipped_bundle().illumination()
+    rows = []
+    for photons in PHOTONS:
+        eta, classes = photons / float(test.sum(axis=1).mean()), len(task.classes)
+        known = word_information(eta * train, task.train.labels, eta * test, task.test.labels, classes, law=law)
+        p = click_probability(law, eta * test)
+        ratio = fisher(p, p * (1 - p), task.test.labels)
+        row: Row = {"table": "information", "way": WAYS[1], "photons": photons, "objects": len(test)}
+        row |= {"trace": ratio.trace, "discriminant": ratio.discriminant, "illumination": eta * illumination}
+        right = 100 * known.heldout_bayes_accuracy
+        rows.append(row | {"bits": known.heldout_bits, "value": right, "clicks": known.clicks})
+    return rows
+
+
+# ---- maps of single readouts (Fig. 2F) ----
+
+
+def maps_page(asked: Asked) -> Made:
+    """Return one row per level and way, clicks beside the frames of as many photons."""
+    task = load_task(shipped_bundle().task, asked.data_dir)
+    part = replace(task, test=task.test.first(FRAMES))
+    panels: Rows = []
+    for photons in MAP_PHOTONS:
+        for way, make in zip(WAYS, (_map_of_frames, _map_of_words)):
+            path = asked.cache / f"fig-2f-{'frames' if way == WAYS[0] else 'words'}-{photons:g}.json"
+            made_with = {"objects": FRAMES, "photons": photons, "floor": FLOOR}
+            found = kept(path, made_with, partial(make, part, photons), collect=asked.collect)
+            if found is None:
+                asked.report(f"{way} at {photons:g} photons: not measured yet (pans reproduce fig-2f)")
+                continue
+            panels.append({"table": "maps", "way": way, "asked": photons, **found})
+    for row in panels:
+        other = next((each for each in panels if (each["way"], each["asked"]) == (WAYS[0], row["asked"])), row)
+        if other is not row:
+            row |= against(row["value"], other["value"], row["error_objects"], other["error_objects"])
+    pictures: dict[str, Draw] = {}
+    if panels:
+        pictures = {"": partial(plots.readout_maps, panels=panels, classes=task.classes)}
+    return Made(panels, pictures)
+
+
+def _map_of_frames(task: Task, photons: float) -> Row:
+    measurement = measure(task, None)
+    lit = measurement.photoelectrons(measurement.test, photons)
+    readouts = detect(lit, "counting", np.random.default_rng([0, 5]))
+    decided = log_joint(measurement, readouts, photons, "counting", floor=FLOOR).argmax(axis=1)
+    light = {"photons": float(lit.sum(axis=1).mean()), "illumination": measurement.illumination(photons)}
+    return mapped(readouts.astype(np.float64), decided, task) | light
+
+
+def _map_of_words(task: Task, photons: float) -> Row:
+    law, (train, test) = ClickLaw(), shipped_light(task)
+    eta = photons / float(test.sum(axis=1).mean())
+    words = np.random.default_rng([0, 6]).random(test.shape) < click_probability(law, eta * test)
+    table = class_table(click_probability(law, eta * train), task.train.labels, len(task.classes))
+    decided = table[words @ (1 << np.arange(words.shape[1]))].argmax(axis=1)
+    light = {"photons": eta * float(test.sum(axis=1).mean()), "illumination": eta * shipped_bundle().illumination()}
+    return mapped(words.astype(np.float64), decided, task) | light
+
+
+def class_table(probability: F64, labels: NDArray[np.int64], n_classes: int) -> F64:
+    """Return log P(word, class), float64 (2**d_f, classes), of objects with click probabilities (n, d_f); bit i is pattern i."""
+    table = np.empty((1 << probability.shape[1], n_classes))
+    for label in range(n_classes):
+        mine = probability[labels == label]
+        chance = np.ones((len(mine), 1))
+        for column in mine.T[:, :, None]:
+            chance = np.concatenate([chance * (1 - column), chance * column], axis=1)
+        table[:, label] = chance.sum(axis=0) / len(labels)
+    return np.log(table + _LEAST)
+
+
+def mapped(readouts: F64, decided: NDArray[np.integer], task: Task, seed: int = 0) -> Row:
+    """Return the t-SNE map of one readout of each test object, how well neighbours tell the class, and the accuracy of `decided`."""
+    places, labels = tsne(readouts, seed=seed), task.test.labels
+    right = 100.0 * (decided == labels)
+    return {
+        "map": places.round(2).tolist(),
+        "labels": labels.tolist(),
+        "features": readouts.shape[1],
+        "neighbours": 100 * neighbours_agree(places, labels),
+        "by_readouts": 100 * neighbours_agree(readouts, labels),
+        "value": float(right.mean()),
+        "error_objects": float(right.std(ddof=1)) / len(right) ** 0.5,
+        "first_200": float(right[:FIRST_OBJECTS].mean()),
+        "clicks": float((readouts > 0).sum(axis=1).mean()),
+    }
+
+
+# ---- frames of direct imaging ----
+
+
+def frames_page(asked: Asked) -> Made:
+    """Return one row per photon level: frames on a map, the posterior's decisions on them, and both curves of direct imaging there."""
+    task = load_task(shipped_bundle().task, asked.data_dir)
+    whole, part = measure(task, None), replace(task, test=task.test.first(MAPPED_FRAMES))
+    maps = {}
+    for photons in MAPPED:
+        made_with = {"objects": MAPPED_FRAMES, "photons": photons, "floor": FLOOR, "flat": True}
+        path = asked.cache / f"direct-frames-{photons:g}.json"
+        found = kept(path, made_with, partial(_map_of_frames, part, photons), collect=asked.collect)
+        if found is not None:
+            maps[photons] = found
+    curves = {
+        name: curve_rows(replace(asked, collect=True), curve)
+        for name, curve in (("network", CLEAN), ("posterior", POSTERIOR))
+    }
+    rows = []
+    for photons in SHOWN:
+        row: Row = {"table": "frames", "photons": photons, "illumination": whole.illumination(photons)}
+        if photons in maps:
+            row |= {f"map_{key}": maps[photons][key] for key in ("neighbours", "value", "error_objects", "clicks")}
+        for name, curve in curves.items():
+            at = next((each for each in curve if each["photons_asked"] == photons), {})
+            row |= {
+                f"{name}_{key}": at[key]
+                for key in ("value", "spread_trials", "error_objects", "first_200", "clicks")
+                if key in at
+            }
+        row["clicks"] = next(
+            (row[f"{of}_clicks"] for of in ("posterior", "network", "map") if f"{of}_clicks" in row), None
+        )
+        rows.append(row)
+    pictures: dict[str, Draw] = {"": partial(plots.frames, classes=task.classes, shown=drawn_frames(task))}
+    if maps:
+        panels = [{"way": "frames", "asked": photons, **found} for photons, found in maps.items()]
+        pictures["-map"] = partial(plots.readout_maps, panels=panels, classes=task.classes)
+    return Made(rows, pictures)
+
+
+def drawn_frames(task: Task, seed: int = 0) -> dict[float, NDArray[np.float32]]:
+    """Return photons -> counts, float32 (classes, draws, height, width), of the first test image of each class."""
+    firsts = np.array([int(np.flatnonzero(task.test.labels == label)[0]) for label in range(len(task.classes))])
+    measurement = measure(task, None)
+    frames = {}
+    for photons, draws in SHOWN.items():
+        lit = measurement.photoelectrons(measurement.test[firsts], photons)
+        rng = np.random.default_rng([seed, int(photons)])
+        drawn = np.stack([detect(lit, "counting", rng) for _ in range(draws)], axis=1)
+        frames[photons] = drawn.reshape(len(firsts), draws, *task.image_shape)
+    return frames

@@ -1,0 +1,365 @@
+"""Pages that measure the trained rows of FashionMNIST and MNIST further: shots, light, dark counts, confusions, single shots."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.evaluate.accuracy import (
+    EXACT_OUTCOMES_MAX,
+    Light,
+    decision_shares,
+    evaluate_exactly,
+    evaluate_sampled,
+    light_of,
+    row_of,
+    sampled_shares,
+)
+from pans.trainer.evaluate.pictures import tsne
+from pans.trainer.tasks.registry import Objects, load_task
+
+from . import plots
+from .active import PARTS, PROFILE, TrainedRow, beside_paper, measured_on, shot_figures, trained_rows
+from .page import FIRST_OBJECTS, VERDICTS, Asked, Draw, Made, Row, Rows, against, flat, interpolated, sampling_error
+from .printed import ACTIVE, SHOTS
+
+SWEPT = "fashion-mnist"  # of eta, dark counts and single shots
+SETTINGS = {  # factors of the light, dark counts of an exposure
+    "eta": tuple(10.0 ** (exponent / 4) for exponent in range(-8, 9)),
+    "dark": tuple(10.0 ** (exponent / 4) for exponent in range(-12, 1)),
+}
+SHOWN = (0.001, 0.01, 0.1, 1.0, 10.0, 100.0)  # settings that the page names
+TRIALS = {FIRST_OBJECTS: 100}
+TRIALS_OF_ALL = 10
+EXACT_WORK_MAX = 1 << 25  # objects times click words
+LEVEL = 2.0  # points below the best that still count as level with it
+WORST = 3  # confusions that a table names
+SHOT_FEATURES = (16, 32)  # of the page single-shot
+SHOWN_TRIALS = 30  # as the paper's experiment
+SAMPLED_TRIALS = 10_000  # where the words are too many to enumerate
+MAPPED = 1000  # shots on a map
+NEIGHBOURS = 10
+UNCERTAIN = (0.1, 0.9)  # click probabilities between which an exposure tells trials apart
+PIPELINE = ("Shirt", 16)  # the paper's example: class and number of patterns
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+# ---- more patterns, more shots ----
+
+
+def fig_3_page(asked: Asked) -> Made:
+    """Return one row per data set and number of patterns at one shot, beside the paper's simulation and experiment."""
+    rows = [
+        {"set": name} | beside_paper(row.paper, 1, row.figures, [row.figures])
+        for name in ACTIVE
+        for row in trained_rows(asked, name)
+    ]
+    return Made(rows, {"": partial(plots.fig_3, rows=rows)})
+
+
+def multi_shot_page(asked: Asked) -> Made:
+    """Return, per data set and measure of the expense, the duels of more patterns against more shots."""
+    points = [
+        {"set": name} | beside_paper(row.paper, shots, row.figures, [row.figures])
+        for name in ACTIVE
+        for row in trained_rows(asked, name)
+        for shots in SHOTS
+    ]
+    return Made(duels(points), {"": partial(plots.multi_shot, rows=points)})
+
+
+def duels(points: Rows) -> Rows:
+    """Hold every point of several shots against the curves of more patterns where they reach as far: one row per set and expense.
+
+    A row counts in how many duels more patterns are above, level and below, and names their least lead in points.
+    """
+    rows: Rows = []
+    for name in dict.fromkeys(row["set"] for row in points):
+        mine = [
+            row | {"paper_error": sampling_error(row["simulation"], FIRST_OBJECTS)}
+            for row in points
+            if row["set"] == name
+        ]
+        for whose, value, error, expenses in (
+            ("paper, simulation", "simulation", "paper_error", {"detections": "detections", "clicks": "paper_clicks"}),
+            (f"ours, first {FIRST_OBJECTS}", "first_200", "first_error", {"detections": "detections"}),
+            (
+                "ours, all",
+                "value",
+                "error_objects",
+                {"detections": "detections", "clicks": "clicks", "photons": "photons"},
+            ),
+        ):
+            for words, key in expenses.items():
+                found = [
+                    duel
+                    for pair in combinations(sorted({r["features"] for r in mine}), 2)
+                    for duel in _duels(mine, pair, key, value, error)
+                ]
+                counts = {verdict: [duel["verdict"] for duel in found].count(verdict) for verdict in VERDICTS}
+                least = min((duel["ahead"] for duel in found), default=None)
+                rows.append(
+                    {"table": "duels", "set": name, "whose": whose, "equal": words, "duels": len(found), "least": least}
+                    | counts
+                )
+    return rows
+
+
+def _duels(rows: Rows, pair: tuple[int, int], spent: str, value: str, error: str) -> Rows:
+    few, many = ([row for row in rows if row["features"] == features] for features in pair)
+    found = []
+    for row in few:
+        there, their_error = (interpolated(many, row[spent], spent, of) for of in (value, error))
+        if there is not None and their_error is not None:
+            found.append(against(there, row[value], their_error, row[error]))
+    return found
+
+
+# ---- light and dark counts ----
+
+
+def measure_setting(bundle: Bundle, test: Objects, sweep: str, setting: float) -> Row:
+    """Return the figures of `bundle` at that factor of the light (`eta`), or with that many dark counts per exposure (`dark`)."""
+    eta, dark = (setting, None) if sweep == "eta" else (1.0, setting)
+    found = {}
+    for part, count in PARTS.items():
+        objects = test.first(count)
+        lit = light_of(bundle, load_profile(PROFILE), objects.images, eta=eta, dark=dark)
+        if enumerable(bundle, len(objects)):
+            found[part] = row_of(evaluate_exactly(bundle, lit, objects.labels))
+        else:
+            trials = TRIALS.get(len(objects), TRIALS_OF_ALL)
+            found[part] = row_of(evaluate_sampled(bundle, lit, objects.labels, shots=1, trials=trials, seed=1))
+    return {"setting": setting, **found}
+
+
+def enumerable(bundle: Bundle, objects: int) -> bool:
+    """Return whether a page enumerates all click words of one shot for that many objects, or samples them."""
+    return objects << bundle.n_features <= EXACT_WORK_MAX
+
+
+def swept_page(asked: Asked) -> Made:
+    """Return one row per number of patterns as trained, with the effect of the sweep, and one per setting."""
+    sweep = "dark" if asked.name == "dark-counts" else "eta"
+    settings, trained, rows = SETTINGS[sweep], [], []
+    facts = {"settings": settings, "trials": [TRIALS[FIRST_OBJECTS], TRIALS_OF_ALL], "exact": EXACT_WORK_MAX}
+    for row in trained_rows(asked, SWEPT):
+        made = measured_on(asked, row, facts, partial(_all_settings, row, asked.data_dir, sweep))
+        if made is not None:
+            swept = [flat(found["all"], found["first_200"]) | {"setting": found["setting"]} for found in made["rows"]]
+            base, of_row = shot_figures(row.figures), {"features": row.features}
+            trained.append(
+                {"table": "trained"} | of_row | base | (over_light if sweep == "eta" else over_dark)(base, swept)
+            )
+            for found in swept:
+                shown = any(math.isclose(found["setting"], setting) for setting in SHOWN)
+                rows.append({"table": "swept", "shown": shown} | of_row | found)
+    return Made(trained + rows, {"": partial(plots.robustness, rows=rows, sweep=sweep)})
+
+
+def _all_settings(row: TrainedRow, data_dir: str | None, sweep: str) -> Row:
+    test = load_task(SWEPT, data_dir).test
+    return {"rows": [measure_setting(row.bundle, test, sweep, setting) for setting in SETTINGS[sweep]]}
+
+
+def _at(swept: Rows, setting: float) -> float:
+    """Return the accuracy at a setting, up to rounding."""
+    return float(min(swept, key=lambda row: abs(float(row["setting"]) - setting))["value"])
+
+
+def over_light(_base: Row, swept: Rows) -> Row:
+    """Return the best factor of the light, its gain over the trained light, and the range within `LEVEL` points of the best."""
+    top = max(swept, key=lambda row: float(row["value"]))
+    level = [row["setting"] for row in swept if row["value"] >= top["value"] - LEVEL]
+    changes = {"at_third": _at(swept, 10**-0.5) - _at(swept, 1.0), "at_tenth": _at(swept, 0.1) - _at(swept, 1.0)}
+    return {
+        "best": top["setting"],
+        "gain": top["value"] - _at(swept, 1.0),
+        "low": level[0],
+        "high": level[-1],
+    } | changes
+
+
+def over_dark(base: Row, swept: Rows) -> Row:
+    """Return the change of the accuracy in points at 0.1 dark counts, and per decade below and above."""
+    low, middle, high = (_at(swept, dark) for dark in (0.01, 0.1, 1.0))
+    return {"change": middle - base["value"], "below": middle - low, "above": high - middle}
+
+
+# ---- confusion ----
+
+
+def confusion(shares: F64, objects: Objects) -> F64:
+    """Return the matrix (true class, decided class) of P(decided | object) (n, classes): rows sum to 1, or to 0 without objects."""
+    matrix = np.zeros((shares.shape[1], shares.shape[1]))
+    np.add.at(matrix, objects.labels, shares)
+    return matrix / np.maximum(np.bincount(objects.labels, minlength=len(matrix)), 1)[:, None]
+
+
+def confusion_page(asked: Asked) -> Made:
+    """Return one row per data set and number of patterns: the classes told best and worst, and the most frequent confusions."""
+    rows: Rows = []
+    pictures: dict[str, Draw] = {}
+    for name in ACTIVE:
+        drawn = []
+        for row in trained_rows(asked, name):
+            facts = {"trials": [TRIALS[FIRST_OBJECTS], TRIALS_OF_ALL]}
+            made = measured_on(asked, row, facts, partial(_matrix, row, asked.data_dir))
+            if made is not None:
+                found = {"table": "confusion", "set": name, "features": row.features} | shot_figures(row.figures)
+                rows.append(found | named_confusions(np.array(made["all"]), made["classes"]))
+                drawn.append(found | {"matrix": made["all"], "classes": made["classes"]})
+        pictures[f"-{name}"] = partial(plots.confusions, rows=drawn, name=name)
+    return Made(rows, pictures)
+
+
+def _matrix(row: TrainedRow, data_dir: str | None) -> Row:
+    task = load_task(row.name, data_dir)
+    lit = light_of(row.bundle, load_profile(PROFILE), task.test.images)
+    if enumerable(row.bundle, len(task.test)):
+        shares = decision_shares(row.bundle, lit)
+    else:
+        shares = sampled_shares(row.bundle, lit, trials=TRIALS_OF_ALL, seed=1)
+    return {"classes": list(task.classes), "all": confusion(shares, task.test).round(5).tolist()}
+
+
+def named_confusions(matrix: F64, classes: list[str]) -> Row:
+    """Return the classes that are told best and worst, and the most frequent confusions, with shares in %."""
+    right = matrix.diagonal()
+    best, poorest = (f"{classes[place]} {100 * right[place]:.0f}" for place in (right.argmax(), right.argmin()))
+    wrong = matrix * (1 - np.eye(len(classes)))
+    places = [np.unravel_index(place, wrong.shape) for place in np.argsort(-wrong, axis=None)[:WORST]]
+    confused = ", ".join(f"{classes[i]} → {classes[j]} {100 * wrong[i, j]:.0f}" for i, j in places)
+    return {"best": best, "poorest": poorest, "confused": confused}
+
+
+# ---- single shots ----
+
+
+def neighbours_agree(points: NDArray[np.floating], labels: I64, count: int = NEIGHBOURS) -> float:
+    """Return the share of points whose class most of their `count` nearest others have (a tie goes to the lowest class)."""
+    norms = (points**2).sum(axis=1)
+    away = norms[:, None] + norms[None, :] - 2 * points @ points.T
+    np.fill_diagonal(away, np.inf)
+    nearest = labels[np.argsort(away, axis=1, kind="stable")[:, :count]]
+    votes = (nearest[:, :, None] == np.arange(labels.max() + 1)).sum(axis=1)
+    return float((votes.argmax(axis=1) == labels).mean())
+
+
+def single_shot_page(asked: Asked) -> Made:
+    """Return one row per number of patterns, and one per first test image of every class."""
+    rows, images, shown = [], [], []
+    facts = {
+        "trials": [SHOWN_TRIALS, SAMPLED_TRIALS],
+        "mapped": MAPPED,
+        "neighbours": NEIGHBOURS,
+        "uncertain": UNCERTAIN,
+    }
+    for row in trained_rows(asked, SWEPT):
+        made = None
+        if row.features in SHOT_FEATURES:
+            made = measured_on(asked, row, facts, partial(_single_shots, row, asked.data_dir))
+        if made is not None:
+            of_row = {"features": row.features}
+            uncertain = {"uncertain": 100 * made["differing"]["uncertain"]}
+            near = {f"near_{key}": 100 * value for key, value in made["near"].items()}
+            rows.append(
+                {"table": "varying"} | of_row | shot_figures(row.figures) | made["differing"] | near | uncertain
+            )
+            images += [{"table": "images"} | of_row | one | _decided(one, made["classes"]) for one in made["objects"]]
+            shown.append(of_row | made | {"patterns": row.bundle.patterns()})
+    pictures: dict[str, Draw] = {}
+    if shown:
+        pictures = {"-frames": partial(plots.click_frames, shown=shown), "-tsne": partial(plots.shot_maps, shown=shown)}
+    for one in shown:
+        if one["features"] == PIPELINE[1]:
+            pictures["-pipeline"] = partial(plots.pipeline, one=one, name=PIPELINE[0])
+            pictures["-outputs"] = partial(plots.outputs, one=one)
+    return Made(rows + images, pictures)
+
+
+def _single_shots(row: TrainedRow, data_dir: str | None) -> Row:
+    test = load_task(SWEPT, data_dir).test
+    lit = light_of(row.bundle, load_profile(PROFILE), test.images)
+    chosen = np.array([int(np.flatnonzero(test.labels == label)[0]) for label in range(row.bundle.n_classes)])
+    labels = test.labels[:MAPPED]
+    words = np.random.default_rng([1, row.features]).binomial(1, lit.probability[:MAPPED])
+    places, decided = tsne(words.astype(np.float64)), make_decider(row.bundle).decide_batch(words, 1)
+    near = {"map": neighbours_agree(places, labels), "clicks": neighbours_agree(words.astype(np.float64), labels)}
+    return {
+        "classes": list(row.bundle.classes),
+        "objects": _trials(row.bundle, lit, chosen),
+        "images": test.images[chosen].tolist(),
+        "differing": differing(lit.probability, test.labels),
+        "near": near | {"head": float((decided == labels).mean())},
+        "places": places.round(2).tolist(),
+        "labels": labels.tolist(),
+    }
+
+
+def _trials(bundle: Bundle, lit: Light, chosen: I64) -> Rows:
+    """Return per chosen object: clicks and outputs of every trial, the decisions, and their expected shares."""
+    decider = make_decider(bundle)
+    part = Light(lit.photoelectrons[chosen], lit.probability[chosen], lit.law, lit.illumination)
+    if 1 << bundle.n_features <= EXACT_OUTCOMES_MAX:
+        expected = decision_shares(bundle, part)
+    else:
+        expected = sampled_shares(bundle, part, trials=SAMPLED_TRIALS, seed=1)
+    rng = np.random.default_rng([0, bundle.n_features])
+    found = []
+    for i, index in enumerate(chosen):
+        words = rng.binomial(1, part.probability[i], (SHOWN_TRIALS, bundle.n_features))
+        light = {"clicks": float(part.probability[i].sum()), "photons": float(part.photoelectrons[i].sum())}
+        facts: Row = {"object": int(index), "class": bundle.classes[i], **light, "illumination": part.illumination}
+        facts["words"] = ["".join(map(str, word)) for word in words]
+        facts["decided"] = decider.decide_batch(words, 1).tolist()
+        facts["outputs"] = softmax(decider.scores_batch(words, 1)).round(3).tolist()
+        found.append(facts | {"expected": expected[i].round(4).tolist()})
+    return found
+
+
+def softmax(scores: NDArray[np.floating]) -> F64:
+    """Return the outputs (n, classes) of rows of scores, each summing to 1."""
+    grown = np.exp(scores.astype(np.float64) - scores.max(axis=1, keepdims=True))
+    return np.asarray(grown / grown.sum(axis=1, keepdims=True))
+
+
+def differing(probability: F64, labels: I64) -> dict[str, float]:
+    """Return how many of d_f clicks differ on average between two shots of one object, of two of a class, of two of other classes.
+
+    `uncertain` is the share of exposures whose click probability is within `UNCERTAIN`.
+    """
+    sizes = np.bincount(labels)
+    means = np.stack([probability[labels == label].mean(axis=0) for label in range(len(sizes))])
+    own = 2 * (probability * (1 - probability)).sum(axis=1)
+    within = []
+    for label, n in enumerate(sizes):  # all pairs of a class, without an object against itself
+        pairs = n * n * 2 * (means[label] * (1 - means[label])).sum()
+        within.append(float(pairs - own[labels == label].sum()) / (n * (n - 1)))
+    between = means @ (1 - means).T
+    between = between + between.T
+    uncertain = ((probability > UNCERTAIN[0]) & (probability < UNCERTAIN[1])).mean()
+    others = float(between[~np.eye(len(sizes), dtype=bool)].mean())
+    return {
+        "uncertain": float(uncertain),
+        "object": float(own.mean()),
+        "class": float(np.mean(within)),
+        "others": others,
+    }
+
+
+def _decided(one: Row, classes: list[str]) -> Row:
+    label, wrong = classes.index(one["class"]), np.array(one["expected"])
+    expected, wrong[label] = 100 * float(wrong[label]), 0.0
+    other, right = int(wrong.argmax()), sum(decided == label for decided in one["decided"])
+    most = f"{classes[other]} {100 * wrong[other]:.0f} %"
+    return {"different": len(set(one["words"])), "right": right, "expected_right": expected, "wrong": most}
