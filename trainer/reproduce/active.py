@@ -102,7 +102,8 @@ def make_row(asked: Asked, row: ActiveRow, seed: int = 0) -> Row:
 
 def measure_row(bundle: Bundle, task: Task) -> Row:
     """Return accuracy, clicks, photons and illumination at every number of shots, of the first 200 and of all test images."""
-    profile, found = load_profile(PROFILE), {}
+    profile = load_profile(PROFILE)
+    found: Row = {}
     for part, count in PARTS.items():
         objects: Objects = task.test.first(count)
         light = light_of(bundle, profile, objects.images)

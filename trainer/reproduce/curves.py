@@ -122,7 +122,7 @@ def fig_2e_page(asked: Asked) -> Made:
         if figures is None:
             asked.report(f"{PANS} d_f = {row.features}: not trained yet (pans reproduce {TASK} --rows {row.features})")
             continue
-        mine = {"table": "pans", "way": PANS, "features": row.features} | shot_figures(figures)
+        mine: Row = {"table": "pans", "way": PANS, "features": row.features} | shot_figures(figures)
         for name, curve in (("direct", posterior), ("envelope", best)):
             for of in ("photons", "illumination"):
                 there, error = (interpolated(curve, mine[of], of, key) for key in ("value", "error_objects"))
