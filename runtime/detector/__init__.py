@@ -1,6 +1,7 @@
-"""What links the exposures of one detector: afterpulses of the clicks before.
+"""What links the clicks of one detector: afterpulses of the exposures before, crosstalk between channels.
 
-The simulator has code of its own for them, and a program in tests/independent counts single events.
+What comes in are chances of clicks of single exposures (instrument/click_law.py); what goes out are those that follow from clicks before
+and beside. limits.py says where the laws stop holding. Start with afterpulses.py.
 
 >>> from pans.runtime.detector import Afterpulses
 >>> round(float(Afterpulses(0.05, 2.0).chance(0.1, [0.0, 0.0])), 3)

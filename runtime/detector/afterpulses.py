@@ -1,6 +1,7 @@
 """Afterpulses: how the clicks of an exposure raise the chance of those after it.
 
-Owns the law of one family of traps, exposure by exposure; under steady light stationary.py has it without approximation. Never draws.
+`Afterpulses` is the law of one family of traps, exposure by exposure; tests/oracles/steady_afterpulses.py has it without approximation
+for steady light.
 
 Every detection (photoelectron, dark count or afterpulse) fills traps, which release a Poisson number of carriers, a = -log(1 - p) in the
 mean: p is the chance that at least one comes. Each comes after an exponential delay of mean tau; a carrier starts a detection like any

@@ -1,7 +1,7 @@
-"""Where the object stands on the pattern grid and how sharply it is seen: the optics between projector and object as numbers.
+"""Optics between projector and object as numbers: shift, rotation, magnification, blur, black level, gain, flat field, bleaching.
 
-Owns the model (shift, rotation, magnification, blur, black level, gain, flat field), the linear map from an object to what the pattern
-grid meets of it, the spelling of `--optics`, and what bleaching leaves of a sample. Numpy only; never reads a profile, never draws a click.
+What comes in are facts of the table (`Imaging`, or text as `--optics` spells it) and objects or patterns as arrays; what goes out is the
+light that a pattern gets through an object. Start with model.py. numpy only.
 
 >>> import numpy as np
 >>> from pans.runtime.imaging import Imaging, seen
@@ -10,10 +10,8 @@ array([[0., 1., 0., 0.]])
 """
 
 from .bleaching import NO_BLEACHING, Bleaching, bleached, bleaching_of, mean_left
-from .model import IDENTITY, Imaging, checked_flat
-from .patterns import levelled, met
-from .sampling import operator, seen
-from .spec import Tolerance, imaging_of, is_spec, tolerance_of
+from .model import IDENTITY, Imaging, Tolerance, checked_flat, imaging_of, is_spec, tolerance_of
+from .sampling import levelled, met, operator, seen
 
 __all__ = [
     "IDENTITY",

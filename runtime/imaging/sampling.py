@@ -1,6 +1,6 @@
-"""From an object to what every pattern pixel meets of it: a linear map of pixels to pixels.
+"""The optics as a linear map: objects as the pattern grid meets them, and patterns as the object meets them (the adjoint).
 
-Owns the interpolation. An object is constant over each of its pixels; a pattern pixel meets the mean, over its own square, of the object
+An object is constant over each of its pixels; a pattern pixel meets the mean, over its own square, of the object
 after magnification, rotation, shift and blur. The weight of an object pixel is the integral of the Gaussian over both squares, in closed
 form per axis of the object. That is exact for every shift, magnification and blur, and for rotations by multiples of 90 degrees. At other
 angles the square of the pattern pixel keeps the object's orientation: its centre is exact, its second moments are too, as those of
@@ -70,6 +70,30 @@ def operator(imaging: Imaging, shape: Shape) -> F64:
         row_weight[grid, above] * column_weight[grid, aside]
     )
     return matrix
+
+
+def levelled(imaging: Imaging, patterns: F64, shape: Shape, peak: F64 | float = 1.0) -> F64:
+    """Return the light of every pattern pixel, float64 (patterns, pixels): gain * flat * (black * peak + (1 - black) * pattern).
+
+    `peak` is the light of a full pixel, of all patterns or (patterns, 1) of each. A pattern without a lit pixel gets the black level
+    too: the light is on. ValueError when the shapes differ.
+    """
+    light = np.asarray(patterns, np.float64)
+    if light.ndim != 2 or light.shape[1] != shape[0] * shape[1]:
+        raise ValueError(f"patterns are {light.shape}, allowed: (patterns, {shape[0]} * {shape[1]})")
+    if imaging.flat is not None and imaging.flat.shape != shape:
+        raise ValueError(f"the flat field is {imaging.flat.shape}, the patterns are {shape}")
+    light = imaging.gain * (imaging.black * np.asarray(peak, np.float64) + (1.0 - imaging.black) * light)
+    return light if imaging.flat is None else np.asarray(light * imaging.flat.reshape(-1))
+
+
+def met(imaging: Imaging, patterns: F64, shape: Shape, peak: F64 | float = 1.0) -> F64:
+    """Return patterns as the object meets them, float64 (patterns, pixels): light = met(...) @ transmission.
+
+    The same as levelled(...) @ seen(...).T for every object; arguments as of `levelled`.
+    """
+    light = levelled(imaging, patterns, shape, peak)
+    return light if imaging.in_place else np.asarray(light @ operator(imaging, shape))
 
 
 def _gathered(imaging: Imaging, pixels: F64, shape: Shape) -> F64:

@@ -14,8 +14,7 @@ from typing import Any
 
 from pans.runtime.bundle.facts import Bundle
 from pans.runtime.errors import UsageError
-from pans.runtime.imaging import IDENTITY, Imaging
-from pans.runtime.imaging.spec import tolerance_of
+from pans.runtime.imaging import IDENTITY, Imaging, tolerance_of
 from pans.runtime.instrument.calibration import check_made_for
 from pans.runtime.instrument.profile import Profile
 

@@ -8,11 +8,11 @@ from itertools import product
 import numpy as np
 import pytest
 from lab_afterpulses import clicks
+from steady_afterpulses import correlation, stationary_chance
 
 from pans.firmware_sim.scene.detector import sample_clicks
 from pans.firmware_sim.scene.detector_model import DetectorModel
 from pans.runtime.detector import Afterpulses
-from pans.runtime.detector.stationary import correlation, stationary_chance
 from pans.runtime.instrument.click_law import ClickLaw
 
 SIGMAS = 4.5

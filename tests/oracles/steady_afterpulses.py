@@ -1,7 +1,5 @@
 """Afterpulses under steady light, without approximation: how often exposures click, and how clicks depend on each other.
 
-Owns the sums over all histories of a detector whose traps are those of afterpulses.py; never a sequence of unequal exposures.
-
 The carriers X still to come are an affine process: E[exp(-u X(t)) | X(0)] = exp(-v X(0) - m w) with dv/dt = -(v - 1 + exp(-a v))/tau,
 dw/dt = 1 - exp(-a v), v(0) = u, w(0) = 0 (Hawkes and Oakes, Journal of Applied Probability 11, 493, 1974; Errais, Giesecke and Goldberg,
 SIAM Journal on Financial Mathematics 1, 642, 2010). An exposure is silent with exp(-m - q X). Going back period by period until v
@@ -15,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .afterpulses import Afterpulses
+from pans.runtime.detector import Afterpulses
 
 _STEPS, _STEPS_LEAST = 12, 4  # of Runge and Kutta in a time constant, and beside those
 _GONE = 1e-12
