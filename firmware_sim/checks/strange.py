@@ -13,9 +13,26 @@ import numpy as np
 
 from pans.firmware_sim.device.instrument import Instrument
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.automata import MaskChunk, Show, StateChunk, pack_masks, pack_show, pack_states
-from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_arm, pack_gate, pack_pattern, pack_plan
-from pans.runtime.wire.counts import CountStateChunk, pack_count_states, pack_read_counts, state_dtype
+from pans.runtime.wire.commands import (
+    Arm,
+    CountStateChunk,
+    Gate,
+    MaskChunk,
+    PatternChunk,
+    PlanChunk,
+    Show,
+    StateChunk,
+    pack_arm,
+    pack_count_states,
+    pack_gate,
+    pack_masks,
+    pack_pattern,
+    pack_plan,
+    pack_read_counts,
+    pack_show,
+    pack_states,
+    state_dtype,
+)
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, Opcode
 from pans.runtime.wire.schema import STATE_DTYPE
 

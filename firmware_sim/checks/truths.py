@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan
-from pans.runtime.wire.counts import decode_counts
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
     ClickBlock,
@@ -21,6 +20,7 @@ from pans.runtime.wire.messages import (
     Mark,
     MessageType,
     decode_clicks,
+    decode_counts,
     decode_frames,
     decode_mark,
 )

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, pack_arm
-from pans.runtime.wire.counts import announced_channels, announced_counts, decode_counts
-from pans.runtime.wire.messages import DeviceState, Frame, MalformedMessage, MessageType, Opcode
+from pans.runtime.wire.commands import Arm, announced_channels, announced_counts, pack_arm
+from pans.runtime.wire.messages import DeviceState, Frame, MalformedMessage, MessageType, Opcode, decode_counts
 from pans.runtime.wire.session import STREAM_TYPES
 
 from .plans import Layout, layout_for

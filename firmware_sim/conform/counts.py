@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.wire.automata import announced, pack_states
-from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
-from pans.runtime.wire.counts import (
+from pans.runtime.wire.commands import (
+    Arm,
     CountStateChunk,
+    announced,
     announced_channels,
     announced_counts,
+    pack_arm,
     pack_count_states,
+    pack_plan,
     pack_read_counts,
+    pack_states,
     state_dtype,
 )
 from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, ClickBlock, Opcode

@@ -9,17 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.wire.automata import (
+from pans.runtime.wire.commands import (
+    Arm,
     Extension,
     MaskChunk,
     Show,
     StateChunk,
     announced,
+    pack_arm,
     pack_masks,
+    pack_plan,
     pack_show,
     pack_states,
 )
-from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
 from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, ClickBlock, DeviceState, Opcode
 from pans.runtime.wire.schema import STATE_DTYPE
 

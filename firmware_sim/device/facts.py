@@ -13,8 +13,7 @@ from pans.runtime.imaging import IDENTITY, NO_BLEACHING
 from pans.runtime.instrument.click_law import cannot_count
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.scene_fit import scene_facts
-from pans.runtime.wire.automata import Extension, announcement
-from pans.runtime.wire.counts import count_announcement
+from pans.runtime.wire.commands import Extension, announcement, count_announcement
 
 from .gates import GATE_CHANNELS
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS

@@ -19,9 +19,20 @@ from pans.firmware_sim.scene.still import Scene
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.automata import Extension, unpack_masks, unpack_show, unpack_states
-from pans.runtime.wire.commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
-from pans.runtime.wire.counts import ReadCounts, unpack_count_states, unpack_read_counts
+from pans.runtime.wire.commands import (
+    Arm,
+    Extension,
+    ReadCounts,
+    unpack_arm,
+    unpack_count_states,
+    unpack_gate,
+    unpack_masks,
+    unpack_pattern,
+    unpack_plan,
+    unpack_read_counts,
+    unpack_show,
+    unpack_states,
+)
 from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 
 from .clock import BUFFER_MESSAGES

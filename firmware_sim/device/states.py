@@ -15,10 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program, States
-from pans.runtime.wire.automata import Extension, Show, StateChunk
-from pans.runtime.wire.counts import EXPOSURE_BYTES, CountStateChunk, ReadCounts
+from pans.runtime.wire.commands import CountStateChunk, Extension, ReadCounts, Show, StateChunk
 from pans.runtime.wire.fields import MAX_LEAVES, MAX_STATES
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, BLOCK_HEADER_BYTES, MAX_PAYLOAD_BYTES, AckStatus
+from pans.runtime.wire.messages import (
+    ADAPTIVE_PATTERN,
+    BLOCK_HEADER_BYTES,
+    EXPOSURE_BYTES,
+    MAX_PAYLOAD_BYTES,
+    AckStatus,
+)
 
 from .upload import Refused
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.counts import encode_counts
+from pans.runtime.wire.messages import encode_counts
 
 from .sequential import Measurement, StreamMessage
 

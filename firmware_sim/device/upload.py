@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.wire.automata import MaskChunk
-from pans.runtime.wire.commands import MODES, PARALLEL, PatternChunk, PlanChunk
+from pans.runtime.wire.commands import MODES, PARALLEL, MaskChunk, PatternChunk, PlanChunk
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, BLOCK_HEADER_BYTES, DARK_PATTERN, MAX_PAYLOAD_BYTES, AckStatus
 
 MAX_PATTERN_PIXELS = 1 << 22

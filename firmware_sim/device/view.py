@@ -25,8 +25,7 @@ from pans.firmware_sim.scene.still import Scene
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.wire.commands import PARALLEL, Arm
-from pans.runtime.wire.counts import ReadCounts
+from pans.runtime.wire.commands import PARALLEL, Arm, ReadCounts
 from pans.runtime.wire.messages import AckStatus
 
 from .bleached import bleached_photoelectrons

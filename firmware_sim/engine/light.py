@@ -28,8 +28,7 @@ from pans.firmware_sim.scene.detector_model import (
 from pans.firmware_sim.scene.light import LightTable
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.instrument.dead_time import STEP, counted_table
-from pans.runtime.wire.automata import MaskChunk
-from pans.runtime.wire.commands import MODES, PARALLEL, PatternChunk
+from pans.runtime.wire.commands import MODES, PARALLEL, MaskChunk, PatternChunk
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN
 
 MAGIC = 0x31474C534E4150  # "PANSLG1"

@@ -44,11 +44,10 @@ from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.report.summary import Summary, summarise
 from pans.runtime.timing.ledger import frozen_heap
 from pans.runtime.wire import messages
-from pans.runtime.wire.counts import decode_counts
 from pans.runtime.wire.fields import FACTS, wrong_facts
 from pans.runtime.wire.frame import Frame
 from pans.runtime.wire.framing import FrameDecoder, encode_frame
-from pans.runtime.wire.messages import NO_OBJECT, DeviceState, MalformedMessage, MessageType
+from pans.runtime.wire.messages import NO_OBJECT, DeviceState, MalformedMessage, MessageType, decode_counts
 
 OBJECTS = 12
 SESSIONS_AT_ONCE = 25  # that one process is given

@@ -36,8 +36,7 @@ from pans.runtime.flow.core import FlowCore
 from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.turn.system import offered
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.counts import encode_counts
-from pans.runtime.wire.messages import Mark, MessageType, Opcode
+from pans.runtime.wire.messages import Mark, MessageType, Opcode, encode_counts
 from pans.runtime.wire.session import MAX_KEPT, HostSession
 
 # Of processor time: one piece or frame takes microseconds, the longest gap that is believed about a second.

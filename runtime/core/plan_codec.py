@@ -1,6 +1,6 @@
 """A plan as the commands that a device is sent, and back: LOAD_PLAN, READ_COUNTS, and LOAD_STATES or LOAD_COUNT_STATES.
 
-Owns the conversion; never sends anything. The bodies are laid out in wire/commands.py, wire/automata.py and wire/counts.py.
+Owns the conversion; never sends anything. The bodies are laid out in wire/commands.py.
 """
 
 from __future__ import annotations
@@ -11,14 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.wire.automata import STATES_PER_COMMAND, StateChunk, pack_states
-from pans.runtime.wire.commands import MAX_SLOTS_PER_CHUNK, MODES, PlanChunk, pack_plan
-from pans.runtime.wire.counts import (
+from pans.runtime.wire.commands import (
+    MAX_SLOTS_PER_CHUNK,
+    MODES,
+    STATES_PER_COMMAND,
     CountStateChunk,
+    PlanChunk,
     ReadCounts,
+    StateChunk,
     count_state_chunks,
     pack_count_states,
+    pack_plan,
     pack_read_counts,
+    pack_states,
     state_dtype,
 )
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MalformedMessage, Opcode

@@ -7,6 +7,8 @@ and what is allowed.
 from __future__ import annotations
 
 import itertools
+import operator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -121,22 +123,22 @@ class Tolerance:
             if low > high:
                 raise ValueError(f"{name} is {low:g}..{high:g}, allowed: the lower one first")
         for place in (0, 1):
-            Imaging(**{name: getattr(self, name)[place] for name in _RANGES})  # the ranges of a single table
+            self._at(operator.itemgetter(place))  # the ranges of a single table
 
     @property
     def middle(self) -> Imaging:
         """The optics in the middle of every span."""
-        return Imaging(**{name: (low + high) / 2 for name, (low, high) in self._spans()})
+        return self._at(lambda span: (span[0] + span[1]) / 2)
 
     def draw(self, random: np.random.Generator) -> Imaging:
         """Return optics drawn uniformly within the tolerance."""
-        return Imaging(**{name: float(random.uniform(low, high)) for name, (low, high) in self._spans()})
+        return self._at(lambda span: float(random.uniform(*span)))
 
     def edges(self) -> list[Imaging]:
         """Return the corners of shift and rotation where every other fact is at its high end: up to 8 optics."""
         moved = ("right_px", "down_px", "rotation_deg")
         ends = itertools.product(*(sorted(set(getattr(self, name))) for name in moved))
-        worst = Imaging(**{name: high for name, (_, high) in self._spans()})
+        worst = self._at(lambda span: span[1])
         return [replace(worst, **dict(zip(moved, corner))) for corner in ends]
 
     def as_dict(self) -> dict[str, list[float]]:
@@ -160,6 +162,10 @@ class Tolerance:
 
     def _spans(self) -> list[tuple[str, Span]]:
         return [(name, getattr(self, name)) for name in _RANGES]
+
+    def _at(self, place: Callable[[Span], float]) -> Imaging:
+        facts: dict[str, Any] = {name: place(span) for name, span in self._spans()}
+        return Imaging(**facts)
 
 
 # the facts of each key of `--optics`, and from where a tolerance goes to either side; without it, a value is the fact itself

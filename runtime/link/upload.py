@@ -13,9 +13,16 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import DeviceError
-from pans.runtime.wire.automata import announced, mask_chunks, pack_masks
-from pans.runtime.wire.commands import MAX_PIXELS_PER_CHUNK, PatternChunk, pack_pattern
-from pans.runtime.wire.counts import announced_channels, announced_counts
+from pans.runtime.wire.commands import (
+    MAX_PIXELS_PER_CHUNK,
+    PatternChunk,
+    announced,
+    announced_channels,
+    announced_counts,
+    mask_chunks,
+    pack_masks,
+    pack_pattern,
+)
 from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA, COUNT_SCHEMA
 

@@ -17,7 +17,7 @@ from pans.runtime.core.window import DecisionWindows
 from pans.runtime.link.connection import Connection
 from pans.runtime.timing.ledger import LatencyHistogram
 from pans.runtime.turn.rings import Drive
-from pans.runtime.wire.automata import Show, pack_show
+from pans.runtime.wire.commands import Show, pack_show
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.schema import HEADER, STRUCTS
 

@@ -15,9 +15,19 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_from_chunks, reading_of
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.ranges import Range
-from pans.runtime.wire.automata import StateChunk, unpack_show, unpack_states
-from pans.runtime.wire.commands import Arm, PlanChunk, unpack_arm, unpack_plan
-from pans.runtime.wire.counts import CountStateChunk, ReadCounts, unpack_count_states, unpack_read_counts
+from pans.runtime.wire.commands import (
+    Arm,
+    CountStateChunk,
+    PlanChunk,
+    ReadCounts,
+    StateChunk,
+    unpack_arm,
+    unpack_count_states,
+    unpack_plan,
+    unpack_read_counts,
+    unpack_show,
+    unpack_states,
+)
 from pans.runtime.wire.fields import MAX_PHOTON_NUMBER
 from pans.runtime.wire.messages import (
     CommandMessage,

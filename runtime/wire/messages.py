@@ -48,6 +48,7 @@ from .schema import Opcode as Opcode
 from .schema import StateReason as StateReason
 
 # Of a block's fields these can hold more than they mean: two comparisons settle it for the many good ones, the table names a bad one.
+EXPOSURE_BYTES = 3  # of COUNTS: the pattern shown, and the number
 _BLOCKS = ("CLICKS", "FRAMES")  # COUNTS has a field with a narrow range: it goes through the table
 _CHECKED = {name: narrow_fields(name) for name in FROM_DEVICE}
 _LITTLE_U16 = np.dtype("<u2")
@@ -134,7 +135,7 @@ class Status(NamedTuple):
 class ClickBlock(NamedTuple):
     """Consecutive, equally spaced exposures of one detector: one bit and one shown pattern index each.
 
-    `patterns` is uint16 (count,); `bits` is uint8 (count,) of 0 or 1. With `largest` above 1 it came as COUNTS (counts.py), and `bits` are
+    `patterns` is uint16 (count,); `bits` is uint8 (count,) of 0 or 1. With `largest` above 1 it came as COUNTS, and `bits` are
     photon numbers from 0 to `largest`, which stands for that many or more.
     """
 
@@ -371,6 +372,27 @@ def decode_frames(payload: bytes) -> FrameBlock:
         )
     words = np.frombuffer(payload, np.uint8, count * word_bytes, BLOCK_HEADER_BYTES)
     return FrameBlock(seq, drops, tick, first, period, object_index, words.reshape(count, word_bytes))
+
+
+def encode_counts(block: ClickBlock, session: int) -> bytes:
+    """Return a block of photon numbers, at most `block.largest` each."""
+    head = STRUCTS["COUNTS"].pack(*block[:5], len(block.patterns), block.largest, block.object_index)
+    body = block.patterns.astype("<u2").tobytes() + block.bits.astype(np.uint8).tobytes()
+    return encode_frame(MessageType.COUNTS, head + body, session)
+
+
+def decode_counts(payload: bytes) -> ClickBlock:
+    """Decode COUNTS; the arrays are fresh copies. A number above the block's largest is malformed."""
+    seq, drops, tick, first, period, count, largest, object_index = fields("COUNTS", payload, exact=False)
+    expected = BLOCK_HEADER_BYTES + EXPOSURE_BYTES * count
+    if len(payload) != expected:
+        raise MalformedMessage(f"COUNTS of {count} exposures has {len(payload)} bytes, expected {expected}")
+    patterns = np.frombuffer(payload, "<u2", count, BLOCK_HEADER_BYTES).astype(np.uint16)
+    numbers = np.frombuffer(payload, np.uint8, count, BLOCK_HEADER_BYTES + 2 * count).copy()
+    most = int(numbers.max())
+    if most > largest:
+        raise MalformedMessage(f"COUNTS holds the photon number {most}, its largest is {largest}")
+    return ClickBlock(seq, drops, tick, first, period, object_index, patterns, numbers, largest)
 
 
 def encode_mark(mark: Mark, session: int) -> bytes:

@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from . import messages as wire
-from .counts import decode_counts
 from .frame import content_crc
-from .messages import ClickBlock, Frame, FrameBlock, Mark, MessageType
+from .messages import ClickBlock, Frame, FrameBlock, Mark, MessageType, decode_counts
 
 SEQUENCE = 1 << 32
 HALF_SEQUENCE = 1 << 31

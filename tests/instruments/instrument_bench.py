@@ -11,8 +11,7 @@ from pans.firmware_sim.scene.still import load_scene
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_arm, pack_pattern, pack_plan
-from pans.runtime.wire.counts import decode_counts
-from pans.runtime.wire.messages import DARK_PATTERN, SLOT_DTYPE, MessageType, Opcode
+from pans.runtime.wire.messages import DARK_PATTERN, SLOT_DTYPE, MessageType, Opcode, decode_counts
 
 NONCE = 0x11223344
 POWER_ON = 1000

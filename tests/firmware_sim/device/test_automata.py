@@ -23,17 +23,21 @@ from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.core.plan_codec import plan_chunks, state_chunks
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.automata import (
+from pans.runtime.wire.commands import (
+    Arm,
     MaskChunk,
+    PatternChunk,
     Show,
     StateChunk,
     announced,
     mask_chunks,
+    pack_arm,
     pack_masks,
+    pack_pattern,
+    pack_plan,
     pack_show,
     pack_states,
 )
-from pans.runtime.wire.commands import Arm, PatternChunk, pack_arm, pack_pattern, pack_plan
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
 from pans.runtime.wire.schema import STATE_DTYPE
 

@@ -23,9 +23,20 @@ from pans.runtime.errors import DeviceError
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.upload import check_automaton
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.automata import Show, mask_chunks, pack_masks, pack_show
-from pans.runtime.wire.commands import Arm, PatternChunk, pack_arm, pack_pattern, pack_plan
-from pans.runtime.wire.counts import announced_counts, count_announcement, pack_read_counts
+from pans.runtime.wire.commands import (
+    Arm,
+    PatternChunk,
+    Show,
+    announced_counts,
+    count_announcement,
+    mask_chunks,
+    pack_arm,
+    pack_masks,
+    pack_pattern,
+    pack_plan,
+    pack_read_counts,
+    pack_show,
+)
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA
 

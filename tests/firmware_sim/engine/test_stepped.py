@@ -9,8 +9,7 @@ import pytest
 from c_device import MODES, NONCE, Pair, needs_compiler, strange_frames
 
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.automata import Show, pack_show
-from pans.runtime.wire.commands import Gate, pack_gate
+from pans.runtime.wire.commands import Gate, Show, pack_gate, pack_show
 from pans.runtime.wire.messages import MessageType, Opcode
 
 pytestmark = needs_compiler

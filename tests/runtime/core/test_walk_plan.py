@@ -15,7 +15,7 @@ from pans.runtime.core.plan import ADAPTIVE_PATTERN, DARK_PATTERN, NO_SHOT, buil
 from pans.runtime.core.plan_codec import drive_words, plan_chunks, plan_from_chunks, state_chunks, upload_bytes
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.wire.automata import STATES_PER_COMMAND, pack_states, unpack_states
+from pans.runtime.wire.commands import STATES_PER_COMMAND, pack_states, unpack_states
 from pans.runtime.wire.messages import MalformedMessage
 
 DMD = load_profile("dmd-spad")

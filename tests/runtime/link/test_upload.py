@@ -25,7 +25,7 @@ from pans.runtime.errors import DeviceError
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.connection import Connection, check_device
 from pans.runtime.link.upload import check_automaton, upload_commands
-from pans.runtime.wire.automata import Extension, announcement
+from pans.runtime.wire.commands import Extension, announcement
 from pans.runtime.wire.messages import Opcode
 
 DMD = load_profile("dmd-spad")

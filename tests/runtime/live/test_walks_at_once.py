@@ -27,7 +27,7 @@ from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.format import COUNTS_VERSION
 from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.wire.counts import count_announcement
+from pans.runtime.wire.commands import count_announcement
 from pans.runtime.wire.messages import DARK_PATTERN
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA
 

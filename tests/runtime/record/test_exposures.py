@@ -17,7 +17,6 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.pages.rates import count_rates
 from pans.runtime.record import exposures
 from pans.runtime.record.exposures import iter_exposures
-from pans.runtime.wire.counts import encode_counts
 from pans.runtime.wire.frame import Messages, pack_body, unpack_body
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import (
@@ -26,6 +25,7 @@ from pans.runtime.wire.messages import (
     FrameBlock,
     Mark,
     encode_clicks,
+    encode_counts,
     encode_frames,
     encode_mark,
 )

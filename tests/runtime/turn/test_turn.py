@@ -50,8 +50,8 @@ from pans.runtime.turn import kernels, shows, system
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn.engine import Limits, Turn
 from pans.runtime.turn.streaming import StreamCore
-from pans.runtime.wire.automata import unpack_show
 from pans.runtime.wire.bulk import BulkDecoder
+from pans.runtime.wire.commands import unpack_show
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, Ack, Opcode, decode_command, encode_ack, pack_body
 from pans.runtime.wire.session import HostSession

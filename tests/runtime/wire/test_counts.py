@@ -13,22 +13,20 @@ from hypothesis import strategies as st
 from tree import ROOT
 
 from pans.runtime.wire import FrameDecoder, MalformedMessage, MessageType, StreamTracker
-from pans.runtime.wire.counts import (
+from pans.runtime.wire.commands import (
     CountStateChunk,
     ReadCounts,
     announced_channels,
     announced_counts,
     count_announcement,
     count_state_chunks,
-    decode_counts,
-    encode_counts,
     pack_count_states,
     pack_read_counts,
     state_dtype,
     unpack_count_states,
     unpack_read_counts,
 )
-from pans.runtime.wire.messages import ClickBlock, unpack_body
+from pans.runtime.wire.messages import ClickBlock, decode_counts, encode_counts, unpack_body
 from pans.runtime.wire.session import STREAM_TYPES
 
 PROTOCOL = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")

@@ -14,9 +14,8 @@ from tree import ROOT
 
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire import walk
-from pans.runtime.wire.counts import decode_counts
 from pans.runtime.wire.fields import ALL_MESSAGES, FACTS, FROM_DEVICE, LARGEST_TICK, Fact, Field, wrong_facts
-from pans.runtime.wire.messages import MalformedMessage, decode_welcome
+from pans.runtime.wire.messages import MalformedMessage, decode_counts, decode_welcome
 from pans.runtime.wire.schema import (
     AUTOMATON_SCHEMA,
     AUTOMATON_SCHEMA_TEXT,
