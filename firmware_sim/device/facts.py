@@ -12,7 +12,7 @@ from pans.firmware_sim.scene.still import Scene
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING
 from pans.runtime.instrument.click_law import cannot_count
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.link.scene_fit import scene_facts
+from pans.runtime.link.fit import scene_facts
 from pans.runtime.wire.commands import Extension, announcement, count_announcement
 
 from .gates import GATE_CHANNELS

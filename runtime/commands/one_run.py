@@ -375,7 +375,7 @@ def _closed_quietly(opening: Future[Link]) -> str:
 
 def _traced(options: RunOptions, link: Link, path: Path, around: _Around) -> Link:
     """Return `link` with a trace; one that could not be written to its end is reported, and ends nothing."""
-    from pans.runtime.link.trace import TracedLink
+    from pans.runtime.link.base import TracedLink
 
     traced = TracedLink(link, path, options.device, force=options.force)
 
@@ -500,7 +500,7 @@ def _facts(options: RunOptions, ready: _Prepared, link: Link) -> dict[str, Any]:
 
 
 def _name_scene(run: LiveRun, device: str) -> None:
-    from pans.runtime.link.scene_fit import scene_words
+    from pans.runtime.link.fit import scene_words
 
     welcome = run.connection.session.welcome
     if welcome is not None and (words := scene_words(welcome.facts, device)):

@@ -1,17 +1,21 @@
 """Device URLs -> an open link: bytes in, bytes out, and the clock they are stamped with.
 
-Owns the schemes and what a link is; never looks into the bytes. `open_link` returns a `Link` (serial.py, usb.py, or a driver
-by entry point, see docs/how-to/own-device.md); reader.py reads from any of them.
+`open_link` returns a `Link` (serial.py, usb.py, or a driver by entry point, see docs/how-to/own-device.md); reader.py reads from any
+of them. `TracedLink` keeps a hex trace of another link.
 """
 
 from __future__ import annotations
 
 import re
+import threading
+import time
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, Protocol
 
 from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.guests import load_guest, package_of
+from pans.runtime.outputs import refuse_existing
 
 from .serial import SerialLink
 from .usb import UsbLink
@@ -110,3 +114,78 @@ def descriptor_of(link: Link) -> int | None:
 def link_facts(link: Link) -> dict[str, Any]:
     """Return what a recording should say about the link."""
     return {"name": link.name, "simulated": link.simulated, "virtual_time": link.virtual}
+
+
+class TracedLink:
+    """A link around `link` that writes every byte of both directions to a text file; at most the last line of it is lost.
+
+    One line per read or write: seconds since the link was opened, `>` to the device or `<` from it, then the bytes in hex.
+    """
+
+    def __init__(self, link: Link, path: Path, url: str = "", *, force: bool = False) -> None:
+        self._link, self._url = link, url or link.name
+        self.trouble = ""  # why the trace ended before the link did
+        self._lock = threading.Lock()  # the reader's thread and the loop both write
+        self._started_ns = link.now_ns()
+        self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
+        self.now_ns = link.now_ns
+        self.pause: Any = getattr(link, "pause", time.sleep)
+        try:
+            if force:
+                path.unlink(missing_ok=True)
+            self._file = open(path, "x", encoding="ascii", buffering=1)  # noqa: SIM115 - closed with the link
+        except FileExistsError as error:
+            raise refuse_existing(path) from error
+        except OSError as error:
+            raise UsageError(f"{path}: the trace cannot be written: {error.strerror or error}") from error
+        self._note("#", f"{link.name} opened; > to the device, < from it; seconds since then")
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Link.read`."""
+        try:
+            data = self._link.read(timeout_s)
+        except LinkError as error:
+            self._note("#", error.message)
+            raise
+        if data:
+            self._note("<", data.hex(" "))
+        return data
+
+    def write(self, data: bytes) -> None:
+        """See `Link.write`."""
+        self._note(">", data.hex(" "))
+        self._link.write(data)
+
+    def reopen(self) -> TracedLink:
+        """Open the link again and go on with the same trace."""
+        self._note("#", "opened again")
+        reopen = getattr(self._link, "reopen", None)
+        if reopen is not None:
+            self._link = reopen()
+        else:
+            self._link.close()
+            self._link = open_link(self._url)
+        return self
+
+    def close(self) -> None:
+        """Close the link, then the trace."""
+        self._link.close()
+        with self._lock:
+            self._end()
+
+    def _end(self) -> None:
+        try:
+            self._file.close()
+        except OSError as error:  # what was still to be written
+            self.trouble = error.strerror or str(error)
+
+    def _note(self, mark: str, text: str) -> None:
+        since_s = (self._link.now_ns() - self._started_ns) / 1e9
+        with self._lock:
+            if self._file.closed:
+                return
+            try:
+                self._file.write(f"{since_s:.9f} {mark} {text}\n")
+            except OSError as error:  # a run does not end because its trace cannot be written
+                self.trouble = error.strerror or str(error)
+                self._end()

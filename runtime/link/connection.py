@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
@@ -22,8 +22,8 @@ from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome, pac
 from pans.runtime.wire.session import ANSWER_TYPES, HostSession
 
 from .base import Link
+from .fit import upload_commands
 from .reader import Chunk, LinkReader
-from .upload import check_automaton, upload_commands
 
 if TYPE_CHECKING:
     from pans.runtime.wire.bulk import BulkDecoder
@@ -231,42 +231,3 @@ class Connection:
     def close(self) -> None:
         """Close the link and its reader."""
         self.reader.close()
-
-
-def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
-    """Raise DeviceError when what the device says of itself cannot carry out the plan."""
-    limits = [
-        ("pattern memory (patterns)", bundle.n_shown, int(facts["pattern_memory"])),
-        ("pixels of a pattern", bundle.n_pixels, int(facts["pattern_pixels"])),
-        ("projector levels", bundle.levels, int(facts["levels"])),
-        ("slot memory (slots)", plan.slots_per_cycle, int(facts["slot_memory"])),
-        ("detectors", bundle.n_features if plan.mode == "parallel" else 1, int(facts["channels"])),
-    ]
-    for what, needed, held in limits:
-        if needed > held:
-            raise DeviceError(
-                f"the device's {what}: {held}, needed {needed}", remedy="use a device or a bundle that fits"
-            )
-    _check_optics(facts, bundle)
-    check_automaton(facts, plan)
-    if facts["mode"] != plan.mode:
-        raise DeviceError(f"the device measures in {facts['mode']} mode, the profile says {plan.mode}")
-    if int(facts["tick_hz"]) != tick_hz:
-        raise DeviceError(
-            f"the device counts {facts['tick_hz']} ticks per second, the profile says {tick_hz}",
-            remedy="give the profile of this device with --profile",
-        )
-
-
-def _check_optics(facts: Any, bundle: Bundle) -> None:
-    """A device may say which passive optics it looks through (their fingerprint); it must then be the bundle's."""
-    held = facts.get("optics_sha256")
-    wanted = None if bundle.analyser is None else bundle.analyser.fingerprint
-    if (held is None and facts.get("simulated") is not True) or held == wanted:
-        return
-    has = "a projector and no passive optics" if held is None else f"passive optics {str(held)[:12]}"
-    needs = "a projector" if wanted is None else f"passive optics {wanted[:12]}"
-    raise DeviceError(
-        f"the device has {has}, {bundle.name} needs {needs}",
-        remedy="a simulated instrument gets the optics of a bundle by optics=BUNDLE.pans in its URL",
-    )

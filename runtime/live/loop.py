@@ -30,8 +30,8 @@ from pans.runtime.instrument.channel_health import DarkMonitor
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, descriptor_of, link_facts
-from pans.runtime.link.connection import Connection, check_device
-from pans.runtime.link.scene_fit import check_scene
+from pans.runtime.link.connection import Connection
+from pans.runtime.link.fit import check_device, check_scene
 from pans.runtime.record import Recorder
 from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime

@@ -16,7 +16,7 @@ from pans.firmware_sim.ports.serve import SimOptions
 from pans.firmware_sim.scene.moving import SceneFile
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
-from pans.runtime.link.upload import upload_commands
+from pans.runtime.link.fit import upload_commands
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, pack_arm
 from pans.runtime.wire.messages import Frame, MessageType, Opcode

@@ -21,7 +21,7 @@ from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import DeviceError
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.link.upload import check_automaton
+from pans.runtime.link.fit import check_automaton
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import (
     Arm,

@@ -16,7 +16,7 @@ from pans.runtime.cli import main
 from pans.runtime.commands import doctor
 from pans.runtime.commands.doctor import Finding, examine, port_state, serial_ports, udev_rule
 from pans.runtime.errors import LinkError, UsageError
-from pans.runtime.link.trace import TracedLink
+from pans.runtime.link.base import TracedLink
 
 
 def test_doctor_on_this_machine(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
-from pans.runtime.link.scene_fit import TEXT_MAX_BYTES, check_scene, scene_facts, scene_words
+from pans.runtime.link.fit import TEXT_MAX_BYTES, check_scene, scene_facts, scene_words
 
 FASHION = load_bundle(SHIPPED / "fashion10.pans")[0]
 

@@ -22,7 +22,7 @@ from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import DeviceError, PlanError
 from pans.runtime.instrument.click_law import click_law, object_transmission
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.link.upload import check_automaton
+from pans.runtime.link.fit import check_automaton
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.format import COUNTS_VERSION

@@ -23,8 +23,8 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.errors import DeviceError
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.link.connection import Connection, check_device
-from pans.runtime.link.upload import check_automaton, upload_commands
+from pans.runtime.link.connection import Connection
+from pans.runtime.link.fit import check_automaton, check_device, upload_commands
 from pans.runtime.wire.commands import Extension, announcement
 from pans.runtime.wire.messages import Opcode
 
