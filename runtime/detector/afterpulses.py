@@ -1,7 +1,6 @@
 """Afterpulses: how the clicks of an exposure raise the chance of those after it.
 
-`Afterpulses` is the law of one family of traps, exposure by exposure; tests/independent/detector/steady_afterpulses.py has it without approximation
-for steady light.
+`Afterpulses` is the law of one family of traps, exposure by exposure. A test compares it with sums over all histories in steady light.
 
 Every detection (photoelectron, dark count or afterpulse) fills traps, which release a Poisson number of carriers, a = -log(1 - p) in the
 mean: p is the chance that at least one comes. Each comes after an exponential delay of mean tau; a carrier starts a detection like any
