@@ -79,8 +79,8 @@ class DeviceError(LinkError):
 class TimingError(PansError):
     """The timing contract was broken, so that results could no longer be trusted."""
 
-    usual_remedy = "`pans doctor` checks this machine's timing"
     exit_code = 4
+    usual_remedy = "`pans doctor` checks this machine's timing"
 
 
 @contextmanager

@@ -1,7 +1,6 @@
-"""Plain grey pictures as PNG, written and read without an imaging library: the lean runtime has none.
+"""Plain grey pictures of 8 and 16 bits as PNG (W3C PNG specification), written and read without an imaging library.
 
-Owns the pixels and the chunks of 8-bit and 16-bit grey PNG (W3C PNG specification); all other kinds are refused. Sizes are checked before
-anything is unpacked.
+All other kinds are refused. Sizes are checked before anything is unpacked.
 """
 
 from __future__ import annotations
@@ -109,6 +108,4 @@ def _guess(kind: int, left: int, above: int, corner: int) -> int:
         return left
     if kind == 3:
         return (left + above) // 2
-    paeth = left + above - corner
-    nearest = sorted(((abs(paeth - left), 0, left), (abs(paeth - above), 1, above), (abs(paeth - corner), 2, corner)))
-    return nearest[0][2]
+    return min((left, above, corner), key=lambda near: abs(left + above - corner - near))

@@ -1,6 +1,6 @@
 """A small table with pictures for a notebook: what `_repr_html_` of bundles, profiles, recordings and runs returns.
 
-Owns the markup, in which every text is escaped; what is told is the object's own. No script, no style sheet, nothing loaded.
+Every text is escaped; there is no script and no style sheet.
 """
 
 from __future__ import annotations

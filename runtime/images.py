@@ -1,8 +1,9 @@
-"""A user's picture file as 8-bit grey, without guessing: every pixel format is scaled by its own full scale; and folders of them.
+"""Pictures of a user as 8-bit grey (`read_grey`), labelled sets of them (`read_labelled`), and how alike two pictures are (`likeness`).
 
-Owns this conversion; never resizes and never stretches contrast. Trainer and simulator read pictures with it; Pillow is loaded only
-then. Full scale of 8-bit and 1-bit pictures is white, of 16-bit ones 65535 (a 12-bit camera's file stays dark: scale it before), of
-floating-point ones 1.0; colours become luminance (ITU-R 601) and transparency is ignored.
+Nothing is resized and no contrast stretched. Full scale of 8-bit and 1-bit pictures is white, of 16-bit ones 65535 (a 12-bit camera's file
+stays dark: scale it before), of floating-point ones 1.0; colours become luminance (ITU-R 601), transparency is ignored. Pillow is loaded
+only to read a picture. SSIM is that of the paper's release: 11 x 11 Gaussian window, sigma 1.5, zeros outside, C1 = 1e-4, C2 = 9e-4, data
+range 1, mean over all pixels.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ from .container import MIB, open_regular
 from .errors import DamagedFileError, PansError, UsageError
 from .npz_file import read_arrays
 
+WINDOW_PX = 11
+SIGMA_PX = 1.5
+C1, C2 = 1e-4, 9e-4
+
+F64 = NDArray[np.float64]
 FULL_SCALE_16 = 65535
 LABELLED_MAX_BYTES = 1024 * MIB
 FAULTS_SHOWN = 5  # of each kind in a folder; the rest is counted
-DAMAGED, STRANGE, SIZE, PLACE = (
-    "cannot be read",
-    "hold what is not taken",
-    "have another size",
-    "are in the wrong place",
-)
-KINDS_OF_FAULT = (DAMAGED, STRANGE, SIZE, PLACE)  # in the order in which they are told: damaged files are the fewest
+# kinds of fault, in the order in which they are reported: damaged files are the fewest
+KINDS_OF_FAULT = ("cannot be read", "hold what is not accepted", "have another size", "are in the wrong place")
+DAMAGED, STRANGE, SIZE, PLACE = KINDS_OF_FAULT
 PILLOW_REMEDY = "pip install pillow"
 LITTER = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx"))
 PICTURE_SUFFIXES = frozenset((".png", ".tif", ".tiff", ".pgm", ".jpg", ".jpeg", ".bmp"))
@@ -150,10 +152,8 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
     try:
         with open_regular(path) as file, Image.open(file) as picture:
             if picture.width * picture.height > pixels_max:
-                raise UsageError(
-                    f"{path}: {picture.width} x {picture.height} pixels, more than the {pixels_max} allowed",
-                    remedy="make the images smaller, or fewer",
-                )
+                size = f"{picture.width} x {picture.height} pixels, more than the {pixels_max} allowed"
+                raise UsageError(f"{path}: {size}", remedy="make the images smaller, or fewer")
             frames = getattr(picture, "n_frames", 1)
             if frames != 1:
                 raise UsageError(f"{path}: {frames} frames", remedy="one picture per file: save the frames apart")
@@ -163,19 +163,16 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
     except Image.DecompressionBombError as error:
         raise UsageError(f"{path}: {error}", remedy="make the image smaller") from error
     except (OSError, SyntaxError, ValueError) as error:  # what damaged files make the decoders raise
-        raise DamagedFileError(
-            f"{path}: not an image that can be read: {error}", remedy="repair it, or move it elsewhere"
-        ) from error
+        remedy = "repair it, or move it elsewhere"
+        raise DamagedFileError(f"{path}: not an image that can be read: {error}", remedy=remedy) from error
 
 
 def to_8_bits(where: Path, values: NDArray[Any], full_scale: float) -> NDArray[np.uint8]:
     """Return `values` (any shape), 0 to `full_scale`, as nearest of 256 grey levels; UsageError for any beyond, or not finite."""
     low, high = float(values.min()), float(values.max())
     if not (low >= 0 and high <= full_scale):  # NaN fails it too
-        raise UsageError(
-            f"{where}: values from {low:g} to {high:g}, allowed: 0 to {full_scale:g}",
-            remedy="scale them, or save 8 bits",
-        )
+        found = f"{where}: values from {low:g} to {high:g}, allowed: 0 to {full_scale:g}"
+        raise UsageError(found, remedy="scale them, or save 8 bits")
     return np.asarray(np.rint(values.astype(np.float64) * (255 / full_scale)), dtype=np.uint8)
 
 
@@ -210,8 +207,46 @@ def read_labelled(name: str) -> LabelledPictures:
         )
     if labels.dtype.kind not in "iu":
         raise UsageError(f"{path}: labels are {labels.dtype}, allowed: integers")
-    return LabelledPictures(images, labels.astype(np.int64), _names(arrays.get("classes")), "")
+    classes = tuple(str(name) for name in arrays.get("classes", np.zeros(0, str)).ravel())
+    return LabelledPictures(images, labels.astype(np.int64), classes, "")
 
 
-def _names(classes: NDArray[np.str_] | None) -> tuple[str, ...]:
-    return () if classes is None else tuple(str(name) for name in classes.ravel())
+class Likeness(NamedTuple):
+    """SSIM and mean squared error of every picture, float64 (n,)."""
+
+    ssim: F64
+    mse: F64
+
+
+def likeness(pictures: NDArray[np.floating[Any]], truth: NDArray[np.uint8]) -> Likeness:
+    """Compare pictures, floats in [0, 1] (n, height, width), with true images, uint8 of the same shape."""
+    if pictures.shape != truth.shape or truth.dtype != np.uint8 or pictures.ndim != 3:
+        raise UsageError(
+            f"pictures are {pictures.shape}, the true images {truth.dtype} {truth.shape}: allowed are equal shapes, uint8"
+        )
+    shown, wanted = pictures.astype(np.float64), truth / 255.0
+    return Likeness(ssim(shown, wanted), ((shown - wanted) ** 2).mean(axis=(1, 2)))
+
+
+def ssim(x: F64, y: F64) -> F64:
+    """Return the mean SSIM of image pairs, float64 (n, height, width) in [0, 1]; 1 for equal images."""
+    mean_x, mean_y = _blur(x), _blur(y)
+    variances = _blur(x * x) + _blur(y * y) - mean_x**2 - mean_y**2
+    covariance = _blur(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
+    structure = (2 * covariance + C2) / (variances + C2)
+    return np.asarray((luminance * structure).mean(axis=(1, 2)))
+
+
+def _blur(images: F64) -> F64:
+    """Gaussian means with zeros outside; the window is a product, so it runs along one axis after the other."""
+    half = WINDOW_PX // 2
+    weight = np.exp(-(np.arange(-half, half + 1) ** 2) / (2 * SIGMA_PX**2))
+    weight /= weight.sum()
+    for axis in (1, 2):
+        edge = [(0, 0)] * 3
+        edge[axis] = (half, half)
+        padded = np.pad(images, edge)
+        size = images.shape[axis]
+        images = sum(w * padded.take(range(i, i + size), axis=axis) for i, w in enumerate(weight))
+    return images

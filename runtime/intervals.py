@@ -1,10 +1,8 @@
-"""Intervals and tail probabilities of counts that a lean installation must compute itself: binomial, beta and chi-square.
+"""Intervals and tail probabilities of counts that a lean installation must compute itself: binomial, beta and chi-square, scalar float64.
 
-Owns the special functions and the intervals made from them; never knows what was counted. All are scalar float64.
-
-Sources: Jeffreys interval in Brown, Cai and DasGupta, Statistical Science 16 (2001); continued fractions by Lentz's method,
-series and fraction of the incomplete gamma function as in the NIST Digital Library of Mathematical Functions, 8.7, 8.9 and
-8.17."""
+Sources: Jeffreys interval in Brown, Cai and DasGupta, Statistical Science 16 (2001); continued fractions by Lentz's method, series and
+fraction of the incomplete gamma function as in the NIST Digital Library of Mathematical Functions, 8.7, 8.9 and 8.17.
+"""
 
 from __future__ import annotations
 

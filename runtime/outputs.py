@@ -1,9 +1,4 @@
-"""Creating files so that none is ever lost: exclusive creation, whole files or none, and the checks before a command begins.
-
-Owns how every output comes to be. A command declares its outputs (`check_outputs`) before it does anything else; nothing that exists is
-replaced unless the user asked for it (`force`) or the file is one that this project rewrites in place (`ours`). Never reads what is in a
-file and never decides where an output belongs.
-"""
+"""Creating files so that none is lost: the check of all outputs before a command begins, exclusive creation, whole files or none."""
 
 from __future__ import annotations
 
@@ -50,9 +45,8 @@ def check_outputs(
     for path in map(Path, outputs):
         identity = file_identity(path)
         if identity in read:
-            raise UsageError(
-                f"{path}: is the input {read[identity]} itself", remedy="choose another name for the output"
-            )
+            remedy = "choose another name for the output"
+            raise UsageError(f"{path}: is the input {read[identity]} itself", remedy=remedy)
         if identity in written:
             raise UsageError(f"{path}: is also the output {written[identity]}", remedy="give each output its own name")
         written[identity] = path
@@ -70,9 +64,7 @@ def file_identity(path: str | Path) -> tuple[object, ...]:
             found = real.stat()
             return found.st_dev, found.st_ino
         except (FileNotFoundError, NotADirectoryError):
-            folder = real.parent
-            while not folder.exists():
-                folder = folder.parent
+            folder = next(one for one in real.parents if one.exists())
             found = folder.stat()
             return found.st_dev, found.st_ino, *real.relative_to(folder).parts
     except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: links that point at each other
@@ -113,10 +105,8 @@ def _check_writable(folder: Path) -> None:
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         os.unlink(probe)
     except OSError as error:
-        raise UsageError(
-            f"{folder}: cannot be written to: {error.strerror or error}",
-            remedy="choose a folder that can be written to",
-        ) from error
+        what = f"{folder}: cannot be written to: {error.strerror or error}"
+        raise UsageError(what, remedy="choose a folder that can be written to") from error
 
 
 # ---- creating ----
@@ -151,7 +141,7 @@ def whole_file(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     try:
         try:
             yield beside
-            _sync(beside)
+            _sync(beside, os.O_RDWR)  # Windows syncs only what is open for writing
             if force:
                 os.replace(beside, target)
             else:
@@ -162,10 +152,8 @@ def whole_file(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     except FileExistsError as error:
         raise refuse_existing(target) from error
     except OSError as error:
-        raise UsageError(
-            f"{target}: cannot be written: {error.strerror or error}",
-            remedy="make room on that disk, or choose another place",
-        ) from error
+        what = f"{target}: cannot be written: {error.strerror or error}"
+        raise UsageError(what, remedy="make room on that disk, or choose another place") from error
     sync_folder(target.parent)
 
 
@@ -197,29 +185,22 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(
-            f"{folder}: the folder cannot be made: {error.strerror or error}",
-            remedy="choose a place that can be written to",
-        ) from error
+        what = f"{folder}: the folder cannot be made: {error.strerror or error}"
+        raise UsageError(what, remedy="choose a place that can be written to") from error
     for one in reversed(made):
         sync_folder(one.parent)
 
 
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDWR)  # Windows syncs only what is open for writing
+def sync_folder(folder: Path) -> None:
+    """Make a new or renamed entry of `folder` survive a power cut, where the system can sync folders."""
+    if os.name == "posix":
+        with suppress(OSError):  # some network file systems refuse; the file itself is on the disk
+            _sync(folder, os.O_RDONLY)
+
+
+def _sync(path: Path, mode: int) -> None:
+    handle = os.open(path, mode)
     try:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make a new or renamed entry of `folder` survive a power cut, where the system can sync folders."""
-    if os.name != "posix":
-        return
-    with suppress(OSError):  # some network file systems refuse; the file itself is on the disk
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

@@ -1,8 +1,4 @@
-"""Ranges: what a number that arrives from outside may be, and the words of its refusal.
-
-Owns the check that options of commands and fields of files share. A range never holds nan or infinity. ValueError says what was
-found and what is allowed; the caller says where.
-"""
+"""Ranges: what a number that arrives from outside may be, and the words of its refusal. Options and fields of files share them."""
 
 from __future__ import annotations
 
@@ -31,7 +27,8 @@ class Range:
     def allowed(self) -> str:
         """What is allowed, in words."""
         noun = "a whole number" if self.whole else "a number"
-        return f"{noun} from {_shown(self.low)} to {_shown(self.high)}"
+        low, high = (str(end) if isinstance(end, int) else f"{end:g}" for end in (self.low, self.high))
+        return f"{noun} from {low} to {high}"
 
     def holds(self, value: Any) -> bool:
         """Whether `value` is a number of this range; a boolean is none."""
@@ -70,9 +67,3 @@ def number_text(value: Any) -> str:
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 1 << 64:
         return "a whole number beyond 64 bits"
     return ascii(value)[:60]
-
-
-def _shown(value: float) -> str:
-    if isinstance(value, int):
-        return str(value)
-    return f"{value:g}"

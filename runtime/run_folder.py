@@ -1,7 +1,4 @@
-"""Folders of runs: named by date and time, with a link to the latest, and locked while a run writes there.
-
-Owns `pans-runs/` and the lock files; which files a run leaves there is the command's.
-"""
+"""Folders of runs in `pans-runs`: named by date and time, with a link to the latest, and locked while a run writes there."""
 
 from __future__ import annotations
 
@@ -9,8 +6,9 @@ import os
 import re
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
+from itertools import count
 from pathlib import Path
 
 from .errors import UsageError
@@ -28,32 +26,24 @@ def new_run_folder(name: str, root: Path = RUNS) -> Path:
     """
     make_folder(root)
     plain = re.sub(r"[^A-Za-z0-9_.]+", "-", name)[:NAME_CHARACTERS].strip("-.") or "run"
-    first = root / f"{datetime.now().strftime('%Y-%m-%dT%H%M')}-{plain}"
-    folder, number = first, 1
-    while True:
+    first = f"{datetime.now().strftime('%Y-%m-%dT%H%M')}-{plain}"
+    for number in count(1):
+        folder = root / (first if number == 1 else f"{first}-{number}")
         try:
             folder.mkdir()
-            sync_folder(root)
             break
         except FileExistsError:
-            number += 1
-            folder = first.with_name(f"{first.name}-{number}")
+            continue
         except OSError as error:
-            raise UsageError(
-                f"{folder}: the folder cannot be made: {error.strerror or error}", remedy="choose a place with --out"
-            ) from error
-    _point(root / LATEST, folder.name)
+            what = f"{folder}: the folder cannot be made: {error.strerror or error}"
+            raise UsageError(what, remedy="choose a place with --out") from error
+    sync_folder(root)
+    link, beside = root / LATEST, root / f".{LATEST}.{secrets.token_hex(4)}"
+    if link.is_symlink() or not os.path.lexists(link):  # a file or folder of that name stays
+        with suppress(OSError):  # a system without links has none
+            beside.symlink_to(folder.name, target_is_directory=True)
+            os.replace(beside, link)
     return folder
-
-
-def _point(link: Path, name: str) -> None:
-    """Let `link` point to `name`; a file or folder of that name stays, and a system without links has none."""
-    if os.path.lexists(link) and not link.is_symlink():
-        return
-    beside = link.with_name(f".{LATEST}.{secrets.token_hex(4)}")
-    with suppress(OSError):
-        beside.symlink_to(name, target_is_directory=True)
-        os.replace(beside, link)
 
 
 @contextmanager
@@ -68,61 +58,27 @@ def locked(path: Path) -> Iterator[None]:
     except ModuleNotFoundError:
         yield
         return
-    handle = -1
-    try:
-        while handle < 0:
-            handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise _busy(path, handle) from error
-            if not _is_still(path, handle):  # the holder before removed it between our two calls
-                os.close(handle)
-                handle = -1
-        _sign(path, handle)
-    except OSError as error:
-        _close(handle)
-        raise UsageError(
-            f"{path}: cannot be locked: {error.strerror or error}", remedy="choose another folder with --out"
-        ) from error
-    except UsageError:
-        _close(handle)
-        raise
-    try:
+    remedy = "choose another folder with --out"
+    with ExitStack() as held:
+        try:
+            while True:
+                file = held.enter_context(open(os.open(path, os.O_CREAT | os.O_RDWR, 0o666), "r+b", buffering=0))
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                with suppress(FileNotFoundError):  # the holder before removed it between our two calls
+                    if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
+                        break
+            held.callback(_removed, path)
+            file.truncate(0)
+            file.write(f"{os.getpid()}\n".encode())
+        except BlockingIOError as error:
+            holder = file.read(20).decode("ascii", "replace").strip() or "unknown"
+            what = f"{path.parent}: another run writes here (process {holder})"
+            raise UsageError(what, remedy=remedy) from error
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be locked: {error.strerror or error}", remedy=remedy) from error
         yield
-    finally:
-        with suppress(OSError):
-            os.unlink(path)
-        os.close(handle)
 
 
-def _sign(path: Path, handle: int) -> None:
-    """Write whose lock it is; where that fails the file goes."""
-    try:
-        os.ftruncate(handle, 0)
-        os.write(handle, f"{os.getpid()}\n".encode())
-    except OSError:
-        with suppress(OSError):
-            os.unlink(path)
-        raise
-
-
-def _close(handle: int) -> None:
-    if handle >= 0:
-        os.close(handle)
-
-
-def _is_still(path: Path, handle: int) -> bool:
-    mine = os.fstat(handle)
-    try:
-        there = os.stat(path)
-    except FileNotFoundError:
-        return False
-    return (mine.st_dev, mine.st_ino) == (there.st_dev, there.st_ino)
-
-
-def _busy(path: Path, handle: int) -> UsageError:
-    holder = os.read(handle, 20).decode("ascii", "replace").strip() or "unknown"
-    return UsageError(
-        f"{path.parent}: another run writes here (process {holder})", remedy="choose another folder with --out"
-    )
+def _removed(path: Path) -> None:
+    with suppress(OSError):
+        os.unlink(path)

@@ -1,7 +1,7 @@
 """Text from outside made inert for where it goes: a terminal, a Markdown page, HTML, a CSV cell, a file name.
 
-Owns these rules; every output of device strings, class names, file names and calibrations goes through one of them. JSON needs none: it
-is ASCII with escapes, and stays exact. Characters that do something instead of being seen (controls, line and paragraph separators,
+Every output of device strings, class names, file names and calibrations goes through one of these. JSON needs none: it is ASCII with
+escapes, and stays exact. Characters that do something instead of being seen (controls, line and paragraph separators,
 changes of the writing direction, surrogates, private ones) become their Python escapes; what is too long is cut and ends in an ellipsis.
 
 >>> one_line("SN-1\\x1b[2J\\nPASS")
@@ -19,18 +19,7 @@ from typing import Any
 LINE_MAX = 2000  # characters of one line of foreign text
 FILE_NAME_MAX = 100
 _MARKDOWN = re.compile(r"([\\`*_{}\[\]<>()#|~&!$^])")
-_FORMULA = (
-    "=",
-    "+",
-    "-",
-    "@",
-    "\t",
-    "\r",
-    "＝",
-    "＋",
-    "－",
-    "＠",
-)  # what spreadsheets take for a formula; the wide forms too
+_FORMULA = tuple("=+-@\t\r＝＋－＠")  # what spreadsheets take for a formula; the wide forms too
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?([eE][+-]?\d+)?")
 _NO_FILE_NAME = re.compile(r"[^A-Za-z0-9._-]+")
 _DEVICES = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names that Windows keeps for itself
@@ -39,17 +28,17 @@ _DEVICES = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names that
 def one_line(value: Any, most: int = LINE_MAX) -> str:
     """Return `value` as one visible line of at most `most` characters."""
     text = str(value)
-    cut = text[:most]
-    shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in cut)
+    shown = _visible(text[:most])
     return f"{shown[: most - 1]}…" if len(text) > most or len(shown) > most else shown
 
 
 def lines(value: Any) -> str:
     """Return a text that we made, of several lines, for a terminal: foreign parts of it can move nothing and recolour nothing."""
-    return "\n".join(
-        "".join(letter if letter.isprintable() or letter == "\t" else ascii(letter)[1:-1] for letter in line)
-        for line in str(value).split("\n")
-    )
+    return _visible(str(value), kept="\n\t")
+
+
+def _visible(text: str, kept: str = "") -> str:
+    return "".join(letter if letter.isprintable() or letter in kept else ascii(letter)[1:-1] for letter in text)
 
 
 def markdown(value: Any, most: int = LINE_MAX) -> str:

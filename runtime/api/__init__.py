@@ -1,7 +1,7 @@
 """What a notebook needs: load a profile, a bundle or a recording, build a plan, run on a device, replay, evaluate, decide on clicks.
 
-This is `import pans`; the names are loaded when they are first used. Owns nothing of its own: each call is a few lines around the
-packages, which have the rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.trainer).
+This is `import pans`; what a name needs is loaded when it is first used. Each call is a few lines around the packages, which have the
+rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.trainer).
 
 >>> import pans
 >>> bundle = pans.load_bundle("fashion10")

@@ -1,5 +1,4 @@
-"""The commands of the lean runtime: arguments in, exit codes out.
+"""The commands of the lean runtime, found by entry point (`pans.commands`): arguments in, files, one answer and an exit code out.
 
-Owns how options are spelled and what is printed; nothing is computed here. Each command is found by entry point (`pans.commands`), so that
-this package has no public names: a program calls `pans` or the packages below.
+Start reading at one_run.py, which is `pans run` and `pans demo` from the options to the report.
 """

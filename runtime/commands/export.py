@@ -1,7 +1,6 @@
 """`pans export`: a recording or a bundle for other tools: CSV, Photon-HDF5, Parquet; ONNX, NumPy arrays, PNG pictures.
 
-Owns the command; the files are csv_files.py's, photon_hdf5.py's, parquet.py's and pattern_files.py's. Never changes or judges what it
-exports; a cut recording is exported as far as it goes, and the answer says so.
+A cut recording is exported as far as it goes, and the answer says so.
 """
 
 from __future__ import annotations
@@ -81,25 +80,23 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _export_bundle(args: argparse.Namespace) -> int:
+    is_folder, inputs = args.format != "onnx", [args.recording]
     if file_kind(args.recording) != "bundle":
         remedy = f"a recording goes to {', '.join(OF_RECORDINGS)}"
         raise UsageError(f"{args.recording}: --format {args.format} is for bundles", remedy=remedy)
-    check_outputs(
-        [args.out / "about.json" if args.format != "onnx" else args.out],
-        inputs=[args.recording],
-        force=args.force,
-        makes_folders=args.format != "onnx",
-    )
+    first = args.out / "about.json" if is_folder else args.out
+    check_outputs([first], inputs=inputs, force=args.force, makes_folders=is_folder)
     bundle, digest = load_bundle(args.recording)
     files = dict(_bundle_files(bundle, args.format, args.out))
-    check_outputs(files, inputs=[args.recording], force=args.force, makes_folders=True)
-    if args.format != "onnx":
+    check_outputs(files, inputs=inputs, force=args.force, makes_folders=True)
+    if is_folder:
         make_folder(args.out)
     for path, data in files.items():
         write_file(path, data, force=args.force)
     payload = {"format": args.format, "files": [str(path) for path in files], "sha256": digest, **about(bundle)}
-    shown = str(args.out) if args.format == "onnx" else f"{len(files)} files in {args.out}"
-    emit(args, payload, f"{bundle.name}: {shown}")
+    emit(
+        args, payload, f"{bundle.name}: {len(files)} files in {args.out}" if is_folder else f"{bundle.name}: {args.out}"
+    )
     return EXIT_FINE
 
 

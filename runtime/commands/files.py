@@ -1,7 +1,4 @@
-"""The commands on files: `pans verify`, `pans info`, `pans bundle`.
-
-Owns their arguments and how their answers look; the checks are in verify.py, the facts in file_facts.py, the formats elsewhere.
-"""
+"""The commands on files: `pans verify`, `pans info`, `pans bundle`. Checks are report/verify.py's, facts report/file_facts.py's."""
 
 from __future__ import annotations
 
@@ -29,21 +26,15 @@ if TYPE_CHECKING:  # the help of a command must not load what it works with
     from pans.runtime.report.verify import FileVerdict
 
 DEFAULT_LEVELS = 124
-_VALUE_CHARACTERS = 200
-PHOTONS_AT_WHITE = Range(1e-9, 1e9)
-OUTCOMES = Range(2, 16, whole=True)
+ANY_FILE = "a bundle, a recording, a calibration, or a profile (file or shipped name)"
+VALUE_CHARACTERS = 200
 
 
 # ---- verify ----
 
 
 def _configure_verify(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "paths",
-        nargs="+",
-        metavar="PATH",
-        help="a bundle, a recording, a calibration, or a profile (file or shipped name)",
-    )
+    parser.add_argument("paths", nargs="+", metavar="PATH", help=ANY_FILE)
 
 
 def _verify(args: argparse.Namespace) -> int:
@@ -53,16 +44,13 @@ def _verify(args: argparse.Namespace) -> int:
     groups = [verify_parts(path) if is_of_parts(path) else [verify_file(path)] for path in args.paths]
     verdicts = [verdict for group in groups for verdict in group]
     payload = {
-        "ok": all(verdict.ok for verdict in verdicts),
-        "alerts": [{"path": verdict.path, "message": text} for verdict in verdicts for text in verdict.alerts],
-        "violations": [{"path": verdict.path, "message": text} for verdict in verdicts for text in verdict.violations],
-        "files": [
-            {"path": verdict.path, "kind": verdict.kind, "ok": verdict.ok, "damaged": verdict.damaged}
-            for verdict in verdicts
-        ],
+        "ok": all(one.ok for one in verdicts),
+        "alerts": [{"path": one.path, "message": text} for one in verdicts for text in one.alerts],
+        "violations": [{"path": one.path, "message": text} for one in verdicts for text in one.violations],
+        "files": [{key: getattr(one, key) for key in ("path", "kind", "ok", "damaged")} for one in verdicts],
     }
-    emit(args, payload, "\n".join(line for verdict in verdicts for line in _verdict_lines(verdict)))
-    if any(verdict.damaged for verdict in verdicts):
+    emit(args, payload, "\n".join(line for one in verdicts for line in _verdict_lines(one)))
+    if any(one.damaged for one in verdicts):
         return EXIT_USAGE
     return EXIT_FINE if payload["ok"] else EXIT_ALERT
 
@@ -82,9 +70,7 @@ def _verdict_lines(verdict: FileVerdict) -> Iterator[str]:
 
 
 def _configure_info(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "path", metavar="PATH", help="a bundle, a recording, a calibration, or a profile (file or shipped name)"
-    )
+    parser.add_argument("path", metavar="PATH", help=ANY_FILE)
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -93,7 +79,7 @@ def _info(args: argparse.Namespace) -> int:
     facts = file_facts(args.path)
     rows = list(_flat(facts))
     if not args.json and sys.stdout.isatty():
-        _show_table(rows)
+        _print_table(rows)
     else:
         width = max(len(key) for key, _ in rows)
         emit(args, facts, "\n".join(f"{key:<{width}}  {value}" for key, value in rows))
@@ -103,18 +89,18 @@ def _info(args: argparse.Namespace) -> int:
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yield (dotted key, printable value); a stranger's text must not steer the terminal."""
     for key, value in facts.items():
-        name = one_line(f"{prefix}{key}", _VALUE_CHARACTERS)
+        name = one_line(f"{prefix}{key}", VALUE_CHARACTERS)
         if isinstance(value, dict):
             yield from _flat(value, f"{name}.")
         elif isinstance(value, list | tuple):
-            yield name, one_line(", ".join(str(item) for item in value), _VALUE_CHARACTERS)
+            yield name, one_line(", ".join(str(item) for item in value), VALUE_CHARACTERS)
         elif key == "simulated" and value is True:
             yield name, "SIMULATED"
         elif value is not None and value != "":
-            yield name, one_line(value, _VALUE_CHARACTERS)
+            yield name, one_line(value, VALUE_CHARACTERS)
 
 
-def _show_table(rows: list[tuple[str, str]]) -> None:
+def _print_table(rows: list[tuple[str, str]]) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -140,7 +126,7 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--photons-at-white",
-        type=PHOTONS_AT_WHITE.option,
+        type=Range(1e-9, 1e9).option,
         metavar="N",
         help="of PNG pictures: photons per exposure through a white pixel and a clear object",
     )
@@ -152,19 +138,14 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--outcomes",
-        type=OUTCOMES.option,
+        type=Range(2, 16, whole=True).option,
         default=2,
         metavar="K",
         help="what head or table take of an exposure: K photon numbers, 0 to K - 1 or more (default 2: no click and a click)",
     )
     parser.add_argument("--classes", required=True, metavar="a,b,...", help="class names in the order of the scores")
     group = parser.add_mutually_exclusive_group()
-    group.add_argument(
-        "--levels",
-        type=int,
-        metavar="N",
-        help=f"intensity levels (default {DEFAULT_LEVELS})",
-    )
+    group.add_argument("--levels", type=int, metavar="N", help=f"intensity levels (default {DEFAULT_LEVELS})")
     group.add_argument(
         "--profile", metavar="P", help="take the levels of this profile, and check that it can expose them"
     )
@@ -205,6 +186,7 @@ def _bundle(args: argparse.Namespace) -> int:
     dithered = args.dither == "on" or (args.dither == "auto" and levels <= DITHER_LEVELS_MAX)
     with as_usage_error():
         quantised = quantise_patterns(patterns, levels, dither=shape if dithered else None)
+    rounding = {**_quantisation_facts(quantised), "dithered": dithered}
     bundle = make_bundle(
         name=args.name or args.out.stem,
         task=args.task,
@@ -216,13 +198,12 @@ def _bundle(args: argparse.Namespace) -> int:
             table=_load_array(args.table) if args.table else None,
             outcomes=args.outcomes,
         ),
-        provenance={**provenance, "quantisation": {**_quantisation_facts(quantised), "dithered": dithered}},
+        provenance={**provenance, "quantisation": rounding},
     )
     exposure = {"exposure_us": exposure_us(profile, bundle)} if profile else {}
     cost = _cost(args, patterns, bundle, exposure.get("exposure_us", 0.0), profile) if args.data else {}
     sha256 = write_bundle(bundle, args.out, force=args.force)
-    facts = {**_quantisation_facts(quantised), "dithered": dithered, **exposure, **cost, "levels": levels}
-    facts["patterns"] = bundle.n_features
+    facts = {**rounding, **exposure, **cost, "levels": levels, "patterns": bundle.n_features}
     emit(args, {"bundle": str(args.out), "sha256": sha256, **facts}, "\n".join(_bundle_lines(args.out, sha256, facts)))
     return EXIT_FINE
 
@@ -251,9 +232,8 @@ def _cost(
 
     data = read_labelled(args.data)
     if data.classes and data.classes != bundle.classes:
-        raise UsageError(
-            f"{args.data} has the classes {', '.join(data.classes[:5])}, allowed with --classes: {', '.join(bundle.classes[:5])}"
-        )
+        there, allowed = ", ".join(data.classes[:5]), ", ".join(bundle.classes[:5])
+        raise UsageError(f"{args.data} has the classes {there}, allowed with --classes: {allowed}")
     with as_usage_error():
         cost = quantisation_cost(patterns, bundle, data.images, data.labels, exposure_us, profile)
     return {
@@ -270,9 +250,8 @@ def _patterns(args: argparse.Namespace) -> tuple[NDArray[Any], dict[str, Any]]:
     """Return the patterns in photons (d_f, pixels), and of a folder of pictures what it was; its pictures have the shape too."""
     if not args.patterns.is_dir():
         if args.photons_at_white is not None:
-            raise UsageError(
-                "--photons-at-white has no effect on an array", remedy="leave it out: arrays are in photons"
-            )
+            remedy = "leave it out: arrays are in photons"
+            raise UsageError("--photons-at-white has no effect on an array", remedy=remedy)
         patterns = _load_array(args.patterns)
         if patterns.ndim != 2:
             raise UsageError(f"{args.patterns}: shape {patterns.shape}, allowed: (d_f, pixels)")
@@ -283,13 +262,8 @@ def _patterns(args: argparse.Namespace) -> tuple[NDArray[Any], dict[str, Any]]:
         raise UsageError("pictures do not say how much light white is", remedy="say it with --photons-at-white")
     grey, (height, width) = read_pattern_pngs(args.patterns)
     args.image_shape = args.image_shape or f"{height}x{width}"
-    digest = hashlib.sha256(grey.tobytes()).hexdigest()
-    facts = {
-        "folder": args.patterns.name,
-        "pictures": len(grey),
-        "photons_at_white": args.photons_at_white,
-        "sha256": digest,
-    }
+    facts = {"folder": args.patterns.name, "pictures": len(grey), "photons_at_white": args.photons_at_white}
+    facts["sha256"] = hashlib.sha256(grey.tobytes()).hexdigest()
     return grey * args.photons_at_white, {"patterns": facts}
 
 
@@ -353,9 +327,8 @@ def _load_array(path: Path) -> NDArray[Any]:
         if len(data) - stream.tell() != wanted:
             raise ValueError(f"{len(data) - stream.tell()} bytes of data, its shape {shape} needs {wanted}")
     except ValueError as error:
-        raise DamagedFileError(
-            f"{path}: not a readable .npy array: {error}", remedy="write it with numpy.save"
-        ) from error
+        what = f"{path}: not a readable .npy array: {error}"
+        raise DamagedFileError(what, remedy="write it with numpy.save") from error
     return np.frombuffer(data, dtype=dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 

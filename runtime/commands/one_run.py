@@ -10,9 +10,9 @@ import hashlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -336,9 +336,11 @@ def _prepare_and_run(options: RunOptions, profile: Profile, around: _Around) -> 
         ready = _prepare(options, profile)
         load_ahead()
     except BaseException as error:
-        besides = _closed_quietly(opening)
-        if besides and isinstance(error, PansError):
-            error.message += f"\nbesides, the device could not be opened: {besides}"
+        try:
+            opening.result().close()
+        except Exception as besides:
+            if isinstance(error, PansError):
+                error.message += f"\nbesides, the device could not be opened: {besides}"
         raise
     for warning in ready.warnings:
         warn(warning)
@@ -364,15 +366,6 @@ def _in_background(call: Callable[[], Link]) -> Future[Link]:
     return future
 
 
-def _closed_quietly(opening: Future[Link]) -> str:
-    """Close the link that is being opened; return why it could not be, "" where it could."""
-    try:
-        opening.result().close()
-    except Exception as error:
-        return str(error)
-    return ""
-
-
 def _traced(options: RunOptions, link: Link, path: Path, around: _Around) -> Link:
     """Return `link` with a trace; one that could not be written to its end is reported, and ends nothing."""
     from pans.runtime.link.base import TracedLink
@@ -388,15 +381,12 @@ def _traced(options: RunOptions, link: Link, path: Path, around: _Around) -> Lin
     return traced
 
 
-@contextmanager
-def _metrics_of(options: RunOptions) -> Iterator[MetricsServer | None]:
+def _metrics_of(options: RunOptions) -> AbstractContextManager[MetricsServer | None]:
     if not options.metrics:
-        yield None
-        return
+        return nullcontext()
     from pans.runtime.watch.metrics import MetricsServer
 
-    with closing(MetricsServer(options.metrics)) as server:
-        yield server
+    return closing(MetricsServer(options.metrics))
 
 
 def _monitor_of(options: RunOptions) -> Monitor:
@@ -454,20 +444,33 @@ def _watched(
     options: RunOptions, ready: _Prepared, link: Link, recorder: Recorder | None, around: _Around
 ) -> RunResult:
     """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
+    from pans.runtime.link.fit import scene_words
     from pans.runtime.live import Observers, Recovery
     from pans.runtime.live.loop import running
+    from pans.runtime.monitor.snapshot import begin_facts
     from pans.runtime.watch import Attendants
 
     dark, monitor = ready.dark, around.monitor
     recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
-    monitor.begin(ready.bundle, recorder, _facts(options, ready, link))
+    facts = begin_facts(
+        ready.bundle,
+        title=f"{ready.bundle.name} on {ready.profile.name}",
+        simulated=link.simulated,
+        expected=ready.expected_decisions,
+        deadline_us=options.deadline_us,
+        trials=options.trials,
+        illumination=ready.bundle.illumination() * ready.frames,
+    )
+    monitor.begin(ready.bundle, recorder, facts)
     with Attendants(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
 
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
             if ready.registration is not None:
                 ready.registration.check_device(dark.serial_of(run))
-            _name_scene(run, options.device)
+            welcome = run.connection.session.welcome
+            if welcome is not None and (words := scene_words(welcome.facts, options.device)):
+                say(f"pans: {words}")
             seen.prepared(run)
             monitor.prepared(run)
             if ready.flow_run is not None:
@@ -481,30 +484,6 @@ def _watched(
         observers = Observers(look, prepared, around.stop, acts=False, uploaded=around.compiled)
         what = dark.profile, ready.bundle, ready.plan, ready.core, ready.options
         return around.ending.enter_context(running(link, *what, recorder, recovery, observers))
-
-
-def _facts(options: RunOptions, ready: _Prepared, link: Link) -> dict[str, Any]:
-    """What a live view is told before the run."""
-    from pans.runtime.monitor.snapshot import begin_facts
-
-    bundle = ready.bundle
-    return begin_facts(
-        bundle,
-        title=f"{bundle.name} on {ready.profile.name}",
-        simulated=link.simulated,
-        expected=ready.expected_decisions,
-        deadline_us=options.deadline_us,
-        trials=options.trials,
-        illumination=bundle.illumination() * ready.frames,
-    )
-
-
-def _name_scene(run: LiveRun, device: str) -> None:
-    from pans.runtime.link.fit import scene_words
-
-    welcome = run.connection.session.welcome
-    if welcome is not None and (words := scene_words(welcome.facts, device)):
-        say(f"pans: {words}")
 
 
 # ---- report ----

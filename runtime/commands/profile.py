@@ -64,25 +64,15 @@ def _check(args: argparse.Namespace) -> int:
 
     if not args.names:
         raise UsageError("no profile was named", remedy="pans profile check my-lab.toml")
-    found = [
-        (name, load_profile(name)) for name in args.names
-    ]  # the first fault is an error with file, line and column
-    lines = []
-    for name, profile in found:
+    rows, lines = [], list[str]()
+    for name in args.names:
+        profile = load_profile(name)  # the first fault is an error with file, line and column
+        warnings = law_warnings(profile, profile.exposure.min_us)
         lines.append(f"ok        {name}: {profile.name}, {profile.mode}, {profile.detector.channels} channel(s)")
         lines += [f"          to be measured: {key}" for key in profile.measure]
-        lines += [f"          warning: {text}" for text in law_warnings(profile, profile.exposure.min_us)]
-    emit(
-        args,
-        {
-            "ok": True,
-            "rows": [
-                _facts(name, profile) | {"warnings": law_warnings(profile, profile.exposure.min_us)}
-                for name, profile in found
-            ],
-        },
-        "\n".join(lines),
-    )
+        lines += [f"          warning: {text}" for text in warnings]
+        rows.append(_facts(name, profile) | {"warnings": warnings})
+    emit(args, {"ok": True, "rows": rows}, "\n".join(lines))
     return EXIT_FINE
 
 
@@ -92,9 +82,8 @@ def _new(args: argparse.Namespace) -> int:
 
     path, base = Path(_only_name(args, "pans profile new my-lab.toml")), args.base or DEFAULT_BASE
     if path.suffix != ".toml":
-        raise UsageError(
-            f"{path}: a profile's name ends in .toml", remedy=f"pans profile new {path.name or 'my-lab'}.toml"
-        )
+        remedy = f"pans profile new {path.name or 'my-lab'}.toml"
+        raise UsageError(f"{path}: a profile's name ends in .toml", remedy=remedy)
     if path.stem in shipped_profiles():
         raise UsageError(f"{path.stem} is the name of a shipped profile", remedy="choose a name of your own")
     check_outputs([path], inputs=[base], force=args.force)
@@ -113,14 +102,8 @@ def _only_name(args: argparse.Namespace, example: str) -> str:
 
 
 def _facts(path: str, profile: Profile) -> dict[str, Any]:
-    return {
-        "profile": path,
-        "name": profile.name,
-        "mode": profile.mode,
-        "description": profile.description,
-        "measure": list(profile.measure),
-        "sha256": profile.sha256,
-    }
+    facts = {name: getattr(profile, name) for name in ("name", "mode", "description", "sha256")}
+    return {"profile": path, **facts, "measure": list(profile.measure)}
 
 
 PROFILE = Command(

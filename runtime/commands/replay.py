@@ -1,7 +1,4 @@
-"""`pans replay`: recompute a recording's decisions from its raw messages and compare the logs by hash.
-
-Owns the command; the replay itself is record/replaying.py's.
-"""
+"""`pans replay`: recompute a recording's decisions from its raw messages and compare the logs by hash (record/replaying.py)."""
 
 from __future__ import annotations
 
@@ -35,48 +32,33 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from pans.runtime.record.part_names import is_of_parts
+    from pans.runtime.record.part_names import is_of_parts, parts_in
+    from pans.runtime.record.pictures import PictureLog
 
     if args.pictures is not None:
         check_outputs([args.pictures], inputs=[args.recording, args.bundle, args.truth], force=args.force)
-    if is_of_parts(args.recording):
-        if args.pictures or args.truth:
-            raise UsageError("--pictures and --truth take one recording", remedy="name one of its parts")
-        return _run_parts(args)
-    from pans.runtime.record.pictures import PictureLog
-
-    pictures = PictureLog() if args.pictures or args.truth else None
-    recording, found = _replayed(args, args.recording, pictures)
-    payload = {
-        "decisions": found.decisions,
-        "sha256": found.sha256,
-        "recorded_sha256": recording.decisions_sha256,
-        **_agreement(recording, found),
-        "contradictions": found.contradictions,
-        **_figures(found),
-    }
+    of_parts, pictures = is_of_parts(args.recording), PictureLog() if args.pictures or args.truth else None
+    if of_parts and pictures is not None:
+        raise UsageError("--pictures and --truth take one recording", remedy="name one of its parts")
+    rows: list[dict[str, Any]] = []
+    lines: list[str] = []
+    for path in parts_in(args.recording) if of_parts else [args.recording]:
+        recording, found = _replayed(args, path, pictures)
+        rows.append({"decisions": found.decisions, "sha256": found.sha256, **_facts(recording, found)})
+        of_one = f"{found.decisions} decisions, SHA-256 {found.sha256}"
+        head = f"{path.name}: {found.decisions} decisions" if of_parts else of_one
+        lines += [f"{head}: {_agreement_words(recording, found)}", *_passage_words(found)]
+        if of_parts:
+            rows[-1]["part"] = path.name
+        else:
+            rows[-1]["recorded_sha256"] = recording.decisions_sha256
+    identical, payload = all(row["identical"] for row in rows), rows[0] if rows else {}
+    if of_parts:
+        payload = {"decisions": sum(row["decisions"] for row in rows), "identical": identical, "parts": rows}
     if pictures is not None and args.pictures:
         pictures.write(args.pictures, force=args.force)
     if pictures is not None and args.truth:
         payload |= pictures.compare(args.truth)
-    head = f"{found.decisions} decisions, SHA-256 {found.sha256}: {_agreement_words(recording, found)}"
-    emit(args, payload, "\n".join([head, *_words(found)]))
-    return EXIT_FINE if found.as_recorded else EXIT_ALERT
-
-
-def _run_parts(args: argparse.Namespace) -> int:
-    """Replay each part of a recording by itself."""
-    from pans.runtime.record.part_names import parts_in
-
-    rows: list[dict[str, Any]] = []
-    lines: list[str] = []
-    for path in parts_in(args.recording):
-        recording, found = _replayed(args, path)
-        facts = {"part": path.name, "decisions": found.decisions, "sha256": found.sha256}
-        rows.append(facts | _agreement(recording, found) | {"contradictions": found.contradictions} | _figures(found))
-        lines += [f"{path.name}: {found.decisions} decisions: {_agreement_words(recording, found)}", *_words(found)]
-    identical = all(row["identical"] for row in rows)
-    payload = {"decisions": sum(row["decisions"] for row in rows), "identical": identical, "parts": rows}
     emit(args, payload, "\n".join(lines))
     return EXIT_FINE if identical else EXIT_ALERT
 
@@ -90,12 +72,14 @@ def _replayed(args: argparse.Namespace, path: Path, pictures: PictureLog | None 
     return recording, replay(recording, bundle, pictures)
 
 
-def _agreement(recording: Recording, found: Replayed) -> dict[str, Any]:
+def _facts(recording: Recording, found: Replayed) -> dict[str, Any]:
     return {
         "identical": found.as_recorded,
         "complete": recording.complete,
         "decisions_recorded": found.recorded,
         "decisions_more": found.more,
+        "contradictions": found.contradictions,
+        **({} if found.passages is None else found.passages.as_json()),
     }
 
 
@@ -108,11 +92,7 @@ def _agreement_words(recording: Recording, found: Replayed) -> str:
     return f"identical as far as recorded: {found.recorded} of {found.recorded}{more}"
 
 
-def _figures(found: Replayed) -> dict[str, Any]:
-    return {} if found.passages is None else found.passages.as_json()
-
-
-def _words(found: Replayed) -> list[str]:
+def _passage_words(found: Replayed) -> list[str]:
     from pans.runtime.report.words import passage_words
 
     return [] if found.passages is None else passage_words(found.passages)

@@ -1,7 +1,4 @@
-"""`pans report` and `pans compare`: one self-contained HTML page of a recording or a bundle, and of two runs side by side.
-
-Owns the commands; the pages are those of `pages` and `compare`. They load nothing from elsewhere and run nothing.
-"""
+"""`pans report` and `pans compare`: one self-contained HTML page of a recording or a bundle, and of two runs side by side."""
 
 from __future__ import annotations
 
@@ -13,12 +10,8 @@ from pans.runtime.outputs import check_outputs, write_file
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "path",
-        type=Path,
-        metavar="FILE",
-        help="a recording (file, folder or index of its parts), or a bundle",
-    )
+    what = "a recording (file, folder or index of its parts), or a bundle"
+    parser.add_argument("path", type=Path, metavar="FILE", help=what)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.html", help="the page to write")
     add_force(parser)
 
@@ -47,13 +40,9 @@ REPORT = Command(
 
 
 def _configure_compare(parser: argparse.ArgumentParser) -> None:
-    for name in ("first", "second"):
-        parser.add_argument(
-            name,
-            type=Path,
-            metavar="A" if name == "first" else "B",
-            help="a run's folder, a recording (.pansrec), or a summary as `pans run --json` prints it (.json)",
-        )
+    side = "a run's folder, a recording (.pansrec), or a summary as `pans run --json` prints it (.json)"
+    for name, metavar in (("first", "A"), ("second", "B")):
+        parser.add_argument(name, type=Path, metavar=metavar, help=side)
     parser.add_argument(
         "--objects",
         default="auto",

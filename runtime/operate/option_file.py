@@ -91,15 +91,16 @@ def _read(path: Path, options: Mapping[str, argparse.Action]) -> tuple[dict[str,
     """Return the keys of the file with their values, and a call that says where a key stands."""
     try:
         data = read_file(path, FILE_MAX_BYTES)
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}:1:1: not UTF-8: {error.reason} at byte {error.start}") from error
     except PansError as error:
         raise type(error)(error.message, remedy="name a TOML file that --write-config has written") from error
     what, taker = other_kind(data, "TOML")
     if what:
         remedy = f"{taker}; `pans run ... --write-config FILE` writes a file of options"
         raise ConfigError(f"{path}: not a file of options: it is {what}", remedy=remedy)
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}:1:1: not UTF-8: {error.reason} at byte {error.start}") from error
     given, positions = read_toml(text, str(path))
 
     def where(name: str) -> str:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
-from pans.runtime.image_quality import likeness
-from pans.runtime.images import shipped_scene
+from pans.runtime.images import likeness, shipped_scene
 from pans.runtime.npz_file import read_arrays
 from pans.runtime.outputs import write_file
 

@@ -21,7 +21,7 @@ from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.detector import afterpulses_of
 from pans.runtime.detector.crosstalk import Kernel, crosstalk_of, fired, seen_from_own, with_crosstalk
 from pans.runtime.errors import as_usage_error
-from pans.runtime.image_quality import likeness
+from pans.runtime.images import likeness
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, bleached, met
 from pans.runtime.instrument.click_law import (
     ClickLaw,

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
-from pans.runtime.image_quality import likeness
+from pans.runtime.images import likeness
 from pans.runtime.outputs import make_folder, write_file
 from pans.runtime.report import figures as page_figures
 from pans.trainer.figures import new_figure, save_figure

@@ -168,7 +168,7 @@ def test_a_picture_bundle_runs_and_its_pictures_are_recomputed(tmp_path, capsys)
 
 
 def test_ssim_is_that_of_the_trainer():
-    from pans.runtime.image_quality import likeness
+    from pans.runtime.images import likeness
     from pans.trainer.model.ssim import ssim
 
     rng = np.random.default_rng(0)
