@@ -1,7 +1,7 @@
-"""The trained artifact in one file: patterns or passive optics, what decides (head, table or automaton), golden vectors, provenance.
+"""A trained sensor in one file: patterns or passive optics, what decides (head, table or automaton), golden vectors, provenance.
 
-Owns what a bundle is, its bytes (docs/reference/formats.md) and every check of them. A bundle that was read is whole and consistent, or
-the read has raised. It shows no pattern and decides nothing (decide); training and export are the trainer's.
+`load_bundle` reads a file or a shipped bundle by name, `make_bundle` makes one from arrays and an ONNX head, `write_bundle` writes it.
+Start reading in facts.py (what a bundle is), then format.py (its bytes, docs/reference/formats.md) and automaton.py.
 """
 
 from .automaton import Automaton, reachable_automaton, stopped

@@ -27,7 +27,7 @@ from .optics import Analyser
 
 MAGIC = b"PANSBNDL"
 VERSION = 1
-VERSIONS = (1, 2, 3, 4, 5, 6)
+VERSIONS = (VERSION,)
 HEADER_MAX_BYTES = MIB
 _PROLOGUE = struct.Struct("<8sII")
 _DIGEST_BYTES = 32

@@ -1,8 +1,7 @@
-"""The trained artifact in one file: quantised patterns, a back end (table, ONNX head or both), golden vectors, provenance.
+"""Patterns or optics, and what decides, in; a checked `Bundle` with golden vectors out; and bundles written to and read from files.
 
-Owns how a bundle is made, written and loaded; what it is stands in facts.py, its bytes in format.py. Never shows
-a pattern and never decides. A read either returns a `Bundle` whose every byte is covered by a checksum and whose table
-answers the golden vectors, or raises DamagedFileError.
+A read either returns a `Bundle` whose every byte is covered by a checksum and whose table answers the golden vectors, or raises
+DamagedFileError. What a bundle is stands in facts.py, its bytes in format.py.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from .facts import (
     words_among,
 )
 from .format import bundle_bytes, parse_bundle, read_bundle
-from .head import OnnxHead, open_head
+from .head import open_head
 from .layers import Int8Head
 from .optics import Analyser
 
@@ -119,23 +118,22 @@ def make_bundle(
     try:
         analyser = optics if isinstance(optics, Analyser) else None
         shown = optics if isinstance(optics, Shown) else Shown(0, np.zeros((len(optics.matrix), 0), np.uint16), 0.0)
-        quantised = _as_levels(shown) if analyser is None else np.asarray(shown.pattern_levels)
+        patterns = _as_levels(shown) if analyser is None else np.asarray(shown.pattern_levels)
         n_outputs = len(classes) if picture_shape is None else math.prod(picture_shape)
         decided = BackEnd() if back_end is None else back_end
         if automaton is None:
             RANGES["outcomes"].checked(decided.outcomes, "outcomes")
-            words = _Words(len(quantised), decided.outcomes)
-            golden = _evaluate_back_end(decided, words, n_outputs, decides=picture_shape is None)
+            golden = _golden_of_back_end(decided, len(patterns), n_outputs, decides=picture_shape is None)
         else:
-            golden = _golden_of(automaton, decided)
+            golden = _golden_of_automaton(automaton, decided)
         bundle = Bundle(
             name=name,
             task=task,
             classes=tuple(classes),
-            encoder=_encoder(analyser, automaton),
+            encoder="automaton" if automaton is not None else "active" if analyser is None else analyser.kind,
             image_shape=(int(image_shape[0]), int(image_shape[1])),
             levels=int(shown.levels),
-            pattern_levels=frozen(quantised),
+            pattern_levels=frozen(patterns),
             photons_per_level=float(shown.photons_per_level),
             head_onnx=None if decided.head_onnx is None else bytes(decided.head_onnx),
             table=None if golden.table is None else frozen(golden.table),
@@ -173,25 +171,15 @@ def word_means(words: ArrayLike, n_features: int, outcomes: int = 2) -> NDArray[
 
     Of photon numbers a word is their number in base `outcomes`, feature 0 the lowest digit, and a feature is its digit over the largest.
     """
-    if outcomes == 2:
-        bits = np.asarray(words, dtype=np.int64)[:, None] >> np.arange(n_features, dtype=np.int64)
-        return (bits & 1).astype(np.float32)
     digits = np.asarray(words, dtype=np.int64)[:, None] // outcomes ** np.arange(n_features, dtype=np.int64) % outcomes
     return digits.astype(np.float32) / np.float32(outcomes - 1)
-
-
-def _encoder(analyser: Analyser | None, automaton: Automaton | None) -> str:
-    if automaton is not None:
-        return "automaton"
-    return "active" if analyser is None else analyser.kind
 
 
 def _as_levels(shown: Shown) -> NDArray[np.uint16]:
     values = np.asarray(shown.pattern_levels)
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.integer) or values.size == 0:
-        raise ValueError(
-            f"pattern_levels has shape {values.shape} and dtype {values.dtype}, allowed: integers (d_f, pixels)"
-        )
+        found = f"shape {values.shape} and dtype {values.dtype}"
+        raise ValueError(f"pattern_levels has {found}, allowed: integers (d_f, pixels)")
     low, high = int(values.min()), int(values.max())
     if low < 0 or high >= min(shown.levels, LEVELS_MAX):
         raise ValueError(f"pattern_levels run from {low} to {high}, allowed: 0 to {shown.levels - 1}")
@@ -205,47 +193,36 @@ class _Golden(NamedTuple):
     walks: NDArray[np.uint32] | None = None
 
 
-class _Words(NamedTuple):
-    """What words of one shot are made of: so many patterns, so many outcomes of each."""
-
-    n_features: int
-    outcomes: int
-
-    @property
-    def number(self) -> int:
-        return self.outcomes**self.n_features
-
-    def means(self) -> NDArray[np.float32]:
-        """All words as the head's input."""
-        return word_means(np.arange(self.number), self.n_features, self.outcomes)
-
-
-def _evaluate_back_end(back_end: BackEnd, words: _Words, n_outputs: int, *, decides: bool) -> _Golden:
+def _golden_of_back_end(back_end: BackEnd, n_features: int, n_outputs: int, *, decides: bool) -> _Golden:
     """Return the golden vectors and the table, if any; the head answers where there is one, else the table."""
-    n_features, largest = words.n_features, words.outcomes - 1
+    outcomes = back_end.outcomes
+    largest, n_words = outcomes - 1, outcomes**n_features
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused later
         table = None if back_end.table is None else np.array(back_end.table, dtype=np.float32)
     if table is not None:
-        check_table_shape(table.shape, n_features, n_outputs, words.outcomes)
+        check_table_shape(table.shape, n_features, n_outputs, outcomes)
+    means = _golden_words(n_features, largest)
     if back_end.head_onnx is None:
         if table is None:
             raise ValueError("neither a head nor a table was given, allowed: either or both")
-        means = _golden_words(n_features, largest)
-        return _Golden(means, table[words_among(means, words.outcomes)[1]], table)
+        return _Golden(means, table[words_among(means, outcomes)[1]], table)
     head = open_head(back_end.head_onnx, n_features, n_outputs, "head")
-    means = np.concatenate([_golden_words(n_features, largest), _golden_shots(n_features, largest)])
+    means = np.concatenate([means, _golden_shots(n_features, largest)])
     means = means[:: -(-len(means) * n_outputs // GOLDEN_SCORES_MAX)]  # fewer of very large pictures
-    affordable = head.cost.operations * min(words.number, TABLE_BUILD_ROWS_MAX) <= GOLDEN_WORK_MAX
-    if table is None and decides and words.number <= TABLE_BUILD_ROWS_MAX and affordable:
-        table = head.scores(words.means())
-    elif table is not None:
-        _demand_agreement(head, table, words)
+    affordable = head.cost.operations * min(n_words, TABLE_BUILD_ROWS_MAX) <= GOLDEN_WORK_MAX
+    if table is not None or (decides and n_words <= TABLE_BUILD_ROWS_MAX and affordable):
+        answers = head.scores(word_means(np.arange(n_words), n_features, outcomes))
+        difference = "" if table is None else golden_violation(table, answers)
+        if difference:
+            more = "(vector = click word; found = table, expected = head)"
+            raise ValueError(f"head and table disagree: {difference} {more}")
+        table = answers if table is None else table
     return _Golden(means, head.scores(means), table)
 
 
-def _golden_of(automaton: Automaton, beside: BackEnd) -> _Golden:
+def _golden_of_automaton(automaton: Automaton, besides: BackEnd) -> _Golden:
     """Words as for any bundle, and words that lead to nodes that few random words would reach."""
-    parts = (beside.head_onnx, beside.table, beside.int8_head, beside.int8_onnx)
+    parts = (besides.head_onnx, besides.table, besides.int8_head, besides.int8_onnx)
     demand(all(part is None for part in parts), "an automaton beside a head or a table, allowed: either")
     words = np.concatenate([_golden_words(automaton.n_bits), words_to(automaton, golden_nodes(automaton))])
     if automaton.counts:
@@ -255,12 +232,6 @@ def _golden_of(automaton: Automaton, beside: BackEnd) -> _Golden:
     words = words[:: math.ceil(len(words) * numbers)]  # fewer of very long ones
     walks = walk_nodes(automaton, words)
     return _Golden(words, log_scores(automaton.posteriors[walks[:, -1]]), None, walks)
-
-
-def _demand_agreement(head: OnnxHead, table: NDArray[np.float32], words: _Words) -> None:
-    difference = golden_violation(table, head.scores(words.means()))
-    if difference:
-        raise ValueError(f"head and table disagree: {difference} (vector = click word; found = table, expected = head)")
 
 
 def _golden_words(n_features: int, largest: int = 1) -> NDArray[np.float32]:

@@ -1,7 +1,7 @@
-"""From clicks to a label and its probability, or to a picture: the back ends behind one call.
+"""From clicks to a label and its probability, or to a picture: the back ends behind one call, `make_decider`.
 
-Owns the back ends and the choice among them. Each one has answered the bundle's golden vectors before it answers anything else. It counts
-no clicks and never abstains (core): scores that are not finite come back with probability 0.
+A back end answers the bundle's golden vectors before it answers anything else. Scores that are not finite come back with probability 0.
+Start reading in verdict.py (what a decision is), then backends.py (the choice among table, kernels, ONNX and automaton).
 
 >>> import numpy as np
 >>> from pans.runtime.bundle import BackEnd, Shown, make_bundle

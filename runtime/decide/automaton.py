@@ -1,7 +1,7 @@
-"""The automaton as a back end: a click word is walked to its leaf, and the leaf's posterior decides.
+"""The automaton as a back end: a click word in, walked to its leaf; the class with the largest posterior there out.
 
-Owns the compiled walk, and the choice not to decide: below the confidence that was asked for, the label is `NO_LABEL`. A walk is one shot;
-its patterns depend on its own clicks, so that several walks are never fused. Never says which pattern is shown (core).
+Below the confidence that was asked for, the label is `NO_LABEL`. A walk is one shot: its patterns depend on its own clicks, so that
+several walks are never fused.
 """
 
 from __future__ import annotations
@@ -27,44 +27,27 @@ def walk_words(
     leaves: NDArray[np.uint32],
     exposures: NDArray[np.uint16],
 ) -> int:
-    """Walk click words of zeros and ones (n, bits) from state 0; return -1, or the first word that holds another number.
+    """Walk words of outcomes (n, bits) from state 0; return -1, or the first word that holds an impossible number.
 
-    `successors` uint32 (states, 2**channels) as in `Automaton`, whose longest walk must fit into a word: bit t * channels + k is channel k
-    in slot t. Writes the leaf of each word to `leaves` (n,) and the exposures of its walk to `exposures` (n,).
+    `successors` uint32 (states, outcomes) as in `Automaton`, whose longest walk must fit into a word: number t * channels + k is channel k
+    in slot t, a click of 0 or 1, or of one channel a photon number. Writes the leaf of each word to `leaves` (n,) and the exposures of its
+    walk to `exposures` (n,).
     """
     n_states = successors.shape[0]
+    largest = successors.shape[1] - 1 if channels == 1 else 1
     for i in range(words.shape[0]):
         node, bit = np.int64(0), 0
         while node < n_states:
             outcome = np.int64(0)
             for channel in range(channels):
-                click = np.int64(words[i, bit])
-                if click != 0 and click != 1:
+                number = np.int64(words[i, bit])
+                if number < 0 or number > largest:
                     return i
-                outcome |= click << channel
+                outcome |= number << channel
                 bit += 1
             node = np.int64(successors[node, outcome])
         leaves[i] = node - n_states
         exposures[i] = bit // channels
-    return -1
-
-
-@outer
-def walk_counts(
-    successors: NDArray[np.uint32], words: NDArray[Any], leaves: NDArray[np.uint32], exposures: NDArray[np.uint16]
-) -> int:
-    """Walk words of photon numbers (n, slots) from state 0, as `walk_words` does; -1, or the first word with an impossible number."""
-    n_states, n_outcomes = successors.shape
-    for i in range(words.shape[0]):
-        node, slot = np.int64(0), 0
-        while node < n_states:
-            outcome = np.int64(words[i, slot])
-            if outcome < 0 or outcome >= n_outcomes:
-                return i
-            node = np.int64(successors[node, outcome])
-            slot += 1
-        leaves[i] = node - n_states
-        exposures[i] = slot
     return -1
 
 
@@ -91,13 +74,12 @@ class AutomatonDecider:
         self.decide(self._one[0].copy(), 1)
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
-        """Decide from single clicks, int64 (d_f,); UsageError for anything but zeros and ones of one shot."""
+        """Decide from the outcomes of one walk, int64 (d_f,); UsageError for impossible ones, and for several shots."""
         demand_one_shot(shots)
         self._one[0] = counts
         automaton = self.automaton
-        if _walk(automaton, self._one, self._leaf, self._exposures) >= 0:
-            what = f"photon numbers of {_allowed(automaton)}" if automaton.counts else "clicks of 0 or 1"
-            raise UsageError(f"an automaton answers {what}, not {counts.tolist()}")
+        if walk_words(automaton.successors, self._one, automaton.channels, self._leaf, self._exposures) >= 0:
+            raise UsageError(f"an automaton answers numbers of 0 to {automaton.largest}, not {counts.tolist()}")
         return self.decide_leaf(int(self._leaf[0]))
 
     def decide_leaf(self, leaf: int) -> Verdict:
@@ -107,8 +89,7 @@ class AutomatonDecider:
     def leaves(self, counts: ArrayLike, shots: int = 1) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
         """Return the leaf and the exposures of each walk, (n,), of outcomes, integers (n, d_f); ValueError for impossible ones."""
         demand_one_shot(shots)
-        most = self.automaton.n_outcomes - 1 if self.automaton.counts else shots
-        return _walked(self.automaton, checked_counts(counts, most, self.n_features))
+        return _walked(self.automaton, checked_counts(counts, self.automaton.largest, self.n_features))
 
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
         """Return log posteriors, float32 (n, classes), at least log(1e-30), of clicks (n, d_f)."""
@@ -127,12 +108,11 @@ class AutomatonDecider:
         walks = bundle.golden_walks
         if walks is None:
             raise DamagedFileError(f"{bundle.name}: an automaton without golden walks")
-        leaves, _ = _walked(whole, bundle.golden_means.astype(np.int64))
-        if not np.array_equal(leaves + np.uint32(whole.n_states), walks[:, -1]):
-            row = int((leaves + np.uint32(whole.n_states) != walks[:, -1]).argmax())
-            raise DamagedFileError(
-                f"{bundle.name}: golden walk {row} ends at leaf {leaves[row]} here", remedy="export the bundle again"
-            )
+        found = _walked(whole, bundle.golden_means.astype(np.int64))[0] + np.uint32(whole.n_states)
+        if not np.array_equal(found, walks[:, -1]):
+            row = int((found != walks[:, -1]).argmax())
+            where = f"golden walk {row} ends at leaf {found[row] - whole.n_states} here"
+            raise DamagedFileError(f"{bundle.name}: {where}", remedy="export the bundle again")
         demand_golden(self.name, log_scores(whole.posteriors[walks[:, -1]]), bundle.golden_scores, bundle)
 
 
@@ -151,20 +131,10 @@ def leaf_verdicts(automaton: Automaton, confidence: float) -> Verdicts:
 
 def _walked(automaton: Automaton, words: NDArray[np.int64]) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
     leaves, exposures = np.empty(len(words), np.uint32), np.empty(len(words), np.uint16)
-    bad = _walk(automaton, words, leaves, exposures)
+    bad = walk_words(automaton.successors, words, automaton.channels, leaves, exposures)
     if bad >= 0:
-        raise ValueError(f"click word {bad} holds other numbers than {_allowed(automaton)}")
+        raise ValueError(f"click word {bad} holds other numbers than 0 to {automaton.largest}")
     return leaves, exposures
-
-
-def _walk(automaton: Automaton, words: NDArray[Any], leaves: NDArray[np.uint32], exposures: NDArray[np.uint16]) -> int:
-    if automaton.counts:
-        return int(walk_counts(automaton.successors, words, leaves, exposures))
-    return int(walk_words(automaton.successors, words, automaton.channels, leaves, exposures))
-
-
-def _allowed(automaton: Automaton) -> str:
-    return f"0 to {automaton.n_outcomes - 1}" if automaton.counts else "0 and 1"
 
 
 def demand_one_shot(shots: int) -> None:

@@ -1,16 +1,16 @@
-"""What an automaton does on given objects, exactly: no trials, no sampling error.
+"""An automaton, its light on given objects and a detector's law in; what its walks do, exactly, out: no trials, no sampling error.
 
-Owns the sums over all walks. P(node | object) is carried forward slot by slot, alpha(s') = sum of alpha(s) P(outcome | s, object) over the
-edges into s', in float64, whether the outcomes are clicks, photon numbers or the clicks of several channels, which are independent given
-the object: every state is at one depth, so that alpha is whole when its slot comes. Where the detector has afterpulses, a click depends on
-the click before: alpha is then carried for both outcomes of the last exposure; where they have a time constant, with the memory of each
-(remembering.py).
+P(node | object) is carried forward slot by slot, alpha(s') = sum of alpha(s) P(outcome | s, object) over the edges into s', in float64:
+every state is at one depth, so that alpha is whole when its slot comes. The clicks of several channels are independent given the object.
+Where the detector has afterpulses, a click depends on the click before: alpha is carried for both outcomes of the last exposure. Where they
+have a time constant, beside it stands the memory (detector/afterpulses.py) of the walks that came so, as the sums of its mean and of its
+mean square; where several walks meet, their moments are those of all of them together.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.detector import Afterpulses
+from pans.runtime.detector.afterpulses import LEAST_MEAN, SMALL_RATIO
 from pans.runtime.instrument.click_law import ClickLaw, CountLaw, both_chances, count_chances, log_no_click, outcomes_of
-
-from .remembering import Remembered
 
 NO_AFTERPULSES = Afterpulses(0.0)
 LEAF_NUMBERS_MAX = 1 << 27  # objects times leaves that are returned at once: 1 GiB
@@ -43,9 +42,7 @@ class ExpectedWalk:
     illumination: F64
     exposures: F64
     leaves: F64
-    ends: F64 | None = (
-        None  # (n, 2): mean and mean square of the carriers in traps behind a walk, where afterpulses have a time constant
-    )
+    ends: F64 | None = None  # (n, 2): mean and mean square of the carriers in traps behind a walk, with a time constant
 
 
 def expected_walk(
@@ -64,31 +61,35 @@ def expected_walk(
     time; `transmission` (n, pixels), 0 to 1. `law` is that of one whole exposure: dark counts and read noise come whatever the dwell.
     Of `afterpulses` without a time constant a click makes the next exposure click as well; the exposure before a walk is taken to have
     none (that of the last object's end is forgotten, at most one click in so many walks). With one, `begins` is the memory with which a
-    walk begins, mean and variance, and remembering.py says what is exact.
+    walk begins, mean and variance, and meeting walks share its moments.
     Of several channels `law` is that of each. ValueError for shapes that do not fit, a law of other outcomes than the automaton's, and
     afterpulses of a detector that counts or of several channels.
     """
     _check_arguments(automaton, patterns, transmission)
     _check_law(automaton, law, afterpulses)
     n, n_leaves = len(transmission), automaton.n_leaves
+    sums, leaves = np.zeros((4, n)), np.empty((n, n_leaves))
     ends = np.empty((n, 2)) if afterpulses.time else None
-    found = ExpectedWalk(np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, n_leaves)), ends)
     step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
-    slots, shown = _states_by_slot(automaton), patterns.sum(axis=1, dtype=np.float64) * photons_per_level
+    order = np.argsort(automaton.depth, kind="stable").astype(np.int64)
+    slots = np.split(order, np.searchsorted(automaton.depth[order], np.arange(1, automaton.n_slots)))
+    shown = patterns.sum(axis=1, dtype=np.float64) * photons_per_level
     for start in range(0, n, step):
         here = slice(start, min(start + step, n))
         light = pattern_light(patterns, transmission[here], photons_per_level)
-        walked: _Walked
-        if automaton.channels > 1 and isinstance(law, ClickLaw):
-            walked = _ByWords(automaton, law, len(light))
-        elif isinstance(law, CountLaw):
-            walked = _ByNumbers(automaton, law, len(light))
-        elif afterpulses.time:
-            walked = _ByMemory(Remembered(automaton, afterpulses, len(light), begins), law, automaton.n_states)
-        else:
-            walked = _ByClicks(automaton, law, len(light), afterpulses.probability)
-        _walk_block(automaton, slots, light, shown, walked, found, here)
-    return found
+        walks = _walks(automaton, law, afterpulses, len(light), begins)
+        for states in slots:
+            rows, share = automaton.rows[states], automaton.dwell[states] / automaton.dwell_steps
+            each = light[:, rows] * share[:, None]
+            reached, clicks = walks.leave(states, each)
+            sums[0, here] += clicks
+            sums[1, here] += (reached * each.sum(axis=2)).sum(axis=1)
+            sums[2, here] += reached @ (shown[rows].sum(axis=1) * share)
+            sums[3, here] += reached.sum(axis=1)
+        leaves[here] = walks.chance[:, :, automaton.n_states :].sum(axis=0)
+        if ends is not None and isinstance(walks, _RememberedWalks):
+            ends[here] = walks.sums.ends.T
+    return ExpectedWalk(sums[0], sums[1], sums[2], sums[3], leaves, ends)
 
 
 def _check_arguments(automaton: Automaton, patterns: NDArray[Any], transmission: NDArray[Any]) -> None:
@@ -115,12 +116,6 @@ def _check_law(automaton: Automaton, law: ClickLaw | CountLaw, afterpulses: Afte
         )
 
 
-def _states_by_slot(automaton: Automaton) -> list[NDArray[np.int64]]:
-    order = np.argsort(automaton.depth, kind="stable").astype(np.int64)
-    ends = np.searchsorted(automaton.depth[order], np.arange(automaton.n_slots + 1))
-    return [order[ends[slot] : ends[slot + 1]] for slot in range(automaton.n_slots)]
-
-
 def pattern_light(patterns: NDArray[Any], transmission: NDArray[Any], scale: float) -> F64:
     """Return photoelectrons, float64 (objects, patterns), with the light on all the time; arguments as in `expected_walk`."""
     wide = transmission.astype(np.float64)
@@ -132,86 +127,38 @@ def pattern_light(patterns: NDArray[Any], transmission: NDArray[Any], scale: flo
     return light
 
 
-class _Walked(Protocol):
-    """The walks of some objects, carried on slot by slot."""
+def _walks(
+    automaton: Automaton, law: ClickLaw | CountLaw, afterpulses: Afterpulses, n: int, begins: tuple[float, float]
+) -> _Walks | _AfterpulsedWalks | _RememberedWalks:
+    if isinstance(law, ClickLaw) and afterpulses.time:
+        return _RememberedWalks(automaton, law, afterpulses, n, begins)
+    if isinstance(law, ClickLaw) and afterpulses.probability:
+        return _AfterpulsedWalks(automaton, law, afterpulses.probability, n)
+    return _Walks(automaton, law, n)
 
-    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
-        """Leave `states` (m,) of one slot, shown with `photoelectrons` (objects, m), of several channels (objects, m, channels).
 
-        Returns the chances with which the objects reached them (objects, m), and the expected clicks (objects,).
+class _Walks:
+    """Walks of n objects, carried on slot by slot, whose outcomes depend on nothing before; `chance` is (1, n, nodes)."""
+
+    def __init__(self, automaton: Automaton, law: ClickLaw | CountLaw, n: int) -> None:
+        self._automaton, self._law = automaton, law
+        self.chance = np.zeros((1, n, len(automaton.posteriors)))
+        self.chance[0, :, 0] = 1.0
+        numbers = range(automaton.n_outcomes)
+        self._clicks = np.array([number if automaton.counts else number.bit_count() for number in numbers], np.float64)
+
+    def leave(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
+        """Leave `states` (m,) of one slot, which give `photoelectrons` (n, m, channels).
+
+        Returns the chances with which the objects reached them (n, m), and the expected clicks (n,).
         """
-
-    def leaves(self) -> F64:
-        """The chance of each leaf, (objects, leaves)."""
-
-    def ends(self) -> F64 | None:
-        """Moments of the detector's memory behind a walk, (objects, 2), where it has one."""
-
-
-class _ByClicks:
-    """Walks by clicks, each of which may make the next exposure click too."""
-
-    def __init__(self, automaton: Automaton, law: ClickLaw, n: int, afterpulse: float) -> None:
-        self._automaton, self._law, self._afterpulse = automaton, law, afterpulse
-        self._alpha = np.zeros((2 if afterpulse else 1, n, len(automaton.posteriors)))
-        self._alpha[0, :, 0] = 1.0
-
-    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
-        alpha, afterpulse = self._alpha, self._afterpulse
-        reached = alpha[:, :, states].sum(axis=0)
-        click, miss = both_chances(self._law, photoelectrons)  # 1 - p would lose the digits of what is all but certain
-        clicked = alpha[-1][:, states] * (miss * afterpulse) if afterpulse else 0.0  # by afterpulses alone
-        pass_on(alpha, states, self._automaton.successors, (click, miss), afterpulse)
-        return reached, (reached * click + clicked).sum(axis=1)
-
-    def leaves(self) -> F64:
-        return np.asarray(self._alpha[:, :, self._automaton.n_states :].sum(axis=0))
-
-    def ends(self) -> None:
-        return None
-
-
-class _ByNumbers:
-    """Walks by photon numbers."""
-
-    def __init__(self, automaton: Automaton, law: CountLaw, n: int) -> None:
-        self._automaton, self._law = automaton, law
-        self._alpha = np.zeros((n, len(automaton.posteriors)))
-        self._alpha[:, 0] = 1.0
-
-    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
-        reached = self._alpha[:, states]
-        chances = count_chances(self._law, photoelectrons)
-        pass_counts_on(self._alpha, states, self._automaton.successors, chances)
-        return reached, (reached * np.tensordot(np.arange(len(chances)), chances, 1)).sum(axis=1)
-
-    def leaves(self) -> F64:
-        return self._alpha[:, self._automaton.n_states :]
-
-    def ends(self) -> None:
-        return None
-
-
-class _ByWords:
-    """Walks by the clicks of several channels at once."""
-
-    def __init__(self, automaton: Automaton, law: ClickLaw, n: int) -> None:
-        self._automaton, self._law = automaton, law
-        self._alpha = np.zeros((n, len(automaton.posteriors)))
-        self._alpha[:, 0] = 1.0
-
-    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
-        reached = self._alpha[:, states]
-        click, miss = both_chances(self._law, photoelectrons)
-        chances = word_chances(click, miss)
-        pass_counts_on(self._alpha, states, self._automaton.successors, chances)
-        return reached, (reached * click.sum(axis=2)).sum(axis=1)
-
-    def leaves(self) -> F64:
-        return self._alpha[:, self._automaton.n_states :]
-
-    def ends(self) -> None:
-        return None
+        reached = self.chance[0][:, states]
+        if isinstance(self._law, CountLaw):
+            chances = count_chances(self._law, photoelectrons[:, :, 0])
+        else:
+            chances = word_chances(*both_chances(self._law, photoelectrons))
+        _pass_on(self.chance[0], states, self._automaton.successors, chances)
+        return reached, (reached * np.tensordot(self._clicks, chances, 1)).sum(axis=1)
 
 
 def word_chances(click: F64, miss: F64) -> F64:
@@ -222,53 +169,61 @@ def word_chances(click: F64, miss: F64) -> F64:
     return chances
 
 
-class _ByMemory:
-    """Walks by clicks on a detector that remembers several exposures."""
+class _AfterpulsedWalks:
+    """Walks as `_Walks`, each click of which makes the next exposure click too, with a probability; `chance` is (2, n, nodes)."""
 
-    def __init__(self, walked: Remembered, law: ClickLaw, n_states: int) -> None:
-        self._walked, self._law, self._n_states = walked, law, n_states
+    def __init__(self, automaton: Automaton, law: ClickLaw, afterpulse: float, n: int) -> None:
+        self._automaton, self._law, self._afterpulse = automaton, law, afterpulse
+        self.chance = np.zeros((2, n, len(automaton.posteriors)))
+        self.chance[0, :, 0] = 1.0
 
-    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
-        return self._walked.go_on(states, -log_no_click(self._law, photoelectrons))
-
-    def leaves(self) -> F64:
-        return np.asarray(self._walked.chance[:, :, self._n_states :].sum(axis=0))
-
-    def ends(self) -> F64:
-        return self._walked.ends.T
+    def leave(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
+        """See `_Walks`."""
+        reached = self.chance[:, :, states]
+        click, miss = both_chances(self._law, photoelectrons[:, :, 0])
+        _pass_afterpulses_on(self.chance, states, self._automaton.successors, click, miss, self._afterpulse)
+        return reached.sum(axis=0), (reached.sum(axis=0) * click + reached[1] * miss * self._afterpulse).sum(axis=1)
 
 
-def _walk_block(
-    automaton: Automaton,
-    slots: list[NDArray[np.int64]],
-    light: F64,
-    shown: F64,
-    walked: _Walked,
-    found: ExpectedWalk,
-    here: slice,
-) -> None:
-    """Carry `walked` through all slots; `light` (objects, patterns) and `shown` (patterns,) of the patterns, lit all the time."""
-    sums = np.zeros((4, len(light)))
-    for states in slots:
-        rows = automaton.rows[states]
-        share = automaton.dwell[states] / automaton.dwell_steps
-        each = light[:, rows] * share[:, None]
-        photoelectrons = each[:, :, 0] if automaton.channels == 1 else each
-        reached, clicks = walked.go_on(states, photoelectrons)
-        sums[0] += clicks
-        sums[1] += (reached * each.sum(axis=2)).sum(axis=1)
-        sums[2] += reached @ (shown[rows].sum(axis=1) * share)
-        sums[3] += reached.sum(axis=1)
-    for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
-        total[here] = row
-    found.leaves[here] = walked.leaves()
-    ends = walked.ends()
-    if found.ends is not None and ends is not None:
-        found.ends[here] = ends
+class _Sums(NamedTuple):
+    """Chance of each node by the last outcome, its memory and squared memory, float64 (2, n, nodes); and what is left, (2, n)."""
+
+    chance: F64
+    memory: F64
+    squares: F64
+    ends: F64
+
+
+class _RememberedWalks:
+    """Walks as `_Walks` on a detector that remembers several exposures.
+
+    `begins` is the memory, mean and variance, with which every walk begins; the ends are the mean and the mean square of what is left
+    when the last slot of a walk is over. The slots behind its leaf are dark.
+    """
+
+    def __init__(
+        self, automaton: Automaton, law: ClickLaw, afterpulses: Afterpulses, n: int, begins: tuple[float, float]
+    ) -> None:
+        self._automaton, self._law, self._afterpulses = automaton, law, afterpulses
+        nodes = (2, n, len(automaton.posteriors))
+        self.sums = _Sums(np.zeros(nodes), np.zeros(nodes), np.zeros(nodes), np.zeros((2, n)))
+        self.chance = self.sums.chance
+        self.chance[0, :, 0], self.sums.memory[0, :, 0] = 1.0, begins[0]
+        self.sums.squares[0, :, 0] = begins[1] + begins[0] ** 2
+        self._of_law = np.array([*afterpulses.steps, afterpulses.dead])
+
+    def leave(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
+        """See `_Walks`."""
+        automaton, mean = self._automaton, -log_no_click(self._law, photoelectrons[:, :, 0])
+        reached, clicks = self.chance[:, :, states].sum(axis=0), np.zeros(len(mean))
+        behind = automaton.n_slots - 1 - int(automaton.depth[states[0]])
+        of_law = np.append(self._of_law, self._afterpulses.dark_flow(behind))
+        _pass_memory_on(self.sums, states, automaton.successors, mean, of_law, clicks)
+        return reached, clicks
 
 
 @njit(cache=True, nogil=True)
-def pass_counts_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], chances: F64) -> None:
+def _pass_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], chances: F64) -> None:
     """Add what leaves each of `states` (m,) to its successors: alpha (n, nodes), chances (outcomes, n, m)."""
     for i in range(alpha.shape[0]):
         for k in range(states.size):
@@ -278,20 +233,61 @@ def pass_counts_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np
 
 
 @njit(cache=True, nogil=True)
-def pass_on(
-    alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], chances: tuple[F64, F64], afterpulse: float
+def _pass_afterpulses_on(
+    alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], click: F64, miss: F64, afterpulse: float
 ) -> None:
-    """Add what leaves each of `states` (m,) to its successors: alpha (k, n, nodes), chances (n, m) of a click and of none.
-
-    alpha[1] is what came by a click, which `afterpulse` adds to the next; with k = 1 what was before makes no difference.
-    """
-    click, miss = chances
-    last = alpha.shape[0] - 1
-    for before in range(alpha.shape[0]):
+    """As `_pass_on`: alpha (2, n, nodes), whose second part came by a click, which `afterpulse` adds to the next; chances (n, m)."""
+    for before in range(2):
         stays = 1.0 - afterpulse * before
         for i in range(alpha.shape[1]):
             for k in range(states.size):
                 state = states[k]
                 reached = alpha[before, i, state]
                 alpha[0, i, successors[state, 0]] += reached * miss[i, k] * stays
-                alpha[last, i, successors[state, 1]] += reached * (click[i, k] + miss[i, k] * (1.0 - stays))
+                alpha[1, i, successors[state, 1]] += reached * (click[i, k] + miss[i, k] * (1.0 - stays))
+
+
+@njit(cache=True, nogil=True)
+def _pass_memory_on(sums, states, successors, mean, of_law, clicks):  # type: ignore[no-untyped-def]
+    """Add what leaves `states` (m,) to its successors in `sums`, with its memory, and the expected clicks to `clicks` (objects,).
+
+    of_law float64 (14,): the steps of `Afterpulses`, its dead time, and its flow through the slots behind. The same as `Afterpulses.after`.
+    """
+    chance, memory, squares, ends = sums
+    n_states = successors.shape[0]
+    to_x, of_m, spread_m, spread_x = of_law[0], of_law[1], of_law[2], of_law[3]
+    pause_x, pause_m, pause_spread_m, pause_spread_x = of_law[4], of_law[5], of_law[6], of_law[7]
+    seen, kept, dead, behind, behind_spread = of_law[8], of_law[9], of_law[11], of_law[12], of_law[13]
+    for before in range(2):
+        for i in range(mean.shape[0]):
+            for k in range(states.size):
+                state = states[k]
+                reached = chance[before, i, state]
+                if reached <= 0.0:
+                    continue
+                m, x = mean[i, k], memory[before, i, state] / reached
+                found, varied = m / (1.0 + dead * m), m / (1.0 + dead * m) ** 3
+                variance = max(squares[before, i, state] / reached - x * x, 0.0)
+                ratio = seen * variance / max(x, LEAST_MEAN)
+                sight = seen * x * (np.log1p(ratio) / ratio if ratio > SMALL_RATIO else 1.0 - ratio / 2.0)
+                click, fewer = -np.expm1(-(m + sight)), 1.0 / (1.0 + ratio)
+                silent_x, silent_v = x * kept * fewer, variance * (kept * fewer) ** 2
+                more_x = of_m * found + x * (to_x - kept) + x * kept * (1.0 - fewer)
+                more_v = spread_m * varied + spread_x * x + variance * (to_x**2 - (kept * fewer) ** 2)
+                for outcome in range(2):
+                    part, here, spread = reached * np.exp(-(m + sight)), silent_x, silent_v
+                    if outcome:
+                        part, chance_of = reached * click, max(click, LEAST_MEAN)
+                        here = silent_x + more_x / chance_of
+                        square = silent_x**2 + (more_v + more_x * (2.0 * silent_x + more_x)) / chance_of
+                        spread = max(silent_v + square - here**2, 0.0)
+                    spread = pause_x**2 * spread + pause_spread_m * varied + pause_spread_x * here
+                    here = pause_x * here + pause_m * found
+                    after = successors[state, outcome]
+                    chance[outcome, i, after] += part
+                    memory[outcome, i, after] += part * here
+                    squares[outcome, i, after] += part * (spread + here**2)
+                    if after >= n_states:
+                        ends[0, i] += part * behind * here
+                        ends[1, i] += part * (behind**2 * (spread + here**2) + behind_spread * here)
+                clicks[i] += reached * click

@@ -41,7 +41,7 @@ AUTOMATON_DTYPES = {
     "golden_walks": "<u4",
     "golden_posteriors": "<f4",
 }
-VERSIONS = (1, 2, 3, 4, 5, 6)
+VERSIONS = (1,)
 NEW_KEYS = {"sensor", "picture_shape", "outcomes"}
 AUTOMATON_KEYS = {"automaton", "expected"}
 KEYS = {"name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"}

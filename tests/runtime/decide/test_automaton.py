@@ -71,7 +71,7 @@ def test_what_cannot_answer_is_refused() -> None:
         make_decider(fixed, confidence=0.9)
     decider = make_decider(bundle, backend="automaton")
     for counts in ([2, 0, 0], [-1, 0, 0]):
-        with pytest.raises(UsageError, match="clicks of 0 or 1"):
+        with pytest.raises(UsageError, match="numbers of 0 to 1"):
             decider.decide(np.array(counts), 1)
         with pytest.raises(ValueError, match="counts run from"):
             decider.decide_batch([counts], 1)
