@@ -1,13 +1,16 @@
-"""The clicks behind each decision of recordings, and what the object was.
+"""Recordings, and labels from a CSV file, in; the clicks behind each decision with a known truth out.
 
-Owns the way from recordings to arrays: each is decided again, and its clicks are noted as the back end is asked. Decisions without
-trustworthy clicks (a gap, a wrong pattern, changed dark counts) are left out. Never fits anything.
+Each recording is decided again, and its clicks are noted as the back end is asked. Decisions without trustworthy clicks (a gap, a wrong
+pattern, changed dark counts) are left out. The file has lines `object,label`, or `recording,object,label` for several recordings; a label
+is a class name of the bundle, or its number; an empty one leaves the object out.
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
-from collections.abc import Iterable, Sequence
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,24 +19,93 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.container import MIB, open_regular
+from pans.runtime.container import MIB, open_regular, read_file
 from pans.runtime.core.decision import Decision, DecisionFlag
-from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
 from pans.runtime.record import Recording, read_recording, replay
 from pans.runtime.record.part_names import is_of_parts, parts_in
 from pans.runtime.record.replaying import ASKED, ClickLog
 from pans.runtime.wire.messages import MalformedMessage, MessageType, decode_welcome, unpack_body
 
-from .labels import Labels
-
+HEADS = (("object", "label"), ("recording", "object", "label"))
+ROWS_MAX = 1 << 20
+BYTES_MAX = 1 << 26
+OBJECT_MAX = (1 << 32) - 1
+_LABELS_REMEDY = (
+    "write one line `object,label` per object, the label a class name or its number, empty where it is unknown"
+)
 _TRUSTED = DecisionFlag.ABSTAINED | ASKED
 
 
-class Light(NamedTuple):
-    """Means per decision that a run's summary told, nan where it did not know."""
+class Labels(NamedTuple):
+    """Labels by object; `by_recording` by the recording's file name, whose only key is "" where the file names none."""
 
-    photons: float
-    illumination: float
+    by_recording: Mapping[str, Mapping[int, int | None]]
+    sha256: str
+
+    @property
+    def names_recordings(self) -> bool:
+        """Whether each line names its recording."""
+        return "" not in self.by_recording
+
+
+def read_labels(path: Path, classes: Sequence[str]) -> Labels:
+    """Return the labels in `path`; ConfigError, with the line, for a label out of range, an object twice, or another form."""
+    data = read_file(path, BYTES_MAX)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8: {error}", remedy=_LABELS_REMEDY) from error
+    rows = csv.reader(io.StringIO(text, newline=""))
+    try:
+        return Labels(_label_rows(path, rows, tuple(classes)), hashlib.sha256(data).hexdigest())
+    except csv.Error as error:
+        raise ConfigError(f"{path}:{rows.line_num}: no CSV: {error}", remedy=_LABELS_REMEDY) from error
+
+
+def _label_rows(path: Path, rows: Any, classes: tuple[str, ...]) -> dict[str, dict[int, int | None]]:
+    head = tuple(word.strip() for word in next(rows, []))
+    if head not in HEADS:
+        allowed = " or ".join(",".join(names) for names in HEADS)
+        raise ConfigError(
+            f"{path}:1: the first line is {ascii(','.join(head))[:80]}, allowed: {allowed}", remedy=_LABELS_REMEDY
+        )
+    found: dict[str, dict[int, int | None]] = {}
+    for count, row in enumerate(rows):
+        where = f"{path}:{rows.line_num}"
+        if not row:
+            continue
+        if len(row) != len(head) or count >= ROWS_MAX:
+            raise ConfigError(f"{where}: {len(row)} values, allowed: {len(head)}, in at most {ROWS_MAX} lines")
+        recording = row[0].strip() if len(head) == 3 else ""
+        object_id = _number(row[-2].strip(), where)
+        mine = found.setdefault(recording, {})
+        if object_id in mine:
+            raise ConfigError(f"{where}: object {object_id} has a label already", remedy="name each object once")
+        mine[object_id] = _label(row[-1].strip(), classes, where)
+    if not any(label is not None for mine in found.values() for label in mine.values()):
+        raise ConfigError(f"{path}: no object has a label", remedy=_LABELS_REMEDY)
+    return found
+
+
+def _number(word: str, where: str) -> int:
+    if not (word.isascii() and word.isdigit() and len(word) <= 10 and int(word) <= OBJECT_MAX):
+        raise ConfigError(f"{where}: the object is {ascii(word)[:40]}, allowed: whole numbers 0 to {OBJECT_MAX}")
+    return int(word)
+
+
+def _label(word: str, classes: tuple[str, ...], where: str) -> int | None:
+    if not word:
+        return None
+    if word in classes:
+        return classes.index(word)
+    if word.isascii() and word.isdigit() and len(word) <= 6 and int(word) < len(classes):
+        return int(word)
+    names = ", ".join(classes[:10]) + (", ..." if len(classes) > 10 else "")
+    raise ConfigError(
+        f"{where}: the label is {ascii(word)[:40]}, allowed: 0 to {len(classes) - 1}, or one of {names}",
+        remedy="name a class of the bundle (pans info BUNDLE lists them)",
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +119,8 @@ class Labelled:
     sources: tuple[dict[str, Any], ...]  # of the provenance: name, SHA-256 and decisions of each recording
     simulated: bool
     left_out: dict[str, int]
-    light: Light
+    photons: float  # means per decision of the summaries, nan where they do not know
+    illumination: float
 
 
 class _Read(NamedTuple):
@@ -73,8 +146,13 @@ def labelled_clicks(
     """
     files = [part for path in paths for part in (parts_in(path) if is_of_parts(path) else [path])]
     read = [_read(path, bundle, bundle_sha256, cycle) for path in files]
-    _demand_different(read)
-    _demand_same_shots(read)
+    for place, one in enumerate(read):
+        before = next((other for other in read[:place] if other.sha256 == one.sha256), None)
+        if before is not None:
+            raise UsageError(f"{one.path}: the same recording as {before.path}", remedy="name each recording once")
+    shots = {one.log.shots for one in read if one.log.counts}
+    if len(shots) > 1:
+        raise UsageError(f"recordings with {sorted(shots)} shots per decision", remedy="refit each --shots by itself")
     if labels is not None:
         _check_named(labels, read)
     truths, object_ids, counts, sources = [], [], [], []
@@ -102,10 +180,18 @@ def labelled_clicks(
             remedy="name the objects' classes with --labels FILE.csv (a simulated scene with labels names them itself)",
         )
     _demand_one_truth(truths, object_ids, [place for _, place in numbers])
+    summaries = [(one.recording.summary, len(one.log.counts)) for one in read]
     return Labelled(
-        np.stack(counts), np.array(truths), np.array(object_ids), read[0].log.shots, tuple(sources),
-        any(one.recording.simulated for one in read), left_out, _light(read),
-    )  # fmt: skip
+        np.stack(counts),
+        np.array(truths),
+        np.array(object_ids),
+        read[0].log.shots,
+        tuple(sources),
+        any(one.recording.simulated for one in read),
+        left_out,
+        _mean(summaries, "photons_mean"),
+        _mean(summaries, "illumination_mean", "illumination"),
+    )
 
 
 def _read(path: Path, bundle: Bundle, bundle_sha256: str, cycle: int) -> _Read:
@@ -151,20 +237,6 @@ def _scene_of(recording: Recording) -> tuple[int, str]:
         except MalformedMessage:
             continue
     return 0, ""
-
-
-def _demand_different(read: Iterable[_Read]) -> None:
-    seen: dict[str, Path] = {}
-    for one in read:
-        before = seen.setdefault(one.sha256, one.path)
-        if before is not one.path:
-            raise UsageError(f"{one.path}: the same recording as {before}", remedy="name each recording once")
-
-
-def _demand_same_shots(read: Sequence[_Read]) -> None:
-    shots = {one.log.shots for one in read if one.log.counts}
-    if len(shots) > 1:
-        raise UsageError(f"recordings with {sorted(shots)} shots per decision", remedy="refit each --shots by itself")
 
 
 def _check_named(labels: Labels, read: Sequence[_Read]) -> None:
@@ -221,14 +293,8 @@ def _demand_one_truth(truths: list[int], object_ids: list[int], places: list[int
             )
 
 
-def _light(read: Sequence[_Read]) -> Light:
-    """Means over the decisions of what the summaries say."""
-    weights = np.array([float(len(one.log.counts)) for one in read])
-
-    def mean(*names: str) -> float:
-        told = [next((s[name] for name in names if s.get(name) is not None), None) for s in summaries]
-        numbers = [float(value) if isinstance(value, int | float) else np.nan for value in told]
-        return float(np.average(numbers, weights=weights)) if weights.sum() else float("nan")
-
-    summaries = [one.recording.summary for one in read]
-    return Light(mean("photons_mean"), mean("illumination_mean", "illumination"))
+def _mean(summaries: Sequence[tuple[Mapping[str, Any], int]], *names: str) -> float:
+    """The mean over the decisions of the first of `names` that each summary has, nan where one has none."""
+    found = [next((s[name] for name in names if s.get(name) is not None), None) for s, _ in summaries]
+    values = [float(value) if isinstance(value, int | float) else np.nan for value in found]
+    return float(np.average(values, weights=[float(n) for _, n in summaries]))

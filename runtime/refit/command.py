@@ -1,23 +1,33 @@
-"""`pans refit`: what decides, corrected by recorded clicks of labelled objects of this instrument.
-
-Owns the command's arguments and files; what it reports is worded in words.py. The choice is choosing.py's, the new bundle rebuild.py's.
-"""
+"""`pans refit`: recordings and labels in; a bundle whose back end is corrected for this instrument, and a report, out."""
 
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, Command, add_new_bundle, emit
 from pans.runtime.errors import UsageError
+from pans.runtime.intervals import Z_95
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
 if TYPE_CHECKING:
+    from pans.runtime.bundle import Bundle
+
+    from .choosing import Estimate, Judged, Refitted
+    from .clicks import Labelled
+    from .evidence import Evidence
     from .rebuild import Rows
 
 CYCLE_RANGE = Range(1, 1 << 32, whole=True)
+_JUDGED = ("accuracy_old", "accuracy_new", "accuracy_gain", "log_loss_old", "log_loss_new", "log_loss_gain")
+_KEPT = (
+    *("chosen", "objects", "decisions", "objects_per_class", "simulated", "held_out"),
+    *("clicks_mean", "photons_mean", "illumination"),
+)
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -51,10 +61,8 @@ def _run(args: argparse.Namespace) -> int:
     path = bundle_path(args.bundle)
     check_outputs([args.out], inputs=[path, *args.recordings, args.labels], force=args.force)
     from .choosing import choose, judge, kinds_for
-    from .clicks import labelled_clicks
-    from .labels import read_labels
+    from .clicks import labelled_clicks, read_labels
     from .rebuild import rebuilt, rows_of
-    from .words import provenance_of, report_of, words_of
 
     bundle, sha256 = load_bundle(path)
     labels = None if args.labels is None else read_labels(args.labels, bundle.classes)
@@ -65,8 +73,8 @@ def _run(args: argparse.Namespace) -> int:
     if not kinds:
         raise UsageError(f"{bundle.n_classes} classes are too many to refit", remedy="refit bundles of fewer classes")
     found, judged = choose(rows.evidence, kinds), judge(rows.evidence, kinds)
-    report = report_of(bundle, clicks, rows.evidence, found, judged)
-    facts = provenance_of(bundle, sha256, clicks, None if labels is None else labels.sha256, report)
+    report = _report(bundle, clicks, rows.evidence, found, judged)
+    facts = _provenance(bundle, sha256, clicks, None if labels is None else labels.sha256, report)
     new = rebuilt(bundle, rows, found, clicks, facts)
     written = write_bundle(new.bundle, args.out, force=args.force)
     files = {"bundle": str(args.out), "sha256": written}
@@ -89,6 +97,108 @@ def _demand_enough(rows: Rows, classes: tuple[str, ...]) -> None:
             f"too few labelled objects, allowed: {PER_CLASS_MIN} or more of each class; there are {', '.join(few[:10])}{more}",
             remedy="record and label more objects",
         )
+
+
+def _report(bundle: Bundle, clicks: Labelled, evidence: Evidence, found: Refitted, judged: Judged) -> dict[str, Any]:
+    """The figures as JSON; `held_out` are those of the procedure on objects that it had not seen."""
+    import numpy as np
+
+    from .choosing import FOLDS, OLD
+
+    seen = np.bincount(evidence.classes, minlength=bundle.n_classes)
+    figures = {name: estimate_json(getattr(judged, name)) for name in _JUDGED}
+    curve = zip(judged.sizes, judged.curve)
+    return {
+        "chosen": found.name,
+        "changed": found.name != OLD,
+        "objects": evidence.n_objects,
+        "decisions": len(evidence.row),
+        "objects_per_class": dict(zip(bundle.classes, seen.tolist())),
+        "left_out": clicks.left_out,
+        "simulated": clicks.simulated,
+        "held_out": {"folds": FOLDS, **figures, "chosen": list(judged.chosen)},
+        "kinds": {name: {"log_loss_gain": gain, "error": error} for name, (gain, error) in found.trials.items()},
+        "learning_curve": [{"objects": size, **estimate_json(accuracy)} for size, accuracy in curve],
+        "clicks_mean": float(clicks.counts.sum(axis=1).mean()),
+        "photons_mean": _known(clicks.photons),
+        "illumination": _known(clicks.illumination),
+    }
+
+
+def _provenance(
+    bundle: Bundle, sha256: str, clicks: Labelled, labels_sha256: str | None, report: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Where the new bundle comes from."""
+    return {
+        "from_bundle_sha256": sha256,
+        "recordings": list(clicks.sources),
+        "labels_sha256": labels_sha256,
+        "shots": clicks.shots,
+        "expected_of_the_old_instrument": None if bundle.expected is None else dict(bundle.expected),
+        **{name: report[name] for name in _KEPT},
+    }
+
+
+def words_of(report: Mapping[str, Any]) -> str:
+    """Return the report in words."""
+    held = report["held_out"]
+    kind = "SIMULATED: " if report["simulated"] else ""
+    left = ", ".join(f"{count} {why}" for why, count in report["left_out"].items() if count)
+    lines = [
+        f"{kind}{report['objects']} labelled objects, {report['decisions']} decisions"
+        + (f" ({left}: left out)" if left else ""),
+        _outcome(report),
+        f"on objects held out ({held['folds']} folds; 95 % intervals):",
+        f"  accuracy  old {percent_words(held['accuracy_old'])}, new {percent_words(held['accuracy_new'])}, "
+        f"gain {percent_words(held['accuracy_gain'], '+')}",
+        f"  log loss  old {_plain(held['log_loss_old'])}, new {_plain(held['log_loss_new'])}, gain {_plain(held['log_loss_gain'])}",
+        f"  {light_words(report)} per decision",
+        "accuracy by the number of labelled objects: "
+        + ", ".join(f"{row['objects']}: {100 * row['value']:.1f} %" for row in report["learning_curve"]),
+        *report.get("notes", ()),
+        f"{report['bundle']}  SHA-256 {report['sha256'][:16]}",
+    ]
+    return "\n".join(lines)
+
+
+def _outcome(report: Mapping[str, Any]) -> str:
+    if not report["changed"]:
+        return "the old back end stays: no correction is clearly better on objects held out"
+    slots = report.get("slots_corrected", 0)
+    also = f", and of the states after {slots} of the exposures" if slots else ""
+    return f"corrected: {report['chosen']}{also}"
+
+
+def estimate_json(found: Estimate) -> dict[str, float | None]:
+    """Return an estimate with its 95 % interval; None for what is not known."""
+    half = Z_95 * found.error
+    return {
+        "value": _known(found.value),
+        "low": _known(found.value - half),
+        "high": _known(found.value + half),
+        "error": _known(found.error),
+    }
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def percent_words(found: Mapping[str, float], sign: str = "") -> str:
+    """Return an accuracy and its interval in words; with `sign` "+" a gain."""
+    value, low, high = (format(100 * found[name] + 0.0, f"{sign}.1f") for name in ("value", "low", "high"))
+    return f"{value} ({low} to {high}) %"
+
+
+def light_words(figures: Mapping[str, Any]) -> str:
+    """Return `clicks_mean`, `photons_mean` (None: unknown) and `illumination` of `figures` in words."""
+    found = (figures["clicks_mean"], figures["photons_mean"], figures["illumination"])
+    clicks, photons, light = ("unknown" if value is None else f"{value:.4g}" for value in found)
+    return f"at {clicks} clicks, {photons} photons, illumination {light}"
+
+
+def _plain(found: Mapping[str, float]) -> str:
+    return f"{found['value']:.3f} ({found['low']:.3f} to {found['high']:.3f})"
 
 
 REFIT = Command(

@@ -1,12 +1,16 @@
-"""Labelled clicks as numbers: which row of scores each decision came to, what the object was, and which decisions share an object.
+"""Labelled clicks in; posteriors of single rows, and corrections of scores that are linear in them, out.
 
-Owns the weights (each object counts once, however often it was shown), the folds and the losses per object, and the posteriors of single
-rows, drawn from what was seen there towards what is believed of all:
+Each object counts once, however often it was shown. The posterior of a row is drawn from what was seen there towards what is believed:
 
     posterior(c) = (seen(c) + kappa * believed(c)) / (seen + kappa)
 
-Kappa, the objects that the belief is worth, is that of greatest marginal likelihood of the counts (Dirichlet-multinomial). Where rows
-agree with the belief, kappa is large and nothing changes. Never fits a head and never reads a file.
+Kappa, the objects that the belief is worth, is that of greatest marginal likelihood of the counts (Dirichlet-multinomial). A correction is
+
+    new score = old score + bias + A (old score) + B (clicks)
+
+A change of the click rates of class c, from p to p' under pattern i, changes the log likelihood of independent clicks by exactly a term
+linear in them: B has its place there. Each block (bias, A, B) has a Gaussian prior around zero; its width is that of greatest marginal
+likelihood, by Laplace's approximation (D. MacKay, "Bayesian interpolation", Neural Computation 4, 415, 1992).
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +27,14 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 KAPPAS = np.exp(np.arange(0.0, 10.0, 0.5))  # objects; beyond, no row of a few thousand objects moves by a hundredth
-_log_gamma = np.vectorize(math.lgamma, otypes=[np.float64])
+PRECISION_RANGE = (1e-2, 1e6)  # of a prior: a score moves by 10 at the one end and by a thousandth at the other
+_FIRST_PRECISION = 10.0
+_ROUNDS, _STEPS, _LAST_STEPS = 12, 4, 30  # of the prior's width; Newton steps in a round, and at the end
+_SETTLED = 0.05  # change of the logarithm of a precision that ends the search
+_ROWS_AT_ONCE = 4096  # of the Hessian: 50 MB at most
+_FLAT = 1e-9  # variance of a feature that says nothing
 _LEAST = 1e-12  # of a belief
+_log_gamma = np.vectorize(math.lgamma, otypes=[np.float64])
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +46,6 @@ class Evidence:
     row: I64  # (n,)
     truth: I64  # (n,)
     object_id: I64  # (n,): the object, 0..objects-1; an object has one truth
-    shots: int = 1  # of a decision, whose mean `clicks` are
 
     @property
     def n_classes(self) -> int:
@@ -87,19 +96,13 @@ class Evidence:
 
 
 def evidence_of(
-    scores: NDArray[Any],
-    clicks: NDArray[Any],
-    row: NDArray[Any],
-    truth: NDArray[Any],
-    object_id: NDArray[Any],
-    shots: int = 1,
+    scores: NDArray[Any], clicks: NDArray[Any], row: NDArray[Any], truth: NDArray[Any], object_id: NDArray[Any]
 ) -> Evidence:
     """Return the evidence with scores centred on each row's mean, in float64, and objects numbered without gaps."""
     wide = np.asarray(scores, np.float64)
-    _, numbers = np.unique(object_id, return_inverse=True)
     centred = wide - wide.mean(axis=1, keepdims=True)
-    wide_clicks = np.asarray(clicks, np.float64)
-    return Evidence(centred, wide_clicks, row.astype(np.int64), truth.astype(np.int64), numbers, shots)
+    numbers = np.unique(object_id, return_inverse=True)[1]
+    return Evidence(centred, np.asarray(clicks, np.float64), row.astype(np.int64), truth.astype(np.int64), numbers)
 
 
 def log_softmax(scores: F64) -> F64:
@@ -131,3 +134,138 @@ def log_likelihood(believed: F64, counts: F64, kappa: float) -> float:
     seen = total[total > 0]
     per_class = _log_gamma(counts[row, label] + weight) - _log_gamma(weight)
     return float(per_class.sum() - (_log_gamma(seen + kappa) - math.lgamma(kappa)).sum())
+
+
+# ---- corrections ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """`gain` (features, classes) and `offset` (classes,): added to the scores are `features @ gain + offset`."""
+
+    blocks: tuple[str, ...]
+    gain: F64
+    offset: F64
+    precision: F64  # of the prior of each block, for standardised features
+
+    def apply(self, scores: F64, clicks: F64) -> F64:
+        """Return the corrected scores of centred `scores` (n, classes) and `clicks` (n, d_f)."""
+        return scores + _raw_features(self.blocks, scores, clicks) @ self.gain + self.offset
+
+
+class _Standard(NamedTuple):
+    """Features of mean 0 and variance 1 over what was seen, the bias first; `block` is the number of each one's block."""
+
+    features: F64
+    mean: F64
+    scale: F64
+    block: I64
+
+
+class Prior(NamedTuple):
+    """What a fit begins with, and leaves to one on nearly the same data: precisions (blocks,) and weights (1 + features, classes)."""
+
+    precision: F64
+    weights: F64
+
+
+def fit(
+    blocks: tuple[str, ...], scores: F64, clicks: F64, counts: F64, prior: Prior | None = None
+) -> tuple[Correction, Prior]:
+    """Fit the `blocks` to `counts` (rows, classes) of rows with `scores` and `clicks`; `prior` fixes the precisions."""
+    standard = _standardised(blocks, scores, clicks, counts)
+    if prior is None:
+        prior = _widest_likelihood(standard, scores, counts)
+    weights, _ = _maximised(standard, scores, counts, prior, _LAST_STEPS)
+    gain = weights[1:] / standard.scale[:, None]
+    return Correction(blocks, gain, weights[0] - standard.mean @ gain, prior.precision), Prior(prior.precision, weights)
+
+
+def n_parameters(blocks: tuple[str, ...], n_classes: int, n_clicks: int) -> int:
+    """Return how many numbers a correction has."""
+    sizes = {"bias": 1, "scores": n_classes, "clicks": n_clicks}
+    return n_classes * sum(sizes[block] for block in blocks)
+
+
+def _raw_features(blocks: tuple[str, ...], scores: F64, clicks: F64) -> F64:
+    parts = {"scores": scores, "clicks": clicks}
+    chosen = [parts[block] for block in blocks if block != "bias"]
+    return np.concatenate(chosen, axis=1) if chosen else np.zeros((len(scores), 0))
+
+
+def _standardised(blocks: tuple[str, ...], scores: F64, clicks: F64, counts: F64) -> _Standard:
+    raw = _raw_features(blocks, scores, clicks)
+    weight = counts.sum(axis=1) / counts.sum()
+    mean = weight @ raw
+    variance = weight @ (raw - mean) ** 2
+    scale = np.where(variance > _FLAT, np.sqrt(variance + _FLAT), np.inf)  # what never varies keeps a gain of 0
+    features = np.concatenate([np.ones((len(raw), 1)), (raw - mean) / scale], axis=1)
+    sizes = {"bias": 1, "scores": scores.shape[1], "clicks": clicks.shape[1]}
+    block = np.repeat(np.arange(len(blocks)), [sizes[name] for name in blocks])
+    return _Standard(features, mean, scale, block)
+
+
+def _widest_likelihood(standard: _Standard, scores: F64, counts: F64) -> Prior:
+    """Return the precisions of greatest marginal likelihood, and the weights there."""
+    n_blocks, n_classes = int(standard.block.max()) + 1, counts.shape[1]
+    found = Prior(np.full(n_blocks, _FIRST_PRECISION), np.zeros((len(standard.block), n_classes)))
+    for _ in range(_ROUNDS):
+        weights, hessian = _maximised(standard, scores, counts, found, _STEPS)
+        variance = np.diag(np.linalg.inv(hessian)).reshape(weights.shape)
+        precision = np.empty(n_blocks)
+        for block in range(n_blocks):
+            of_block = standard.block == block
+            measured = of_block.sum() * n_classes - found.precision[block] * variance[of_block].sum()
+            precision[block] = max(measured, _FLAT) / max((weights[of_block] ** 2).sum(), _FLAT)
+        precision = precision.clip(*PRECISION_RANGE)
+        settled = np.abs(np.log(precision / found.precision)).max() < _SETTLED
+        found = Prior(precision, weights)
+        if settled:
+            break
+    return found
+
+
+def _maximised(standard: _Standard, scores: F64, counts: F64, prior: Prior, steps: int) -> tuple[F64, F64]:
+    """Return the weights of greatest posterior density by Newton's method, from the prior's, and the Hessian of the last step."""
+    features, weights = standard.features, prior.weights
+    precision = prior.precision[standard.block]
+    total = counts.sum(axis=1)
+
+    def loss_at(weights: F64) -> tuple[float, F64]:
+        logs = log_softmax(scores + features @ weights)
+        return float(-(counts * logs).sum() + 0.5 * (precision[:, None] * weights**2).sum()), logs
+
+    loss, logs = loss_at(weights)
+    hessian = np.zeros((0, 0))
+    for _ in range(steps):
+        chance = np.exp(logs)
+        slope = features.T @ (total[:, None] * chance - counts) + precision[:, None] * weights
+        hessian = _hessian(features, total, chance, precision)
+        step = np.linalg.solve(hessian, slope.ravel()).reshape(weights.shape)
+        wanted, length = float((step * slope).sum()), 1.0
+        after, logs_after = loss_at(weights - step)
+        while after > loss - 1e-4 * length * wanted and length > 1e-6:
+            length /= 2
+            after, logs_after = loss_at(weights - length * step)
+        if after >= loss:
+            break
+        weights, gained, loss, logs = weights - length * step, loss - after, after, logs_after
+        if gained < 1e-9 * total.sum():
+            break
+    return weights, hessian
+
+
+def _hessian(features: F64, total: F64, chance: F64, precision: F64) -> F64:
+    """Second derivatives by all weights, (size, size): the sum over rows of n (diag(p) - p p^T), taken with the features."""
+    n_features, n_classes = features.shape[1], chance.shape[1]
+    flat: NDArray[np.float64] = np.zeros((n_features * n_classes, n_features * n_classes))
+    found = flat.reshape(n_features, n_classes, n_features, n_classes)
+    for start in range(0, len(features), _ROWS_AT_ONCE):
+        part = slice(start, start + _ROWS_AT_ONCE)
+        x, p, n = features[part], chance[part], total[part]
+        both = (x[:, :, None] * p[:, None, :]).reshape(len(x), -1)
+        flat -= (both * n[:, None]).T @ both
+        for label in range(n_classes):
+            found[:, label, :, label] += (x * (n * p[:, label])[:, None]).T @ x
+    flat[np.diag_indices(len(flat))] += np.repeat(precision, n_classes)
+    return flat

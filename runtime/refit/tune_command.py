@@ -1,26 +1,25 @@
-"""`pans tune`: patterns adjusted on the instrument itself, by the clicks of labelled objects.
-
-Owns the command's arguments, files and exit codes; the search is search.py's, a whole tuning tuning.py's.
-"""
+"""`pans tune`: a bundle, a device and labels in; patterns adjusted on the instrument itself, and a report, out."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_new_bundle, emit
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
-from .moves import BENDS
+from .command import light_words, percent_words
 
 PARTS = {
     "shift": ("right_px", "down_px"),
     "rotation": ("rotation_deg",),
     "scale": ("scale",),
-    "bends": BENDS,
+    "bends": ("stretch_px", "shear_px", "keystone_right_px", "keystone_down_px"),
     "brightness": ("brightness",),
 }
 USUAL = "shift,rotation,scale"
@@ -81,9 +80,7 @@ def _run(args: argparse.Namespace) -> int:
     from pans.runtime.instrument.profile import load_profile
     from pans.runtime.live.continuous import stop_signals
 
-    from .search import Budget
-    from .trial import Bench
-    from .tuning import Tuning, words_of
+    from .tune import Bench, Budget, Tuning
 
     bundle, sha256 = load_bundle(path)
     _demand_tunable(bundle.analyser is not None, bundle.picture_shape is not None, bundle.name)
@@ -101,11 +98,11 @@ def _run(args: argparse.Namespace) -> int:
             "parameters": list(names),
         }
         tuning = Tuning(bench, names, Budget(args.photons, 60 * args.minutes), checkpoint, facts)
-        tuned = tuning.run(resume=args.resume)
-        written = write_bundle(tuned.bundle, args.out, force=replaces)
-    payload = {"bundle": str(args.out), "sha256": written, "checkpoint": str(checkpoint), **tuned.report}
-    emit(args, payload, words_of(payload))
-    return EXIT_INTERRUPTED if tuned.report["interrupted"] else EXIT_FINE
+        tuned, report = tuning.run(resume=args.resume)
+        written = write_bundle(tuned, args.out, force=replaces)
+    payload = {"bundle": str(args.out), "sha256": written, "checkpoint": str(checkpoint), **report}
+    emit(args, payload, _words_of(payload))
+    return EXIT_INTERRUPTED if report["interrupted"] else EXIT_FINE
 
 
 def _parameters(parts: str) -> tuple[str, ...]:
@@ -132,7 +129,7 @@ def _profile_of(device: str) -> str:
 def _labels(args: argparse.Namespace, classes: tuple[str, ...]) -> tuple[dict[int, int | None] | None, str | None]:
     if args.labels is None:
         return None, None
-    from .labels import read_labels
+    from .clicks import read_labels
 
     found = read_labels(args.labels, classes)
     if found.names_recordings:
@@ -141,7 +138,7 @@ def _labels(args: argparse.Namespace, classes: tuple[str, ...]) -> tuple[dict[in
 
 
 def _count(device: str, labels: dict[int, int | None] | None) -> int:
-    from .trial import scene_size
+    from .tune import scene_size
 
     found = max(labels) + 1 if labels else scene_size(device)
     if found < OBJECTS_RANGE.low:
@@ -150,6 +147,35 @@ def _count(device: str, labels: dict[int, int | None] | None) -> int:
             remedy="say with --objects how many pass in one trial",
         )
     return min(found, OBJECTS_USUAL)
+
+
+def _words_of(report: Mapping[str, Any]) -> str:
+    """Return the report in words."""
+    kind = "SIMULATED: " if report["simulated"] else ""
+    from .tune import Move
+
+    move = Move(**report["move"])
+    spent = report["spent"]
+    lines = [
+        f"{kind}{report['trials']} trials of {report['objects']} objects, {report['accepted']} steps taken: {move.words()}",
+        f"ended: {report['ended']}; {spent['photons_or_clicks']:.4g} photons and "
+        f"{spent['instrument_minutes']:.3g} minutes of the instrument",
+    ]
+    if report["resolution"] is not None:
+        lines.append(f"with these objects a step is seen from a gain of {report['resolution']:.2g} in log loss on")
+    compared = report["comparison"]
+    if compared is None:
+        lines.append("not compared: the old patterns stay" if not report["changed"] else "not compared: interrupted")
+    else:
+        for name in ("old", "new"):
+            here = compared["held_out"][f"accuracy_{name}"]
+            lines.append(
+                f"  {name}  held out {percent_words(here)}, all objects {percent_words(compared['all_objects'][f'accuracy_{name}'])} "
+                f"{light_words(compared[name])}"
+            )
+        if not report["changed"]:
+            lines.append("the old patterns stay: the new ones are not better on fresh clicks")
+    return "\n".join([*lines, f"{report['bundle']}  SHA-256 {report['sha256'][:16]}"])
 
 
 TUNE = Command(

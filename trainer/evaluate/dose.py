@@ -26,7 +26,7 @@ from pans.runtime.bundle.layers import Layer, read_layers
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.imaging import NO_BLEACHING
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.refit.onnx_chain import chain_onnx
+from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.tasks.registry import Objects
 
 from .accuracy import EXACT_OUTCOMES_MAX, Measured, light_of

@@ -25,7 +25,7 @@ from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, mean_left, met
 from pans.runtime.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.refit.onnx_chain import chain_onnx
+from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import demand_sequence, outcome_law_of
 from pans.trainer.evaluate.dose import demand_fixed_patterns
 from pans.trainer.evaluate.information import mutual_information_bits

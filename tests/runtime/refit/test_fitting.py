@@ -8,9 +8,8 @@ import onnxruntime
 import pytest
 
 from pans.runtime.bundle.layers import Layer, read_layers, reference_scores
-from pans.runtime.refit.evidence import KAPPAS, best_kappa, log_likelihood, log_softmax, shrunk
-from pans.runtime.refit.loglinear import fit
-from pans.runtime.refit.onnx_chain import chain_onnx, corrected_layers
+from pans.runtime.refit.evidence import KAPPAS, best_kappa, fit, log_likelihood, log_softmax, shrunk
+from pans.runtime.refit.rebuild import chain_onnx, corrected_layers
 
 BLOCKS = ("bias", "scores", "clicks")
 

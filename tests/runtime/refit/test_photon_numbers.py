@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +14,7 @@ from heads import affine_head
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide import make_decider
 from pans.runtime.refit.choosing import Kind, fitted
-from pans.runtime.refit.clicks import Labelled, Light
-from pans.runtime.refit.eigentasks import eigentasks
+from pans.runtime.refit.clicks import Labelled
 from pans.runtime.refit.rebuild import rebuilt, rows_of
 
 OUTCOMES, D_F, SHOWN = 4, 3, 3000
@@ -40,7 +38,7 @@ def drawn(shots: int = 1, seed: int = 1) -> Labelled:
     truth = np.arange(SHOWN) % 2
     upto = CHANCES[truth].cumsum(axis=2)
     counts = sum((rng.random((SHOWN, D_F))[:, :, None] >= upto[:, :, :-1]).sum(axis=2) for _ in range(shots))
-    return Labelled(np.asarray(counts), truth, np.arange(SHOWN), shots, (), True, {}, Light(math.nan, math.nan))
+    return Labelled(np.asarray(counts), truth, np.arange(SHOWN), shots, (), True, {}, math.nan, math.nan)
 
 
 def accuracy(bundle: Bundle) -> float:
@@ -85,14 +83,6 @@ def test_several_shots_are_refitted_through_the_head_and_claim_no_noise() -> Non
     clicks = drawn(shots=3)
     rows = rows_of(wrong_bundle("head"), clicks)
     assert np.allclose(rows.evidence.clicks[rows.evidence.row], clicks.counts / 9)
-    assert eigentasks(rows.evidence) is None  # the binomial variance would be wrong of photon numbers
-    ordinary: dict[str, Any] = {"head_onnx": affine_head(np.eye(3, 2, dtype=np.float32), np.zeros(2, np.float32))}
-    of_clicks = rows_of(made_bundle(D_F, 2, **ordinary), Labelled(np.minimum(clicks.counts, 3), *_others(clicks)))
-    assert eigentasks(of_clicks.evidence) is not None
-
-
-def _others(clicks: Labelled) -> tuple[Any, ...]:
-    return (clicks.truth, clicks.object_id, clicks.shots, (), True, {}, clicks.light)
 
 
 def test_an_automaton_over_numbers_comes_near_the_exact_posteriors() -> None:
@@ -104,7 +94,7 @@ def test_an_automaton_over_numbers_comes_near_the_exact_posteriors() -> None:
     truth = np.arange(4000) % 2
     upto = rates[truth].cumsum(axis=2)[:, :, :-1]
     counts = (rng.random((4000, automaton.n_slots))[:, :, None] >= upto).sum(axis=2)
-    clicks = Labelled(counts, truth, np.arange(4000), 1, (), True, {}, Light(math.nan, math.nan))
+    clicks = Labelled(counts, truth, np.arange(4000), 1, (), True, {}, math.nan, math.nan)
     rows = rows_of(bundle, clicks)
     found = fitted(rows.evidence, Kind(("bias",), rows=True), np.ones(4000, bool))
     new = rebuilt(bundle, rows, found, clicks, {}).bundle.automaton

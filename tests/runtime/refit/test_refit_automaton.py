@@ -6,7 +6,7 @@ import pytest
 from pans.firmware_sim.testing import small_automaton_bundle
 from pans.runtime.bundle.automaton import walk_nodes
 from pans.runtime.refit.choosing import choose, kinds_for
-from pans.runtime.refit.clicks import Labelled, Light
+from pans.runtime.refit.clicks import Labelled
 from pans.runtime.refit.evidence import log_softmax
 from pans.runtime.refit.rebuild import rebuilt, rows_of
 
@@ -16,7 +16,7 @@ def walks(bundle, rates, objects: int, seed: int) -> Labelled:
     rng = np.random.default_rng(seed)
     truth = rng.integers(0, bundle.n_classes, objects)
     words = (rng.random((objects, bundle.n_features)) < rates[truth]).astype(np.int64)
-    return Labelled(words, truth, np.arange(objects), 1, (), True, {}, Light(1.0, 1.0))
+    return Labelled(words, truth, np.arange(objects), 1, (), True, {}, 1.0, 1.0)
 
 
 def exact_posteriors(automaton, rates):

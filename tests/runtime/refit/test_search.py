@@ -8,8 +8,7 @@ import pytest
 from pans.firmware_sim.testing import small_automaton_bundle
 from pans.runtime.bundle import load_bundle
 from pans.runtime.errors import DamagedFileError, PlanError
-from pans.runtime.refit.moves import BENDS, STILL, Move, moved
-from pans.runtime.refit.search import Budget, Cost, Search, Step, paired
+from pans.runtime.refit.tune import BENDS, STILL, Budget, Cost, Move, Search, Step, moved, paired
 
 NAMES = ("right_px", "down_px", "rotation_deg")
 HARD = np.random.default_rng(0).exponential(size=1000)

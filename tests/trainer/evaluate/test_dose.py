@@ -15,7 +15,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.refit.onnx_chain import chain_onnx
+from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.dose import (
     Knowledge,

@@ -16,7 +16,7 @@ from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.refit.onnx_chain import chain_onnx
+from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.dose import dose_curve, of_first, training_readings
 from pans.trainer.evaluate.held_out import Conditions, HeldOut
