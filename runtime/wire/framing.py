@@ -1,22 +1,25 @@
 """Framing: COBS and CRC-32 around every message, and the decoder that resynchronises after any garbage; sans-I/O.
 
-Owns the way from bytes to whole frames; never looks into a payload. `FrameDecoder.feed` returns frames whose CRC was right and counts
-what was damaged: damage is a measurement, not a failure.
+`encode_frame` returns the bytes of one frame. `FrameDecoder.feed` returns frames whose CRC was right and counts what was damaged: damage
+is a measurement, not a failure. Its kernels are loaded when the first decoder is made.
 """
 
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
+import numpy.typing as npt
 
-from .frame import DecoderCounters, Frame, unpack_body
+from .frame import DecoderCounters, Frame
 from .schema import HEADER, MAX_FRAME_BYTES, MAX_PAYLOAD_BYTES, SCHEMA, UNSEEDED, MalformedMessage
 
-if TYPE_CHECKING:
-    from .bulk import BulkDecoder
+CHUNK_BYTES = 1 << 18  # decoded at a time: large against a frame, small against a level-2 cache
+SMALLEST_FRAME_BYTES = 14  # on the wire: header, CRC, a code byte and the delimiter
 
+U8 = npt.NDArray[np.uint8]
+I64 = npt.NDArray[np.int64]
 
 _LONG = 512  # from about here on arrays are quicker: ten microseconds in any case
 _CODES = tuple(bytes((length + 1,)) for length in range(254))
@@ -46,30 +49,6 @@ def cobs_encode(data: bytes) -> bytes:
     return bytes(out)
 
 
-def cobs_decode(data: bytes) -> bytes | None:
-    """Invert `cobs_encode`; None when `data` (without its delimiter) is no COBS string."""
-    size, plain, position = len(data), bytearray(data), 0
-    while position < size:  # in place: every code byte becomes the zero before its group
-        code = plain[position]
-        if code == 0 or code == 0xFF:  # damage, or a group without a zero
-            break
-        plain[position] = 0
-        position += code
-    else:
-        return bytes(plain[1:]) if position == size else None
-    out, position = bytearray(), 0
-    while position < size:
-        code = data[position]
-        end = position + code
-        if code == 0 or end > size:
-            return None
-        out += data[position + 1 : end]
-        position = end
-        if code != 0xFF and position < size:
-            out.append(0)
-    return bytes(out)
-
-
 def encode_frame(message_type: int, payload: bytes, session: int, flags: int = 0) -> bytes:
     """Return one frame ready to send, delimiter included; `MalformedMessage` above MAX_PAYLOAD_BYTES."""
     if len(payload) > MAX_PAYLOAD_BYTES:
@@ -81,79 +60,88 @@ def encode_frame(message_type: int, payload: bytes, session: int, flags: int = 0
 
 
 class FrameDecoder:
-    """Incremental decoder of one direction of a link; holds at most MAX_FRAME_BYTES and resynchronises at every delimiter."""
+    """Incremental decoder of one direction of a link; it resynchronises at every delimiter.
+
+    Memory is MAX_FRAME_BYTES and one chunk, allocated here.
+    """
 
     def __init__(self) -> None:
-        self._counters = DecoderCounters()
-        self._buffer = bytearray()
-        self._skipping = False
-        self._bulk: BulkDecoder | None = None
+        from . import kernels  # numba is loaded only by who decodes
+
+        self._kernels = kernels
+        self._raw = bytearray(MAX_FRAME_BYTES + CHUNK_BYTES)
+        self.buffer: U8 = np.frombuffer(self._raw, np.uint8)
+        self.buffer[:] = 0  # touched: else each page is a fault when it is first used
+        self._view = memoryview(self._raw)
+        self._bodies: I64 = np.full((len(self.buffer) // SMALLEST_FRAME_BYTES + 1, 2), 0, np.int64)
+        self._tally: I64 = np.zeros(kernels.N_TALLIES, np.int64)
 
     @property
     def counters(self) -> DecoderCounters:
         """What has been seen since the decoder was made."""
-        return self._counters if self._bulk is None else self._bulk.counters
+        kernels, tally = self._kernels, self._tally.tolist()
+        return DecoderCounters(
+            frames=tally[kernels.FRAMES],
+            bytes_in=tally[kernels.BYTES_IN],
+            crc_errors=tally[kernels.CRC_ERRORS],
+            cobs_errors=tally[kernels.COBS_ERRORS],
+            short_frames=tally[kernels.SHORT_FRAMES],
+            oversized_frames=tally[kernels.OVERSIZED],
+            bytes_discarded=tally[kernels.DISCARDED],
+        )
+
+    @property
+    def arrays(self) -> tuple[U8, I64, I64]:
+        """The buffer, the spans of its bodies and the tally: what compiled code continues (turn/kernels.py)."""
+        return self.buffer, self._bodies, self._tally
 
     @property
     def held_bytes(self) -> int:
         """Bytes of a frame whose delimiter has not come yet."""
-        return len(self._buffer) if self._bulk is None else self._bulk.held_bytes
-
-    @property
-    def bulk(self) -> BulkDecoder | None:
-        """The compiled decoder that does the work since `use_kernels`; None before it."""
-        return self._bulk
-
-    def use_kernels(self) -> None:
-        """Decode in compiled kernels from here on: before arming, since loading them takes time and Python's loops would show."""
-        if self._bulk is None:
-            from .bulk import BulkDecoder  # numba is loaded only for those who need it
-
-            bulk = BulkDecoder()
-            bulk.warm_up()
-            bulk.resume(self._counters, bytes(self._buffer), self._skipping)
-            self._bulk = bulk
+        return int(self._tally[self._kernels.HELD])
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
         """Return the frames that `data` completes, in order; damaged ones are counted and dropped."""
-        if self._bulk is not None:
-            return self._bulk.feed(data)
-        self._counters.bytes_in += len(data)
-        *ended, rest = bytes(data).split(b"\0")
-        frames: list[Frame] = []
-        for piece in ended:
-            self._append(piece)
-            if not self._skipping and self._buffer:
-                frame = self._decode(bytes(self._buffer))
-                if frame is not None:
-                    frames.append(frame)
-            self._buffer.clear()
-            self._skipping = False
-        self._append(rest)
-        return frames
+        return [self.frame(first, stop) for spans in self.bodies(data) for first, stop in spans.tolist()]
 
-    def _append(self, piece: bytes) -> None:
-        if self._skipping:
-            self._counters.bytes_discarded += len(piece)
-        elif len(self._buffer) + len(piece) > MAX_FRAME_BYTES:
-            self._counters.oversized_frames += 1
-            self._counters.bytes_discarded += len(self._buffer) + len(piece)
-            self._buffer.clear()
-            self._skipping = True
-        else:
-            self._buffer += piece
+    def bodies(self, data: bytes | bytearray | memoryview | U8) -> Iterator[I64]:
+        """Yield, chunk by chunk, the spans (n, 2) of header + payload in `buffer`, valid until the next chunk.
 
-    def _decode(self, raw: bytes) -> Frame | None:
-        counters = self._counters
-        body = cobs_decode(raw)
-        if body is None:
-            counters.cobs_errors += 1
-        elif len(body) < HEADER.size + 4:
-            counters.short_frames += 1
-        elif zlib.crc32(body[:-4], _CRC_SEEDS[body[0]]) != int.from_bytes(body[-4:], "little"):
-            counters.crc_errors += 1
-        else:
-            counters.frames += 1
-            return unpack_body(body[:-4])
-        counters.bytes_discarded += len(raw) + 1
-        return None
+        The iterator must be used up: it takes `data` in as it goes.
+        """
+        for first in range(0, len(data), CHUNK_BYTES):
+            yield self.take(bytes(data[first : first + CHUNK_BYTES]))
+
+    def take(self, data: bytes) -> I64:
+        """Return the spans (n, 2) in `buffer` of what at most CHUNK_BYTES of `data` complete, valid until the next bytes."""
+        count = self._kernels.take_in(data, self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, self._tally)
+        return self._bodies[:count]
+
+    def frame(self, first: int, stop: int) -> Frame:
+        """Return what lies between `first` and `stop` in `buffer` as a frame of its own."""
+        kind, flags, _, session = HEADER.unpack_from(self._raw, first)
+        return Frame(kind, flags, session, bytes(self._view[first + HEADER.size : stop]))
+
+    def warm_up(self) -> None:
+        """Compile or load the kernels, without counting anything."""
+        self._kernels.take_in(b"", self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, np.zeros_like(self._tally))
+
+    # until the live loop has one kernel
+
+    @property
+    def bulk(self) -> FrameDecoder:
+        """Return the decoder itself."""
+        return self
+
+    def use_kernels(self) -> None:
+        """Compile or load the kernels."""
+        self.warm_up()
+
+    @staticmethod
+    def pieces(data: bytes) -> list[bytes]:
+        """Return `data` in pieces that `take` takes."""
+        return [data[first : first + CHUNK_BYTES] for first in range(0, max(1, len(data)), CHUNK_BYTES)]
+
+    def stream_stop(self, spans: I64, first: int, session: int) -> int:
+        """Return the place of the first of `spans` from `first` on that is no stream message of `session`."""
+        return int(self._kernels.stream_stop(self.buffer, spans, first, session))

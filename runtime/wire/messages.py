@@ -20,7 +20,6 @@ from .frame import Frame as Frame
 from .frame import pack_body as pack_body
 from .frame import unpack_body as unpack_body
 from .framing import FrameDecoder as FrameDecoder
-from .framing import cobs_decode as cobs_decode
 from .framing import cobs_encode as cobs_encode
 from .framing import encode_frame as encode_frame
 from .schema import ADAPTIVE_PATTERN as ADAPTIVE_PATTERN

@@ -180,29 +180,6 @@ def test_welcome_carries_facts_and_names_another_schema() -> None:
     assert wire.decode_welcome(stranger) == wire.Welcome(0xDEADBEEF, 2, {})
 
 
-@pytest.mark.parametrize("size", [0, 1, 253, 254, 255, 507, 508, 509, 70_000])
-@pytest.mark.parametrize("fill", [b"\0", b"\1", b"\xff"])
-def test_cobs_at_its_group_boundaries(size: int, fill: bytes) -> None:
-    for data in (fill * size, fill * size + b"\0", b"\0" + fill * size, fill * size + b"\x07"):
-        encoded = wire.cobs_encode(data)
-        assert 0 not in encoded
-        assert len(encoded) <= len(data) + 1 + len(data) // 254 + 1
-        assert wire.cobs_decode(encoded) == data
-
-
-def test_cobs_accepts_a_left_out_empty_last_group() -> None:
-    data = b"\x05" * 254
-    assert wire.cobs_encode(data).endswith(b"\x01")
-    assert wire.cobs_decode(wire.cobs_encode(data)[:-1]) == data
-
-
-@given(st.binary(max_size=2000))
-def test_cobs_round_trip(data: bytes) -> None:
-    encoded = wire.cobs_encode(data)
-    assert 0 not in encoded
-    assert wire.cobs_decode(encoded) == data
-
-
 def traffic() -> list[bytes]:
     return [encoded for encoded, _, _ in GOLDEN] * 3
 
