@@ -40,7 +40,6 @@ COMMANDS = {  # words, what is there already, what else is read
     "refit": ("refit b.pans r.pansrec -o OUT", "OUT", "b.pans"),
     "order": ("order b.pans -o OUT", "OUT", "b.pans"),
     "tune": (f"tune b.pans --device {DEVICE} -o OUT", "OUT", "b.pans"),
-    "trials": ("trials flow --bundle b.pans --json OUT", "OUT", None),
 }
 WRITES_NO_FILE = {
     "verify",
@@ -49,7 +48,6 @@ WRITES_NO_FILE = {
     "devices",
     "doctor",
     "baseline",
-    "fuzz",
     "completion",
     "runs",
     "conform",

@@ -5,16 +5,18 @@ python docs/pictures/calibration.py       (extra `plot`)
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
 
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "instruments"))
 matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
+from simulated_calibrations import simulate
 
-from pans.firmware_sim.trials.calibration import simulate
 from pans.runtime.core.calibration import (
     LADDER,
     TELLING,

@@ -13,12 +13,28 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from pans.firmware_sim.trials.dark_counts import Detector
+from pans.firmware_sim.scene.detector_kernels import click_thresholds, plain_words
+from pans.firmware_sim.scene.detector_model import CLICK_STREAM, stream_key
 from pans.runtime.instrument.channel_health import ChannelHealth
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 
 RATE, CHANNELS, STEP = 0.01, 4, 20
 LEGS = ((12_000, 1.0), (6_000, 2.0), (6_000, 1.0), (300, 20.0), (6_000, 1.0))
+
+
+class Detector:
+    """Dark exposures of one simulated detector, drawn one after another with a rate that may change."""
+
+    def __init__(self, channels: int, seed: int) -> None:
+        self._channels, self._key, self._next = channels, np.uint64(stream_key(seed, CLICK_STREAM)), 0
+
+    def expose(self, n: int, rate: float) -> np.ndarray:
+        """Return the next `n` exposures at `rate`, words uint8 (n, bytes)."""
+        words = np.zeros((n, -(-self._channels // 8)), np.uint8)
+        thresholds = click_thresholds(np.full((1, self._channels), rate))
+        plain_words(thresholds, np.zeros(n, np.int64), self._key, self._next, words)
+        self._next += n
+        return words
 
 
 def main() -> None:

@@ -18,9 +18,8 @@ from typing import NoReturn
 from pans.firmware_sim.options import add_options, settings_from
 from pans.firmware_sim.ports.faults import check_possible, parse_faults
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument, check_options
-from pans.firmware_sim.ports.shell import LONGEST_WAIT_S, open_port, serve
+from pans.firmware_sim.ports.shell import open_port, serve
 from pans.runtime.cli import Command, emit, say
-from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.ranges import Range
 from pans.runtime.timing.cpu import check_core
 
@@ -42,8 +41,6 @@ def _run(args: argparse.Namespace) -> int:
     options = check_options(settings_from(args, SimOptions))
     check_core(args.core)
     check_possible(parse_faults(args.faults), pace="real", listen=args.listen)
-    if options.engine == "c":
-        return _run_c_engine(args, options)
     instrument, clock = build_instrument(options, time.perf_counter_ns())
     if args.echo is not None:
         instrument = FrameEcho(args.echo)
@@ -57,25 +54,6 @@ def _run(args: argparse.Namespace) -> int:
         serve(instrument, clock, port, orphaned.is_set, args.core)
     finally:
         port.close()
-    return 0
-
-
-def _run_c_engine(args: argparse.Namespace, options: SimOptions) -> int:
-    from pans.firmware_sim.engine import CEngine  # and a compiler, only for those who ask for it
-
-    if args.echo is not None:
-        raise UsageError("--engine c has no --echo", remedy="leave one of them out")
-    engine = CEngine(options, args.listen, core=args.core)
-    signal.signal(signal.SIGTERM, _leave)
-    orphaned = _watch_stdin() if args.until_stdin_closes else threading.Event()
-    try:
-        _announce(args, engine.url)
-        while engine.running and not engine.failed and not orphaned.wait(LONGEST_WAIT_S):
-            pass
-        if not orphaned.is_set():
-            raise LinkError(f"the reference instrument has ended: {engine.failed or 'its process is gone'}")
-    finally:
-        engine.close()
     return 0
 
 

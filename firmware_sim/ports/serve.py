@@ -41,7 +41,6 @@ DEFAULT_SCENE = "fashion200"
 MAX_DRIFT_PPM = 1000.0
 CHILD_GOODBYE_S = 2.0
 MAX_BUFFER_MESSAGES = 1 << 16
-ENGINES = ("python", "c")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,6 @@ class SimOptions:
         metavar="D0[:mixed]",
     )
     changes: str = option("", "like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)")
-    engine: str = option("python", "python, or c: the reference firmware, built with the system's compiler")
 
 
 def parse_sim_url(url: str) -> SimOptions:
@@ -112,31 +110,16 @@ def check_options(options: SimOptions) -> SimOptions:
     if options.bleach:
         with as_usage_error():
             bleaching_of(options.bleach)
-    _check_engine(options)
     if not abs(options.drift_ppm) <= MAX_DRIFT_PPM:
         raise UsageError(f"drift_ppm={options.drift_ppm}: allowed are -{MAX_DRIFT_PPM:g}..{MAX_DRIFT_PPM:g}")
     return options
 
 
-def _check_engine(options: SimOptions) -> None:
-    if options.engine not in ENGINES:
-        raise UsageError(f"engine={options.engine}: allowed are {' and '.join(ENGINES)}")
-    if options.engine == "python":
-        return
-    if options.pace == "fast":
-        raise UsageError("engine=c runs at real pace only", remedy="leave pace=fast out, or engine=c")
-    for name in ("faults", "changes", "optics", "bleach"):
-        if getattr(options, name) and not is_spec(options.optics if name == "optics" else ""):
-            raise UsageError(f"engine=c has no {name}", remedy=f"leave {name} out, or engine=c")
-
-
 def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, DeviceClock]:
     """Make the instrument, switched on at `host_ns`, and its clock; ConfigError for an impossible profile or scene.
 
-    With faults, the instrument stands behind a bad link. The C engine is a process and no object of this one: UsageError.
+    With faults, the instrument stands behind a bad link.
     """
-    if options.engine != "python":
-        raise UsageError(f"engine={options.engine}: not for an instrument in this process", remedy="use pans simulate")
     from pans.firmware_sim.device.instrument import Instrument  # only where the instrument is: a host waits for it
 
     from .on_table import scene_on_table

@@ -44,8 +44,7 @@ def check(words: list[str], where: str, whole: bool) -> None:
     except ModuleNotFoundError as error:
         pytest.skip(f"pans {words[0]} needs {error.name}")
     known = {option for action in parser._actions for option in action.option_strings}
-    if words[0] != "trials":  # each trial has options of its own
-        assert {word.partition("=")[0] for word in words if word.startswith("--")} <= known, f"{where}: {words}"
+    assert {word.partition("=")[0] for word in words if word.startswith("--")} <= known, f"{where}: {words}"
     if whole and "..." not in words and "--config" not in words:  # a file may hold what is required
         try:
             parser.parse_args(words[1:])

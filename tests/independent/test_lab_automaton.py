@@ -15,7 +15,6 @@ from lab_automaton import ABSTAINS, read_automaton, walk_again
 from lab_bundle import Damaged, read_bundle
 from lab_recording import read_recording
 
-from pans.firmware_sim.resealed.contents import mutated_array
 from pans.runtime.bundle import Automaton, bundle_bytes, parse_bundle, with_expected, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.decide import make_decider
@@ -85,6 +84,25 @@ def test_both_readers_accept_and_refuse_the_same(automaton: Automaton) -> None:
     assert 20 < taken < 380
 
 
+def mutated_array(dice: random.Random, array: np.ndarray) -> np.ndarray:
+    """A copy with one value, some of them or all at an edge of the type, next to what they were, or turned about."""
+    changed, kind = array.copy(), dice.random()
+    if kind < 0.15 or not array.size:
+        return changed[::-1].copy()
+    place = dice.randrange(array.size)
+    if array.dtype.kind in "iu":
+        info = np.iinfo(array.dtype)
+        near = (int(array[(place + 1) % array.size]), int(array[place]) ^ 1)
+        values: tuple[float, ...] = near if kind < 0.3 else (info.min, info.max, 0, 1, info.max // 2)
+    else:
+        values = (np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e-45, 0.0, -0.0, 1.0, 1e30)
+    many = [dice.randrange(array.size) for _ in range(dice.choice((1, 1, 3, 20)))]
+    changed[place if kind < 0.3 else slice(None) if kind < 0.4 else many] = np.array(dice.choice(values)).astype(
+        array.dtype
+    )
+    return changed
+
+
 def with_one_part_changed(data: bytes, dice: random.Random) -> bytes:
     length = struct.unpack_from("<I", data, 12)[0]
     header, begin = json.loads(data[16 : 16 + length]), 16 + length
@@ -92,7 +110,7 @@ def with_one_part_changed(data: bytes, dice: random.Random) -> bytes:
     for number, row in enumerate(header["parts"]):
         blob = data[begin + row["offset"] : begin + row["offset"] + row["length"]]
         if number == chosen:
-            blob = mutated_array(dice, np.frombuffer(blob, row["dtype"]).reshape(row["shape"])).tobytes()
+            blob = mutated_array(dice, np.frombuffer(blob, row["dtype"])).tobytes()
         row["sha256"] = sha256(blob).hexdigest()
         blobs.append(blob)
     text = json.dumps(header).encode()

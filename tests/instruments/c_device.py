@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import random
-import shutil
 from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from c_core import COMPILER, CDevice
 
 from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.engine import SteppedEngine
-from pans.firmware_sim.ports.serve import SimOptions
 from pans.firmware_sim.scene.moving import SceneFile
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
@@ -23,9 +21,7 @@ from pans.runtime.wire.messages import Frame, MessageType, Opcode
 
 MODES = ("sequential", "parallel", "device-driven", "host-driven")
 NONCE = 7
-needs_compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler on this machine"
-)
+needs_compiler = pytest.mark.skipif(not COMPILER, reason="no C compiler on this machine")
 
 
 def small_scene() -> SceneFile:
@@ -46,10 +42,9 @@ class Pair:
         blinded["photon_number_max"] = 1  # the C core tells clicks
         self.profile = replace(self.profile, detector=replace(self.profile.detector, **blinded))
         scene = small_scene()
-        options = SimOptions("ideal", seed=seed, buffer=buffer)
         self.devices = (
             Instrument(self.profile, scene, seed=seed, buffer_messages=buffer),
-            SteppedEngine(options, profile=self.profile, scene=scene),
+            CDevice(self.profile, scene, seed=seed, buffer=buffer),
         )
         self.heard: tuple[list[Frame], list[Frame]] = ([], [])
         self._decoders = (wire.FrameDecoder(), wire.FrameDecoder())

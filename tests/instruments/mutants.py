@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-import pytest
+from c_core import FOLDER, CDevice, build_library
 
 from pans.firmware_sim.conform import Finding, conform
 from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
-from pans.firmware_sim.engine import SteppedEngine, build
-from pans.firmware_sim.ports.serve import SimOptions
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime.instrument.profile import load_profile
 
@@ -30,8 +28,8 @@ class Mutant(NamedTuple):
 
 def sources_with(mutant: Mutant, folder: Path) -> Path:
     """Copy the C sources with the fault in them; fails when the text that it replaces does not stand there exactly once."""
-    for path in build.FOLDER.rglob("*.[ch]"):
-        copy = folder / path.relative_to(build.FOLDER)
+    for path in FOLDER.rglob("*.[ch]"):
+        copy = folder / path.relative_to(FOLDER)
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.write_text(path.read_text())
     text = (folder / mutant.file).read_text()
@@ -40,19 +38,17 @@ def sources_with(mutant: Mutant, folder: Path) -> Path:
     return folder
 
 
-def build_quickly(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
-    """Compile without optimisation, and keep the result out of the user's cache."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-    monkeypatch.setattr(build, "FLAGS", ("-std=c99", "-O0"))
+def built(mutant: Mutant, folder: Path) -> Path:
+    """Return the library with this fault, compiled without optimisation in `folder`."""
+    return build_library(sources_with(mutant, folder / "sources"), folder / "cache", ("-std=c99", "-O0"))
 
 
-def engine(
-    name: str, library: Path | None = None, scene: str = "uniform", line_bytes_s: int = 0
-) -> tuple[SteppedDevice, DeviceClock]:
+def c_core(name: str, library: Path | None = None, line_bytes_s: int = 0) -> tuple[SteppedDevice, DeviceClock]:
     """The C core in this process."""
-    clock = DeviceClock(load_profile(name).clock.tick_hz)
-    kind = SteppedEngine if line_bytes_s == 0 else SlowLine
-    device = kind(SimOptions(name, scene), clock.tick_at(START_NS), library=library)
+    profile = load_profile(name)
+    clock = DeviceClock(profile.clock.tick_hz)
+    kind = SlowLine if line_bytes_s else CDevice
+    device = kind(profile, tick=clock.tick_at(START_NS), library=library)
     if isinstance(device, SlowLine):
         device.ticks_per_byte = clock.tick_hz / line_bytes_s
     return device, clock
@@ -64,30 +60,29 @@ def tried(name: str, device: SteppedDevice, clock: DeviceClock, *only: str, long
     return {one.number: one for one in conform(link, load_profile(name), pixels=16, only=only, long=long)}
 
 
-class SlowLine(SteppedEngine):
+class SlowLine(CDevice):
     """The C core behind a line of so many bytes per second; what the line does not take yet waits in the device."""
 
     ticks_per_byte = 1.0
     _free_tick = 0  # when the line takes the next piece
 
     def step(self, tick: int, data: bytes) -> bytes:
-        """As SteppedEngine.step, but no more than the line takes by then."""
+        """As CDevice.step, but no more than the line takes by then."""
         sent = self._drain(tick)
-        self._library.instrument_step(self._handle, tick, data, len(data))
-        self._tick = tick
-        self._raise()
+        self._digest(tick, data)
+        self.tick = tick
         return sent + self._drain(tick)
 
     def next_event_tick(self) -> int | None:
         """When the line is free again, else when the device does something by itself."""
-        return self._free_tick if self._free_tick > self._tick else super().next_event_tick()
+        return self._free_tick if self._free_tick > self.tick else super().next_event_tick()
 
     def _drain(self, tick: int) -> bytes:
         sent = b""
         while self._free_tick <= tick:
-            at = max(self._free_tick, self._tick)
+            at = max(self._free_tick, self.tick)
             count = self._library.instrument_output(self._handle, at, self._out, PIECE)
-            self._tick = at
+            self.tick = at
             sent += self._out.raw[:count]
             if count:
                 self._free_tick = at + max(1, round(count * self.ticks_per_byte))

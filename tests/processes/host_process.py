@@ -26,14 +26,14 @@ import pytest
 from tree import ROOT
 
 from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.shell import TcpPort, serve
-from pans.firmware_sim.probes.processes import wait_until
 from pans.firmware_sim.scene.still import load_scene
 from pans.firmware_sim.testing import small_setup
-from pans.firmware_sim.trials.kills import LightLog
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.decide import Verdict
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.wire.messages import DeviceState, StateReason
 
 # stage -> where the child is met: module, class or "" and name; the call before which it waits
 STAGES = {
@@ -47,6 +47,23 @@ STAGES = {
 }
 HANGS = ("python", "native", "file")
 HANGS_AFTER = 30  # decisions
+
+
+class LightLog(Instrument):
+    """An instrument that notes when its light goes on and off, in device ticks and on the clock of time.perf_counter."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        self.changes: list[tuple[DeviceState, StateReason, int, float]] = []
+        self.granted_tick = 0
+        super().__init__(*args, **options)
+
+    def _enter(self, state: DeviceState, reason: StateReason) -> None:
+        super()._enter(state, reason)
+        self.changes.append((state, reason, self.tick, time.perf_counter()))
+
+    def _renew(self, lease_ms: int) -> None:
+        super()._renew(lease_ms)
+        self.granted_tick = self.tick
 
 
 @dataclass
@@ -257,5 +274,8 @@ def _start_server(context: Any) -> None:
 
 def until(condition: Callable[[], object], patience_s: float = 60.0) -> float:
     """Wait until `condition()`; return when it held, on the clock of time.perf_counter."""
-    wait_until(lambda: bool(condition()), patience_s, every_s=0.01)
+    deadline = time.monotonic() + patience_s
+    while not condition():
+        assert time.monotonic() < deadline, f"nothing happened for {patience_s} s"
+        time.sleep(0.01)
     return time.perf_counter()

@@ -8,17 +8,18 @@ from pathlib import Path
 
 import pytest
 from c_device import needs_compiler
-from mutants import Mutant, build_quickly, engine, sources_with, tried
+from mutants import Mutant, built, c_core, tried
 from tree import ROOT
 
 from pans.firmware_sim.conform import RULES, Finding, conform
 from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.engine import CEngine, engine_library, engine_program
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime.cli import main
 from pans.runtime.errors import LinkError
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.wire.framing import FrameDecoder
+from pans.runtime.wire.messages import MessageType, Opcode
 
 BEYOND = {"2.8", "4.20"}  # no link can show them
 LONG = {number for number, rule in RULES.items() if rule.long}
@@ -31,7 +32,6 @@ DEAF_AFTER_GATE = Mutant(
     "    if (deaf)\n        return;\n" + RECEIVED,
     {"4.12"},
 )
-CRASHES_AT_GATE = Mutant("device.c", "    case GATE:\n", "    case GATE:\n        __builtin_trap();\n", {"4.12"})
 OTHER_CRC = Mutant("frame.c", "? 0 : PANS_SCHEMA;", "? 0 : PANS_SCHEMA ^ 1;", {"1.2"})
 
 
@@ -50,7 +50,7 @@ def test_the_simulator_keeps_every_rule(name: str) -> None:
 @needs_compiler
 @pytest.mark.parametrize("name", ["ideal", "dmd-spad", "wdm-snspd"])
 def test_the_reference_instrument_keeps_every_rule(name: str) -> None:
-    found = tried(name, *engine(name))
+    found = tried(name, *c_core(name))
     assert {number: one.why for number, one in found.items() if one.verdict == "broken"} == {}
     assert {
         number for number, one in found.items() if one.verdict == "not tried" and number[:2] not in ("11", "13", "14")
@@ -70,25 +70,22 @@ def test_the_simulator_keeps_the_long_rules(name: str) -> None:
 @needs_compiler
 @pytest.mark.parametrize("name", ["ideal", pytest.param("dmd-spad", marks=pytest.mark.slow)])
 def test_the_reference_instrument_keeps_the_long_rules(name: str) -> None:
-    found = tried(name, *engine(name), long=True)
+    found = tried(name, *c_core(name), long=True)
     assert {number: one.why for number, one in found.items() if one.verdict == "broken"} == {}
     assert all(found[number].verdict == "kept" for number in LONG)
 
 
-def mutated(mutant: Mutant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Finding], float]:
+def mutated(mutant: Mutant, tmp_path: Path) -> tuple[list[Finding], float]:
     """Findings of all rules on this mutant, and how many seconds the link's clock went on."""
-    build_quickly(monkeypatch, tmp_path / "cache")
-    device, clock = engine("ideal", engine_library(sources_with(mutant, tmp_path / "sources")))
+    device, clock = c_core("ideal", built(mutant, tmp_path))
     link = VirtualLink(device, clock, "conform")
     findings = conform(link, load_profile("ideal"), pixels=16)
     return findings, (link.now_ns() - START_NS) * 1e-9
 
 
 @needs_compiler
-def test_a_device_that_falls_silent_ends_the_test_with_its_findings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    findings, seconds = mutated(DEAF_AFTER_GATE, tmp_path, monkeypatch)
+def test_a_device_that_falls_silent_ends_the_test_with_its_findings(tmp_path: Path) -> None:
+    findings, seconds = mutated(DEAF_AFTER_GATE, tmp_path)
     verdicts = {one.number: one.verdict for one in findings}
     assert seconds < SOON_S
     assert [number for number, verdict in verdicts.items() if verdict == "gone"] == ["4.12"]
@@ -102,8 +99,8 @@ def test_a_device_that_falls_silent_ends_the_test_with_its_findings(
 
 
 @needs_compiler
-def test_frames_with_another_crc_are_counted_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    findings, seconds = mutated(OTHER_CRC, tmp_path, monkeypatch)
+def test_frames_with_another_crc_are_counted_and_named(tmp_path: Path) -> None:
+    findings, seconds = mutated(OTHER_CRC, tmp_path)
     assert seconds < SOON_S
     first = next(one for one in findings if one.number == "1.2")
     assert first.verdict == "broken"
@@ -111,26 +108,30 @@ def test_frames_with_another_crc_are_counted_and_named(tmp_path: Path, monkeypat
     assert findings[-1].verdict == "not tried"
 
 
-@needs_compiler
-def test_a_device_that_crashes_leaves_the_findings_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_device_that_goes_away_leaves_the_findings_before(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    build_quickly(monkeypatch, tmp_path / "cache")
-    program = engine_program(sources_with(CRASHES_AT_GATE, tmp_path / "sources"))
+    class Leaving(VirtualLink):
+        """It is gone when it is asked for a gate."""
+
+        def write(self, data: bytes) -> None:
+            frames = FrameDecoder().feed(data)
+            if any(frame.type == MessageType.COMMAND and frame.payload[4] == Opcode.GATE for frame in frames):
+                raise LinkError("the device went away")
+            super().write(data)
+
+    def opened(url: str) -> VirtualLink:
+        return Leaving(*build_instrument(SimOptions("ideal", "uniform"), START_NS), url)
+
+    monkeypatch.setattr("pans.firmware_sim.commands.conform.open_link", opened)
     rules = [word for number in ("4.1", "4.12", "5.1") for word in ("--rule", number)]
-    for json_words in (["--json"], []):
-        device = CEngine(SimOptions("ideal", "uniform"), "tcp:127.0.0.1:0", program=program)
-        try:
-            assert main(["conform", device.url, "--profile", "ideal", "--pixels", "16", *rules, *json_words]) == 3
-        finally:
-            device.close()
-        out = capsys.readouterr().out
-        if json_words:
-            found = json.loads(out)
-            assert (found["verdict"], found["kept"], found["broken"], found["gone"]) == ("FAIL", 1, [], "4.12")
-            assert [one["verdict"] for one in found["rules"]] == ["kept", "gone", "not tried"]
-        else:
-            assert "the device went away in rule 4.12" in out
+    words = ["conform", "sim:ideal", "--pixels", "16", *rules]
+    assert main([*words, "--json"]) == 3
+    found = json.loads(capsys.readouterr().out)
+    assert (found["verdict"], found["kept"], found["broken"], found["gone"]) == ("FAIL", 1, [], "4.12")
+    assert [one["verdict"] for one in found["rules"]] == ["kept", "gone", "not tried"]
+    assert main(words) == 3
+    assert "the device went away in rule 4.12" in capsys.readouterr().out
 
 
 def test_a_device_that_says_nothing_is_no_device() -> None:

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 from c_device import needs_compiler
-from mutants import Mutant, build_quickly, engine, sources_with, tried
+from mutants import Mutant, built, c_core, tried
 
 from pans.firmware_sim.conform import RULES
-from pans.firmware_sim.engine import engine_library
 
 SOUND = ("1.1", "2.1", "4.1", "6.1")  # rules that no fault of the quick set touches
 SLOW_LINE = 100_000  # bytes per second: a fifth of what the fastest stream of rule 6.6 brings
@@ -290,13 +289,10 @@ QUICK = (
 )  # fmt: skip
 
 
-def broken_by(
-    mutant: Mutant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *only: str, long: bool = False
-) -> set[str]:
+def broken_by(mutant: Mutant, tmp_path: Path, *only: str, long: bool = False) -> set[str]:
     """The rules that a copy of the C core with this fault breaks."""
-    build_quickly(monkeypatch, tmp_path / "cache")
-    library = engine_library(sources_with(mutant, tmp_path / "sources"))
-    found = tried(mutant.profile, *engine(mutant.profile, library, line_bytes_s=mutant.line_bytes_s), *only, long=long)
+    device = c_core(mutant.profile, built(mutant, tmp_path), mutant.line_bytes_s)
+    found = tried(mutant.profile, *device, *only, long=long)
     broken = {number for number, one in found.items() if one.verdict in ("broken", "gone")}
     assert all(found[number].why and found[number].pieces for number in broken)
     return broken
@@ -310,31 +306,29 @@ def test_the_faults_are_many_and_name_rules() -> None:
 
 @needs_compiler
 @pytest.mark.parametrize("fault", QUICK)
-def test_a_planted_fault_is_found_by_the_rule_that_it_breaks(
-    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_planted_fault_is_found_by_the_rule_that_it_breaks(fault: str, tmp_path: Path) -> None:
     rules = MUTANTS[fault].rules
-    assert broken_by(MUTANTS[fault], tmp_path, monkeypatch, *rules, *SOUND) == rules
+    assert broken_by(MUTANTS[fault], tmp_path, *rules, *SOUND) == rules
 
 
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", MUTANTS)
-def test_each_planted_fault_is_found(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_planted_fault_is_found(fault: str, tmp_path: Path) -> None:
     rules = MUTANTS[fault].rules
     long = any(RULES[number].long for number in rules)
-    broken = broken_by(MUTANTS[fault], tmp_path, monkeypatch, long=long)
+    broken = broken_by(MUTANTS[fault], tmp_path, long=long)
     assert rules <= broken, f"broken are {sorted(broken)}"
 
 
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", EQUIVALENT)
-def test_what_no_link_can_show_is_not_found(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert broken_by(EQUIVALENT[fault][0], tmp_path, monkeypatch, long=True) == set()
+def test_what_no_link_can_show_is_not_found(fault: str, tmp_path: Path) -> None:
+    assert broken_by(EQUIVALENT[fault][0], tmp_path, long=True) == set()
 
 
 @needs_compiler
 def test_a_line_that_the_stream_fills_is_no_fault() -> None:
-    found = tried("ideal", *engine("ideal", line_bytes_s=SLOW_LINE))
+    found = tried("ideal", *c_core("ideal", line_bytes_s=SLOW_LINE))
     assert {number: one.why for number, one in found.items() if one.verdict in ("broken", "gone")} == {}

@@ -128,7 +128,6 @@ def test_the_device_says_that_its_objects_bleach() -> None:
     [
         ("sim:ideal?bleach=0", UsageError, "bleaching dose is 0"),
         ("sim:ideal?bleach=fast", UsageError, "bleaching is 'fast', allowed: D0, or D0:mixed"),
-        ("sim:ideal?bleach=4&engine=c", UsageError, "engine=c has no bleach"),
         (
             "sim:flow-snspd?scene=cells-in-flow&pace=fast&bleach=4",
             ConfigError,

@@ -8,10 +8,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from c_core import COMPILER, FOLDER, core_sources
 from c_device import needs_compiler
 from tree import ROOT
-
-from pans.firmware_sim.engine.build import FOLDER, core_sources
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZERS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -43,8 +42,7 @@ def compiled_for(target: str, folder: Path) -> list[Path]:
 @needs_compiler
 def test_strange_input_harms_nothing(tmp_path: Path) -> None:
     program = tmp_path / "fuzz"
-    compiler = next(name for name in ("cc", "gcc", "clang") if shutil.which(name))
-    words = [compiler, "-std=c99", *SANITIZERS, *core_sources(), FOLDER / "fuzz" / "fuzz.c", "-o", program]
+    words = [COMPILER, "-std=c99", *SANITIZERS, *core_sources(), FOLDER / "fuzz" / "fuzz.c", "-o", program]
     built = subprocess.run([*map(str, words)], capture_output=True, text=True)
     if built.returncode and "asan" in built.stderr:
         pytest.skip("this compiler has no sanitizers")

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mutated_sessions import Evidence, MutatedLink, Mutation, by
 
-from pans.firmware_sim.checks.mutation import Mutation, by
-from pans.firmware_sim.trials.fields import Evidence, MutatedLink
 from pans.runtime.cli import EXIT_ALERT, EXIT_TIMING, main
 from pans.runtime.commands import one_run
 from pans.runtime.errors import DamagedFileError

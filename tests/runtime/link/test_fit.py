@@ -13,12 +13,12 @@ from bundles import automaton_bundle, made_bundle, six_states
 from lab_bench import SCENE, VirtualLab
 from lab_firmware import Firmware
 from lab_light import Light
+from mutated_sessions import tcp_link
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import load_scene
-from pans.firmware_sim.trials.fields import tcp_link
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.errors import DeviceError

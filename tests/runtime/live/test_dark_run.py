@@ -7,8 +7,8 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
+from small_files import small_calibration
 
-from pans.firmware_sim.resealed.uses import small_calibration
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.instrument.calibration import load_calibration
 from pans.runtime.instrument.channel_health import DarkReport

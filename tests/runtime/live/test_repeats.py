@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import fault_grid
 import pytest
 from commands import json_of, page_of, words_of
 
@@ -16,7 +17,6 @@ from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.firmware_sim.trials import fault_grid
 from pans.runtime import SHIPPED
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.link.base import open_link
@@ -101,7 +101,7 @@ def session(
     device.repeats = repeats
     flow = FlowRun(one.core, None) if isinstance(one.core, FlowCore) else None
     config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=turn)
-    header = fault_grid._recorded(one, {} if flow is None else {"flow": flow.header()})
+    header = one.recorded()
     observers = Observers(prepared=lambda run: None if flow is None else flow.prepared(run))
     with Recorder(path, {"config": header}, overwrite=True) as recorder:
         link = VirtualLink(device, clock, "sim:repeats")
@@ -211,7 +211,7 @@ def test_a_call_that_goes_on_compares_too(how: int, tmp_path: Path) -> None:
     thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
     thread.start()
     config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=COMPILED)
-    with Recorder(tmp_path / "run.pansrec", {"config": fault_grid._recorded(one, {})}) as recorder:
+    with Recorder(tmp_path / "run.pansrec", {"config": one.recorded()}) as recorder:
         result = run_live(open_link(port.url), one.profile, one.bundle, one.plan, one.core, config, recorder)
         recorder.close({})
     stopped.set()

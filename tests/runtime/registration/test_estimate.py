@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pans.firmware_sim.trials.registration import field, rendered
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import Imaging, seen
 from pans.runtime.instrument.profile import load_profile
@@ -22,6 +22,34 @@ from pans.runtime.registration.target import built_in_target, target_sha256
 PROFILE = load_profile("dmd-spad")
 DARK_MEAN = 0.004
 F64 = NDArray[np.float64]
+
+
+def rendered(image: np.ndarray, truth: Imaging, finer: int = 16) -> np.ndarray:
+    """Return the image (rows, columns) as every pixel of a grid of its size meets it, from points `finer` times closer than pixels."""
+    (rows, columns), margin = image.shape, 8  # pixels around the grid, into which nothing blurs
+    y = (np.arange((rows + 2 * margin) * finer) + 0.5) / finer - 0.5 - margin
+    x = (np.arange((columns + 2 * margin) * finer) + 0.5) / finer - 0.5 - margin
+    down, right = np.meshgrid(y - (rows - 1) / 2 - truth.down_px, x - (columns - 1) / 2 - truth.right_px, indexing="ij")
+    position = (
+        (right - 1j * down) * np.exp(-1j * math.radians(truth.rotation_deg)) / truth.scale
+    )  # upwards is positive here
+    column = np.floor(position.real + (columns - 1) / 2 + 0.5).astype(int)
+    row = np.floor(-position.imag + (rows - 1) / 2 + 0.5).astype(int)
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    fine = np.where(inside, image[row.clip(0, rows - 1), column.clip(0, columns - 1)], 0.0)
+    waves = np.add.outer(np.fft.fftfreq(len(y), 1 / finer) ** 2, np.fft.rfftfreq(len(x), 1 / finer) ** 2)
+    fine = np.fft.irfft2(np.fft.rfft2(fine) * np.exp(-2 * math.pi**2 * truth.psf_px**2 * waves), fine.shape)
+    fine = fine.reshape(rows + 2 * margin, finer, columns + 2 * margin, finer).mean(axis=(1, 3))
+    return np.asarray(fine[margin:-margin, margin:-margin])
+
+
+def field(coefficients: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return a flat field (rows, columns) of mean 1 with slopes and curvatures across the grid."""
+    y, x = (np.linspace(-1, 1, size) for size in shape)
+    across, down = np.meshgrid(x, y)
+    terms = [across, down, 1.5 * across**2, across * down, 1.5 * down**2]
+    bent = sum(c * term for c, term in zip(coefficients, terms))
+    return np.asarray(1 + bent - np.mean(bent))
 
 
 @pytest.fixture(scope="module")

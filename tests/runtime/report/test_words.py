@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mutated_sessions import Stage
 
-from pans.firmware_sim.trials.fields import Stage
 from pans.runtime.report.summary import Summary
 from pans.runtime.report.summary_page import write_markdown
 from pans.runtime.report.words import closing_words

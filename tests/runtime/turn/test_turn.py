@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fault_grid import STILL, run_case
 from heads import head_bundle, random_layers
 from inner_kernels import called
 from plans import shot_major
 from streams import SESSION, click_frames
 from tree import ROOT
 
-from pans.firmware_sim.checks.twin import differences
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.serve import open_sim
@@ -35,7 +35,6 @@ from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
-from pans.firmware_sim.trials.fault_grid import STILL, run_case
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import UsageError
@@ -171,33 +170,9 @@ def test_virtual_runs_are_those_of_the_python_turn(mode: str, acts: bool, tmp_pa
 
 
 @pytest.mark.parametrize("seed", range(len(STILL)))
-def test_faulty_bytes_are_decided_as_in_the_python_turn(seed: int) -> None:
-    """The quick form of the fault grid: every kind of plan for objects that stand still, all faults, judged by the checkers.
-
-    What has a compiled turn reads the bytes once more from a socket.
-    """
-    assert run_case("all", seed, 1200, None, "python", reads_again=True).violations == []
-    assert run_case("all", seed, 1200, None, "auto").violations == []
-
-
-def test_a_second_reading_that_lacks_something_is_found() -> None:
-    plan, decider = shot_major(3, 2), make_decider(head_bundle(random_layers([3, 12, 3], seed=3)), backend="table")
-    rng = np.random.default_rng(1)
-    sent = [(int(slot), int(rng.integers(2))) for _ in range(8) for slot in plan.slot_pattern]
-    clean = click_frames(plan, sent, rng, 4)
-    tape: list[tuple[str, Any]] = [("begin", (SESSION, 0, 0)), *(("bytes", data) for data in clean), ("end", None)]
-    core, streamed = Core(plan, decider, 1, 0), StreamCore(plan, decider, 1, 0, SESSION)
-    core.begin(0, 0)
-    rows = np.concatenate([batch.rows.copy() for batch in streamed.feed(b"".join(clean))])
-    assert len(rows) == 8
-
-    def second() -> StreamCore:
-        return StreamCore(plan, decider, 1, 0, 0)
-
-    assert differences(tape, second(), streamed.core, rows) == []
-    lacking = differences([*tape[:2], *tape[3:]], second(), streamed.core, rows)
-    assert any("stream counters" in words for words in lacking)
-    assert any("decision" in words for words in lacking)
+def test_runs_under_all_faults_are_sound(seed: int) -> None:
+    """The quick form of the fault grid: every kind of plan for objects that stand still, judged from outside."""
+    assert run_case("all", seed, 1200).violations == []
 
 
 def streaming() -> tuple[StreamCore, list[bytes]]:

@@ -1,0 +1,334 @@
+"""Whole sessions in which a device, or the host, says something else in one field, under a right checksum.
+
+`Mutation` names a field of the message dictionary and its change, `MutatedLink` carries it out, `Stage.run` runs an ordinary session
+with it and judges what must hold of any: no errors but the package's own, bounded time, a recording that replays to the same
+decisions, and no PASS where the evidence contradicts what was said.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+
+from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.shell import TcpPort, serve
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.scene.still import Scene, scene_from_arrays
+from pans.firmware_sim.testing import small_setup
+from pans.runtime.core.still import Core
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import PansError
+from pans.runtime.link.base import Link, open_link
+from pans.runtime.live import RunOptions, run_live
+from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.report.summary import Summary, summarise
+from pans.runtime.wire import messages
+from pans.runtime.wire.fields import ALL_MESSAGES, AUTOMATON_MESSAGES, Field, wrong_facts
+from pans.runtime.wire.frame import Frame
+from pans.runtime.wire.framing import FrameDecoder, encode_frame
+from pans.runtime.wire.messages import (
+    BLOCK_HEADER_BYTES,
+    NO_OBJECT,
+    STRUCTS,
+    DeviceState,
+    MalformedMessage,
+    MessageType,
+    Opcode,
+    decode_counts,
+)
+
+COMMANDS = ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE", "READ_COUNTS", "LOAD_COUNT_STATES")
+BODIES = {  # of commands: which of them holds the layout, and where in the payload it begins; of rows, the first
+    **{name: (name, STRUCTS["COMMAND"].size) for name in (*COMMANDS, *AUTOMATON_MESSAGES)},
+    "PLAN_SLOT": ("LOAD_PLAN", STRUCTS["COMMAND"].size + STRUCTS["LOAD_PLAN"].size),
+    "STATE": ("LOAD_STATES", STRUCTS["COMMAND"].size + STRUCTS["LOAD_STATES"].size),
+    "COUNT_STATE": ("LOAD_COUNT_STATES", STRUCTS["COMMAND"].size + STRUCTS["LOAD_COUNT_STATES"].size),
+}
+STAMP = "STAMP"  # not a message: the first pattern or state that is stamped in a block of clicks or of photon numbers
+LAYOUTS = {**ALL_MESSAGES, STAMP: (Field("pattern", "H"),)}
+
+
+class Mutation(NamedTuple):
+    """In `message`s, from number `first` on and at most `most` of them, `name` becomes `change` of what it was.
+
+    `name` is a field, or a key of WELCOME's map behind "map.". `words` say what the change is.
+    """
+
+    message: str
+    name: str
+    change: Callable[[Any], Any]
+    words: str
+    first: int = 0
+    most: int = 1 << 30
+
+    def __str__(self) -> str:
+        return f"{self.message}.{self.name} {self.words}, from message {self.first} on, {self.most} of them"
+
+
+def to(value: Any) -> tuple[Callable[[Any], Any], str]:
+    """Return the change to `value`, and its words."""
+    return lambda _: value, f"becomes {value!r}"
+
+
+def by(step: int) -> tuple[Callable[[Any], Any], str]:
+    """Return the change by `step`."""
+    return lambda value: value + step, f"moves by {step}"
+
+
+def is_of(frame: Frame, message: str) -> bool:
+    """Whether a frame is of the kind whose fields stand under `message` in LAYOUTS."""
+    if message in BODIES:
+        return frame.type == MessageType.COMMAND and frame.payload[4] == Opcode[BODIES[message][0]]
+    return frame.type in ((MessageType.CLICKS, MessageType.COUNTS) if message == STAMP else (MessageType[message],))
+
+
+def _layout(mutation: Mutation) -> tuple[struct.Struct, int, int]:
+    """The layout of the fields that `mutation` changes, where it begins in the payload, and the place of the field in it."""
+    place = [one.name for one in LAYOUTS[mutation.message]].index(mutation.name)
+    if mutation.message == STAMP:
+        return struct.Struct("<H"), BLOCK_HEADER_BYTES, place
+    return STRUCTS[mutation.message], BODIES.get(mutation.message, ("", 0))[1], place
+
+
+def field_of(payload: bytes, mutation: Mutation) -> Any:
+    """Return what stands in the field that `mutation` changes."""
+    layout, start, place = _layout(mutation)
+    return layout.unpack_from(payload, start)[place]
+
+
+def mutate(payload: bytes, mutation: Mutation) -> bytes:
+    """Return `payload` with one field changed; whatever does not fit the field's bits is cut to them."""
+    if mutation.name.startswith("map."):
+        head, facts = payload[: STRUCTS["WELCOME"].size], msgpack.unpackb(payload[STRUCTS["WELCOME"].size :])
+        key = mutation.name[4:]
+        value = mutation.change(facts.get(key))
+        if value is MISSING:
+            facts.pop(key, None)
+        else:
+            facts[key] = value
+        return head + msgpack.packb(facts)
+    layout, start, place = _layout(mutation)
+    values = list(layout.unpack_from(payload, start))
+    values[place] = fitted(LAYOUTS[mutation.message][place], mutation.change(values[place]))
+    return payload[:start] + layout.pack(*values) + payload[start + layout.size :]
+
+
+MISSING = object()
+
+
+def fitted(field: Field, value: Any) -> Any:
+    """Return `value` as the field's bits hold it."""
+    if field.code == "f":
+        return struct.unpack("<f", struct.pack("<f", value))[0]
+    size = struct.calcsize(field.code)
+    return int.from_bytes((int(value) % (1 << 8 * size)).to_bytes(size, "little"), "little", signed=field.code == "h")
+
+
+OBJECTS = 12
+SHOTS = 1
+MAX_SESSION_S = 30.0  # of processor time; one takes some 50 ms
+BLOCKS = ("CLICKS", "FRAMES", "COUNTS")
+
+
+class Evidence(NamedTuple):
+    """What the host knows of a session: the exposures of the plan, the classes, ticks per second."""
+
+    exposures: int
+    n_classes: int
+    tick_hz: int
+
+    def excludes(self, message: str, name: str, old: Any, new: Any) -> bool:
+        """Whether a host that compares all that it was told must find the change from `old` to `new`, each allowed by itself.
+
+        What is not listed is believed: nobody but the device knows it.
+        """
+        known: dict[tuple[str, str], bool] = {
+            ("STATUS", "next_exposure"): new > self.exposures,
+            ("STATUS", "drops"): new > self.exposures,
+            ("MARK", "truth"): new >= self.n_classes,
+            ("MARK", "object_index"): new != NO_OBJECT,
+            ("ACK", "last_id"): new > self.exposures,
+            ("BLOCK", "object_index"): new != NO_OBJECT,
+            ("BLOCK", "tick"): abs(new - old) > self.tick_hz,
+        }
+        always = {
+            **{STAMP: ("pattern",), "MARK": ("seq", "exposure_index", "half_exposures"), "PONG": ("host_ns",)},
+            "BLOCK": ("seq", "drops", "exposure_index", "period_ticks", "count", "word_bytes", "largest"),
+        }
+        kind = "BLOCK" if message in BLOCKS else message
+        return known.get((kind, name), name in always.get(kind, ()))
+
+
+class MutatedLink:
+    """An ordinary link around another one; `changed` counts changed messages, `impossible` names those that the evidence excludes."""
+
+    def __init__(self, link: Any, mutations: tuple[Mutation, ...], evidence: Evidence) -> None:
+        self._link, self._mutations, self._evidence = link, mutations, evidence
+        self._armed = False
+        self.impossible: list[str] = []
+        self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
+        self.now_ns, self.close = link.now_ns, link.close
+        self._decoders = {"read": FrameDecoder(), "write": FrameDecoder()}
+        self._seen: Counter[tuple[int, int]] = Counter()
+        self.changed = 0
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Link.read`."""
+        return self._passed("read", self._link.read(timeout_s))
+
+    def write(self, data: bytes) -> None:
+        """See `Link.write`."""
+        self._link.write(self._passed("write", data))
+
+    def _passed(self, way: str, data: bytes) -> bytes:
+        return b"".join(self._mutated(frame) for frame in self._decoders[way].feed(data))
+
+    def _mutated(self, frame: Frame) -> bytes:
+        payload = frame.payload
+        self._armed |= is_of(frame, "ARM")
+        for place, mutation in enumerate(self._mutations):
+            if not is_of(frame, mutation.message):
+                continue
+            number = self._seen[place, 0]
+            self._seen[place, 0] += 1
+            if mutation.first <= number < mutation.first + mutation.most:
+                changed = mutate(payload, mutation)
+                self.changed += changed != payload
+                sent_back = changed != payload and frame.type >= MessageType.WELCOME
+                if sent_back and self._excludes(mutation, frame.type, payload, changed):
+                    self.impossible.append(str(mutation))
+                payload = changed
+        return encode_frame(frame.type, payload, frame.session, frame.flags)
+
+    def _excludes(self, mutation: Mutation, kind: int, old: bytes, new: bytes) -> bool:
+        """Whether the changed message of that type makes no sense, or cannot be true."""
+        try:
+            decoded = _decoded(kind, new)
+        except MalformedMessage:
+            return True
+        if mutation.message == "WELCOME":
+            return bool(wrong_facts(decoded.facts))
+        if len(self._mutations) > 1:
+            return False  # the other one may make it a message that is dropped: of another probe, or of an earlier run
+        if mutation.message == "STATUS" and (not self._armed or decoded.state == DeviceState.ARMED):
+            return False  # of no run, or of one that has not begun
+        values = [field_of(payload, mutation) for payload in (old, new)]
+        return self._evidence.excludes(mutation.message, mutation.name, *values)
+
+
+def _decoded(kind: int, payload: bytes) -> Any:
+    name = MessageType(kind).name.lower()
+    return decode_counts(payload) if kind == MessageType.COUNTS else getattr(messages, f"decode_{name}")(payload)
+
+
+@dataclass(slots=True)
+class Session:
+    """What came of one mutated session; `error` is one of the package's own, `wrong` what must not be."""
+
+    mutations: tuple[Mutation, ...]
+    summary: Summary | None = None
+    error: str = ""
+    changed: int = 0
+    impossible: list[str] = field(default_factory=list)  # changed messages that the evidence excludes
+    wrong: list[str] = field(default_factory=list)
+
+
+class Stage:
+    """What sessions of one mode have in common, made once; `over` is "virtual", or "tcp" for a socket in real time."""
+
+    def __init__(self, mode: str, over: str = "virtual") -> None:
+        self.mode, self._over = mode, over
+        self.profile, self.bundle, self.plan = small_setup(mode)
+        images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
+        self.scene: Scene = scene_from_arrays("fields", images, np.arange(6) % 3, ("a", "b", "c"))
+        self.backend = "table" if self.bundle.automaton is None else "automaton"
+        self.decider = make_decider(self.bundle, shots=SHOTS, backend=self.backend)
+
+    def run(self, folder: Path, seed: int, *mutations: Mutation) -> Session:
+        """Run one session with `mutations` and judge what can be judged of any."""
+        session = Session(mutations)
+        began_s = time.process_time()
+        path = folder / "fields.pansrec"
+        try:
+            self._run(path, seed, session)
+        except PansError as error:
+            session.error = f"{type(error).__name__}: {error.message}"
+        except Exception:
+            session.wrong.append(traceback.format_exc())
+        try:
+            if session.summary is not None:
+                self._check_recording(path, session)
+        except Exception:
+            session.wrong.append(traceback.format_exc())
+        if (took_s := time.process_time() - began_s) > MAX_SESSION_S:
+            session.wrong.append(f"it took {took_s:.1f} s of processor time, allowed {MAX_SESSION_S:g}")
+        if session.summary is not None and session.summary.verdict == "PASS":
+            session.wrong += [f"PASS though {what}" for what in session.impossible[:3]]
+        return session
+
+    def _run(self, path: Path, seed: int, session: Session) -> None:
+        clock = DeviceClock(self.profile.clock.tick_hz)
+        start_ns = time.perf_counter_ns() if self._over == "tcp" else START_NS
+        device = Instrument(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(start_ns))
+        exposures = OBJECTS * self.plan.cycles_per_object * self.plan.slots_per_cycle
+        evidence = Evidence(exposures, len(self.bundle.classes), self.profile.clock.tick_hz)
+        with tcp_link(device, clock) if self._over == "tcp" else virtual_link(device, clock) as way:
+            self._drive(MutatedLink(way, session.mutations, evidence), path, session)
+
+    def _drive(self, link: MutatedLink, path: Path, session: Session) -> None:
+        # No claim on the processor: many sessions share it, and none is judged by its latencies.
+        config = RunOptions(
+            shots=SHOTS, n_cycles=OBJECTS * self.plan.cycles_per_object, deadline_us=1e5, realtime=False
+        )
+        core = Core(self.plan, self.decider, SHOTS, config.n_cycles)
+        config_of_run = {"shots": SHOTS, "tick_hz": self.profile.clock.tick_hz, "backend": self.backend}
+        header = {"config": {**config_of_run, "drive": self.plan.drive, "confidence": 0.0}}
+        with Recorder(path, header, overwrite=True) as recorder:
+            try:
+                result = run_live(link, self.profile, self.bundle, self.plan, core, config, recorder)
+            finally:
+                session.changed, session.impossible = link.changed, link.impossible
+            shots = OBJECTS * self.plan.shots_per_object
+            summary = summarise(result, illumination=1.0, expected_decisions=shots // SHOTS)
+            recorder.close(summary.as_json())
+        session.summary = summary
+
+    def _check_recording(self, path: Path, session: Session) -> None:
+        recording = read_recording(path)
+        again = replay(recording, self.bundle)
+        if (again.decisions, again.sha256) != (recording.n_decisions, recording.decisions_sha256):
+            session.wrong.append(
+                f"a replay gives {again.decisions} decisions of {recording.n_decisions}, or other ones"
+            )
+
+
+@contextmanager
+def virtual_link(device: SteppedDevice, clock: DeviceClock) -> Iterator[Link]:
+    """A link to `device` whose time passes while the host waits."""
+    yield VirtualLink(device, clock, "fields")
+
+
+@contextmanager
+def tcp_link(device: SteppedDevice, clock: DeviceClock) -> Iterator[Link]:
+    """A socket to `device`, which a thread serves in real time."""
+    port, stopped = TcpPort("127.0.0.1", 0), threading.Event()
+    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
+    thread.start()
+    try:
+        yield open_link(port.url)
+    finally:
+        stopped.set()
+        thread.join(2.0)
+        port.close()
