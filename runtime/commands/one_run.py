@@ -448,7 +448,7 @@ def _watched(
     from pans.runtime.live import Observers, Recovery
     from pans.runtime.live.loop import running
     from pans.runtime.monitor.snapshot import begin_facts
-    from pans.runtime.watch import Attendants
+    from pans.runtime.watch.watchers import Watchers
 
     dark, monitor = ready.dark, around.monitor
     recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
@@ -462,7 +462,7 @@ def _watched(
         illumination=ready.bundle.illumination() * ready.frames,
     )
     monitor.begin(ready.bundle, recorder, facts)
-    with Attendants(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
+    with Watchers(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
 
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
@@ -478,7 +478,7 @@ def _watched(
 
         def look(run: LiveRun, output: Output) -> None:
             dark.look(run, output)
-            seen.tell(run)
+            seen.note_news(run)
             monitor.watch(run, output)
 
         observers = Observers(look, prepared, around.stop, acts=False, uploaded=around.compiled)

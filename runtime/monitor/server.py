@@ -30,8 +30,8 @@ def page() -> bytes:
     return files(__package__).joinpath("live.html").read_bytes()
 
 
-def policy() -> str:
-    """Return the header that lets the page run its own script and style alone."""
+def policy() -> dict[str, str]:
+    """Return the headers that let the page run its own script and style alone."""
     text = page().decode()
     hashes = {
         name: " ".join(
@@ -40,11 +40,12 @@ def policy() -> str:
         )
         for name in ("script", "style")
     }
-    return (
-        f"Content-Security-Policy: default-src 'none'; script-src {hashes['script']}; style-src {hashes['style']}; "
-        "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'\r\n"
-        "Referrer-Policy: no-referrer\r\nCache-Control: no-store\r\n"
-    )
+    return {
+        "Content-Security-Policy": f"default-src 'none'; script-src {hashes['script']}; style-src {hashes['style']}; "
+        "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+        "Referrer-Policy": "no-referrer",
+        "Cache-Control": "no-store",
+    }
 
 
 class Events:

@@ -1,4 +1,4 @@
-"""Operating pans over weeks and over many files: options from a file, systemd units, folders of runs, batches of commands.
+"""Commands for weeks and for many files: systemd services, folders of runs, batches; options from a file and tables for other tools.
 
-Owns what is around a command, never what a command does: the loop and its recordings are live's and record's, who watches a run is watch's.
+Each module is one command or one file format and stands alone.
 """

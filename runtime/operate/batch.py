@@ -1,13 +1,15 @@
-"""One command over many inputs: the items, the journal of what is done, and one item's run in a process of its own.
+"""`pans batch`: one command over many recordings, bundles or seeds, here, in several processes, or on the workers of a Dask scheduler.
 
-Owns which words each item is run with and the rows of results; where items run is workers.py's. Each finished item is one line of the
-journal, synced, so that a batch that was ended at any time goes on where it was.
+Each finished item is one line of a journal, synced, so that a batch that was ended at any time continues where it was. An item whose worker
+dies is done by another one. Dask's own messages are pickled: connect only to a scheduler that you trust, in a network that you trust.
 """
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import glob
+import importlib
 import json
 import os
 import shlex
@@ -16,18 +18,30 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.errors import UsageError
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
+from pans.runtime.cli.command import parser_of
+from pans.runtime.cli.finding import find_commands, load_command
+from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.outputs import check_outputs
+from pans.runtime.ranges import Range
+
+from .parquet import need_pyarrow, write_rows
 
 FORMAT = "pans-batch 1"
-ITEMS_MAX = 1_000_000
-VALUES_MAX = 100_000
+ON_FILES = ("replay", "evaluate", "refit", "report", "verify", "info", "export")
+ON_NAMES = ("reproduce", "train", "baseline")
+WORKERS = Range(1, 1024, whole=True)
+ITEMS_MAX, VALUES_MAX = 1_000_000, 100_000
 STDERR_CHARACTERS = 2000
+RETRIES, CONNECT_S = 2, 30  # of Dask
+REPORT_EVERY_S = 5.0
 _DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 
@@ -148,6 +162,65 @@ def _end_with_parent() -> Any:
     return lambda: prctl(_DIES_WITH_PARENT, signal.SIGKILL)
 
 
+def results_here(items: Sequence[Item], folder: str) -> Iterator[tuple[Item, dict[str, Any]]]:
+    """Yield each item with its result, one after the other."""
+    for item in items:
+        yield item, run_item(item.words, folder)
+
+
+def results_of_dask(
+    items: Sequence[Item], folder: str, *, address: str = "", workers: int = 0
+) -> Iterator[tuple[Item, dict[str, Any]]]:
+    """Yield each item with its result as it comes, from the scheduler at `address` or from a local cluster of `workers` processes.
+
+    An item that fails on several workers, each of which died, has an error and no exit code. LinkError without a scheduler.
+    """
+    distributed = need_distributed()
+    with ExitStack() as opened:
+        if not address:
+            cluster = distributed.LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+            address = opened.enter_context(cluster)
+        try:
+            client = opened.enter_context(distributed.Client(address, timeout=CONNECT_S))
+        except (OSError, ValueError) as error:
+            raise LinkError(
+                f"--dask {address}: no scheduler answers: {error}",
+                remedy="start one with `dask scheduler`, or use --workers",
+            ) from error
+        futures = {
+            client.submit(run_item, item.words, folder, key=f"pans-{number}", pure=False, retries=RETRIES): item
+            for number, item in enumerate(items)
+        }
+        by_key = {future.key: item for future, item in futures.items()}
+        try:
+            for future in distributed.as_completed(list(futures)):
+                yield by_key[future.key], _result(future)
+                future.release()
+        except BaseException:
+            client.cancel(list(futures), force=True)
+            raise
+
+
+def _result(future: Any) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = future.result()
+    except Exception as error:  # a worker that died again and again, or that has no pans
+        failed = {"exit": None, "seconds": None, "host": "", "answer": None}
+        return failed | {"error": f"{type(error).__name__}: {error}"[:2000]}
+    return found
+
+
+def need_distributed() -> Any:
+    """Return dask.distributed; UsageError that names the extra."""
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as error:
+        raise UsageError(
+            "--dask and --workers need the packages dask and distributed, which are not installed",
+            remedy="pip install 'pans-runtime[dask]'",
+        ) from error
+
+
 # ---- the journal ----
 
 
@@ -204,3 +277,142 @@ def flat_rows(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 found[key if key not in found else f"answer.{key}"] = value
         flat.append(found)
     return flat
+
+
+# ---- the command ----
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("command", metavar="COMMAND", choices=(*ON_FILES, *ON_NAMES), help="what to do with each input")
+    parser.add_argument(
+        "inputs", nargs="+", metavar="INPUT", help="files or patterns in quotes; of reproduce, train: names"
+    )
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="results: .parquet or .jsonl")
+    parser.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="NAME=VALUES",
+        help="run each input with each of these values of --NAME: seed=0-9, or eta=0.5,1,2 (repeatable)",
+    )
+    parser.add_argument(
+        "--with",
+        dest="extra",
+        default="",
+        metavar="WORDS",
+        help="further options of COMMAND; {path}, {folder}, {stem} and varied names are replaced",
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=WORKERS.option, metavar="N", help="N processes on this machine (extra dask)")
+    where.add_argument(
+        "--dask", default="", metavar="URL", help="a scheduler of Dask, such as tcp://host:8786 (extra dask)"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with these results: only what is missing or has changed"
+    )
+    add_force(parser)
+
+
+def _run(args: argparse.Namespace) -> int:
+    journal = _journal(args)
+    items = items_of(args.command, args.inputs, args.vary, args.extra, files=args.command in ON_FILES)
+    _check_words(args.command, items[0])
+    if args.resume and journal.path.exists():
+        journal.read()
+    elif args.force:
+        journal.path.unlink(missing_ok=True)
+    # what failed without an answer is tried again
+    todo = [item for item in items if journal.rows.get(item.key, {}).get("answer") is None]
+    if len(todo) < len(items):
+        say(f"{len(items) - len(todo)} of {len(items)} are done already")
+    began_s = time.monotonic()
+    try:
+        _work(args, journal, todo)
+    except KeyboardInterrupt:
+        say(f"interrupted; finished results are in {journal.path}\n  go on: the same command with --resume")
+        return EXIT_INTERRUPTED
+    rows = [journal.rows[item.key] for item in items]
+    if args.out.suffix == ".parquet":
+        write_rows(args.out, flat_rows(rows), force=args.force or args.resume)
+    failed = [row for row in rows if row["exit"] != 0]
+    payload = {
+        "results": str(args.out),
+        "items": len(items),
+        "run": len(todo),
+        "failed": [{"item": row["item"], "exit": row["exit"], "error": row["error"]} for row in failed],
+        "seconds": round(time.monotonic() - began_s, 3),
+    }
+    lines = [f"{len(items)} items, {len(failed)} of them not with exit code 0: {args.out}"]
+    lines += [f"  {row['item']}: exit {row['exit']}: {row['error'] or 'an alert'}" for row in failed[:20]]
+    emit(args, payload, "\n".join(lines))
+    return EXIT_ALERT if failed else EXIT_FINE
+
+
+def _journal(args: argparse.Namespace) -> Journal:
+    """Check the outputs and return the journal: OUT itself, or beside a Parquet file."""
+    if args.out.suffix not in (".parquet", ".jsonl"):
+        raise UsageError(f"--out {args.out}: allowed are .parquet and .jsonl", remedy="name it results.jsonl")
+    if args.out.suffix == ".parquet":
+        need_pyarrow()
+    if args.dask or args.workers:
+        need_distributed()
+    path = args.out if args.out.suffix == ".jsonl" else args.out.with_name(f"{args.out.name}.jsonl")
+    if not args.resume and path.exists() and not args.force:
+        raise UsageError(f"{path}: exists already", remedy="go on with --resume, choose another name, or use --force")
+    mine = args.resume and path.exists()
+    check_outputs({args.out, path}, force=args.force, ours=lambda found: mine)
+    return Journal(path)
+
+
+def _check_words(command: str, item: Item) -> None:
+    """A wrong option is found before anything runs."""
+    commands = find_commands()
+    if command not in commands:
+        raise UsageError(f"there is no `pans {command}` here", remedy="`pans` lists the commands")
+    parser_of(command, load_command(commands[command])).parse_args([*item.words[1:], "--json"])
+
+
+def _work(args: argparse.Namespace, journal: Journal, todo: list[Item]) -> None:
+    if not todo:
+        return
+    folder, began_s = str(Path.cwd()), time.monotonic()
+    if args.dask or args.workers:
+        results = results_of_dask(todo, folder, address=args.dask, workers=args.workers or 0)
+    else:
+        results = results_here(todo, folder)
+    reported_s = began_s
+    with closing(results), _bar(len(todo)) as step:  # type: ignore[type-var]
+        for number, (item, row) in enumerate(results, 1):
+            journal.add(item, row)
+            step()
+            now_s = time.monotonic()
+            if not sys.stderr.isatty() and now_s - reported_s > REPORT_EVERY_S and number < len(todo):
+                reported_s = now_s
+                left_s = (now_s - began_s) / number * (len(todo) - number)
+                say(f"{number} of {len(todo)} done, about {left_s:.0f} s left")
+
+
+@contextmanager
+def _bar(total: int) -> Iterator[Any]:
+    if not sys.stderr.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("batch"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=total)
+        yield lambda: progress.advance(task)
+
+
+BATCH = Command(
+    "run one command on many recordings, bundles or seeds, with Dask if wanted",
+    _configure,
+    _run,
+    (
+        "pans batch replay 'runs/*/run.pansrec' --workers 4 -o replays.parquet",
+        "pans batch evaluate fashion10.pans --vary seed=0-9 --with='--trials 5' -o seeds.jsonl",
+        "pans batch report 'runs/*/run.pansrec' --with='-o {folder}/report.html' --dask tcp://host:8786 -o reports.jsonl",
+    ),
+)

@@ -23,7 +23,7 @@ from pans.runtime.errors import PansError
 from .warm import JOBS, PATIENCE_S, Job, cache_folder, compile_settling, start
 
 LARGEST = "core"  # the job of the other process
-LATER = ("live.loop", "monitor.snapshot", "record.recorder", "watch.attendants", "watch.host")
+LATER = ("live.loop", "monitor.snapshot", "record.parted_recorder", "watch.watchers")
 BESIDE = "link"  # what this process compiles meanwhile
 # whose sources kernels are made from: SOURCES of wire/inner.py, which needs numba
 PACKAGES = ("core", "decide", "flow", "instrument", "record", "timing", "turn", "wire")

@@ -1,27 +1,214 @@
-"""`pans runs`: list what lies in a folder of runs, and prune it.
+"""`pans runs`: list what lies in a folder of runs (date, bundle, verdict, decisions, size), and prune it.
 
-Owns the arguments and how the list looks; the facts and the rule of deletion are inventory.py's.
+No file is deleted that no run of pans has written, and none of a run that is under way. A recording is read as far as it is needed: its
+header, and its END, which `read_recording` would check against all bytes.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import re
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, warn
-from pans.runtime.errors import UsageError
+from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block
+from pans.runtime.errors import PansError, UsageError
 from pans.runtime.ranges import Range
-from pans.runtime.run_folder import LATEST, RUNS
+from pans.runtime.record.format import MAGIC, READABLE_VERSIONS, Kind, limits_of
+from pans.runtime.run_folder import LATEST, RUNS, locked
 from pans.runtime.safe_text import one_line
 
-from .inventory import Run, delete_run, prunable, runs_in
-
+OURS = re.compile(
+    r"[^/]*\.pansrec|[^/]*\.parts\.json|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock"
+)
+RUN_LOCK = ".pans-run.lock"
+END_MAX_BYTES = 1 << 24  # read from the end of a recording, in which its END is looked for
 KEEP = Range(0, 1_000_000, whole=True)
 _TIMES = {"s": 1, "min": 60, "h": 3600, "d": 86400, "w": 7 * 86400, "y": 365 * 86400}
 _SIZES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
 _QUANTITY = re.compile(r"(\d{1,12}(?:\.\d{1,6})?)\s?([A-Za-z]+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One folder with a recording; what is not known is "" or None."""
+
+    folder: Path
+    started: datetime
+    bundle: str
+    verdict: str  # PASS, FAIL, "running", or "cut" without an END
+    decisions: int | None
+    accuracy: float | None
+    size: int  # bytes, of the run's own files
+    simulated: bool
+    locked: bool
+    files: tuple[Path, ...] = field(repr=False)
+    foreign: tuple[Path, ...] = field(repr=False)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the facts, JSON-able."""
+        return {
+            "folder": str(self.folder),
+            "started": self.started.isoformat(timespec="seconds"),
+            "bundle": self.bundle,
+            "verdict": self.verdict,
+            "decisions": self.decisions,
+            "accuracy": self.accuracy,
+            "bytes": self.size,
+            "simulated": self.simulated,
+            "locked": self.locked,
+        }
+
+
+def runs_in(root: Path) -> list[Run]:
+    """Return the runs in `root` and, if it is one itself, in it; the newest first. UsageError for a folder that cannot be read."""
+    try:
+        inside = [path for path in root.iterdir() if path.is_dir() and not path.is_symlink()]
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"{root}: cannot be read: {reason}", remedy="name a folder of runs") from error
+    found = [run for folder in (root, *inside) if (run := run_of(folder)) is not None]
+    return sorted(found, key=lambda run: (run.started, run.folder.name), reverse=True)
+
+
+def run_of(folder: Path) -> Run | None:
+    """Return the run in `folder`, None if there is no recording in it."""
+    try:
+        entries = sorted(path for path in folder.iterdir() if path.name != LATEST)
+    except OSError:
+        return None
+    recordings = [path for path in entries if path.suffix == ".pansrec" and path.is_file() and not path.is_symlink()]
+    if not recordings:
+        return None
+    files = [path for path in entries if OURS.fullmatch(path.name) and path.is_file() and not path.is_symlink()]
+    (header, bundle), summary = _begin(recordings[0]), _end(recordings[-1])
+    is_locked = _is_locked(folder / RUN_LOCK)
+    verdict = "running" if is_locked else str(summary.get("verdict", "cut"))
+    return Run(
+        folder=folder,
+        started=_started(header, recordings[0]),
+        bundle=bundle or str(header.get("bundle_sha256", ""))[:12],
+        verdict=verdict[:20],
+        decisions=_number(summary.get("decisions")),
+        accuracy=_number(summary.get("accuracy")),
+        size=sum(path.stat().st_size for path in files),
+        simulated=bool(header.get("simulated") or summary.get("simulated")),
+        locked=is_locked,
+        files=tuple(files),
+        foreign=tuple(path for path in entries if path not in files),
+    )
+
+
+def _begin(path: Path) -> tuple[dict[str, Any], str]:
+    """Return a recording's header and the name of the bundle inside, {} and "" if they cannot be read."""
+    header: dict[str, Any] = {}
+    with suppress(PansError, OSError), open_regular(path) as file:
+        version, chain = check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, READABLE_VERSIONS, str(path))
+        for number in range(2):
+            block = read_block(file, number, chain, limits_of(version), str(path))
+            if block is not None and block.kind == Kind.HEADER:
+                header, chain = parse_json_object(block.payload, str(path)), block.chain
+            elif block is not None and block.kind == Kind.BUNDLE:
+                return header, _name_in(block.payload)
+    return header, ""
+
+
+def _name_in(bundle: bytes) -> str:
+    """Return the name that a bundle gives itself, "" without one; nothing else of it is read."""
+    start = bundle.find(b"{", 0, 256)
+    with suppress(ValueError, RecursionError):
+        found, _ = json.JSONDecoder().raw_decode(bundle[start : start + (1 << 20)].decode("ascii", "replace"))
+        return str(found.get("name", ""))[:100]
+    return ""
+
+
+def _end(path: Path) -> dict[str, Any]:
+    """Return the summary of a recording's END, {} without one; its bytes are not checked against the whole file."""
+    with suppress(PansError, OSError, ValueError, RecursionError), open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        file.seek(max(0, size - END_MAX_BYTES))
+        tail = file.read(END_MAX_BYTES)
+        start = tail.rfind(b'{"blocks":')
+        if start >= 0:
+            found, _ = json.JSONDecoder().raw_decode(tail[start:].decode("ascii", "replace"))
+            summary = found.get("summary")
+            return summary if isinstance(summary, dict) else {}
+    return {}
+
+
+def _started(header: dict[str, Any], path: Path) -> datetime:
+    with suppress(ValueError):
+        found = datetime.fromisoformat(str(header.get("created_utc", "")))
+        return found if found.tzinfo else found.replace(tzinfo=UTC)
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC)
+
+
+def _number(value: Any) -> Any:
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _is_locked(path: Path) -> bool:
+    if not path.exists():
+        return False
+    try:
+        import fcntl
+    except ModuleNotFoundError:
+        return True  # the file goes with its run there
+    try:
+        with open(path, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return False
+    except OSError:
+        return True
+
+
+# ---- which may go ----
+
+
+def prunable(
+    runs: Sequence[Run], *, older_s: float | None, larger: int | None, keep: int, now: float | None = None
+) -> list[Run]:
+    """Return the runs, oldest last, that are older than `older_s` and larger than `larger` bytes (None: whatever that is).
+
+    The `keep` newest ones stay, and so does every run that is going on.
+    """
+    at = time.time() if now is None else now
+    return [
+        run
+        for run in sorted(runs, key=lambda run: run.started, reverse=True)[keep:]
+        if not run.locked
+        and (older_s is None or at - run.started.timestamp() > older_s)
+        and (larger is None or run.size > larger)
+    ]
+
+
+def delete_run(run: Run) -> Iterator[str]:
+    """Delete the files of `run`, and its folder if nothing else is in it; yield what stays and why. UsageError if it began to run."""
+    lock = run.folder / RUN_LOCK
+    with locked(lock):
+        for path in run.files:
+            if path == lock:
+                continue
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                yield f"{path}: {error.strerror or error}"
+    try:
+        run.folder.rmdir()
+    except OSError:
+        rest = sorted(path.name for path in run.folder.iterdir())
+        yield f"{run.folder}: kept, as other files are in it: {', '.join(rest[:5])}"
+
+
+# ---- the command ----
 
 
 def _quantity(text: str, units: dict[str, int], example: str) -> float:
@@ -66,17 +253,13 @@ def _run(args: argparse.Namespace) -> int:
             raise UsageError(f"--{option} has no effect on a list", remedy=f"pans runs prune --{option} ...")
     runs = runs_in(folder)
     latest = folder / LATEST
-    payload = {
+    payload: dict[str, Any] = {
         "folder": str(folder),
         "latest": str(latest.resolve()) if latest.is_symlink() else None,
         "bytes": sum(run.size for run in runs),
         "runs": [run.as_json() for run in runs],
     }
-    emit(
-        args,
-        payload,
-        "\n".join([*_table(runs), f"{len(runs)} runs, {_size(sum(run.size for run in runs))} in {folder}"]),
-    )
+    emit(args, payload, "\n".join([*_table(runs), f"{len(runs)} runs, {_size(payload['bytes'])} in {folder}"]))
     return EXIT_FINE
 
 
@@ -95,7 +278,9 @@ def _prune(args: argparse.Namespace, folder: Path) -> int:
                 stays += delete_run(run)
             except UsageError as error:  # it began to run since it was listed
                 stays.append(error.message)
-        _mend_latest(folder)
+        latest = folder / LATEST
+        if latest.is_symlink() and not latest.exists():
+            latest.unlink()  # it named a run that is gone
     for line in stays:
         warn(line)
     payload = {
@@ -111,13 +296,6 @@ def _prune(args: argparse.Namespace, folder: Path) -> int:
     return EXIT_ALERT if stays else EXIT_FINE
 
 
-def _mend_latest(folder: Path) -> None:
-    """A link to a run that is gone goes too."""
-    latest = folder / LATEST
-    if latest.is_symlink() and not latest.exists():
-        latest.unlink()
-
-
 def _table(runs: Sequence[Run]) -> list[str]:
     rows = [("begun", "verdict", "decisions", "accuracy", "size", "bundle", "folder"), *(_row(run) for run in runs)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
@@ -130,15 +308,8 @@ def _row(run: Run) -> tuple[str, ...]:
     verdict = f"{run.verdict}{' SIMULATED' if run.simulated else ''}"
     begun = run.started.astimezone().strftime("%Y-%m-%d %H:%M")
     decisions = "" if run.decisions is None else str(run.decisions)
-    return (
-        begun,
-        one_line(verdict, 40),
-        decisions,
-        accuracy,
-        _size(run.size),
-        one_line(run.bundle, 40),
-        one_line(run.folder.name, 80),
-    )
+    names = one_line(run.bundle, 40), one_line(run.folder.name, 80)
+    return (begun, one_line(verdict, 40), decisions, accuracy, _size(run.size), *names)
 
 
 def _size(count: int) -> str:

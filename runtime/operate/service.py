@@ -1,6 +1,7 @@
 """`pans service`: a systemd unit for a run whose options are in a file: written, shown, verified, removed; and what Prometheus needs.
 
-Owns the command. It writes and removes unit files and asks `systemd-analyze` about them; starting and stopping services is systemctl's.
+Starting and stopping services is systemctl's. `verify --start` starts the run as systemd does and hears its messages (sd_notify(3)) on a
+real socket. A unit of ours begins with MARK; others are never replaced or removed. Quoting: systemd.service(5), systemd.syntax(7).
 """
 
 from __future__ import annotations
@@ -8,10 +9,17 @@ from __future__ import annotations
 import argparse
 import getpass
 import os
+import re
 import shutil
+import signal
+import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +27,44 @@ from pans.runtime import SHIPPED
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, say, warn
 from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
+from pans.runtime.container import read_file
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, make_folder, write_file
 from pans.runtime.ranges import Range
 from pans.runtime.run_folder import RUNS
+from pans.runtime.timing.ledger import FIFO_PRIORITY
 
-from .notify_check import Heard, start_and_hear
-from .unit import (
-    START_S,
-    STOP_S,
-    Service,
-    check_name,
-    command_of,
-    is_unit_of_ours,
-    quoted,
-    read_unit,
-    unit_text,
-    units_folder,
-)
-
+MARK = "# Written by `pans service install`; change the file of options, not this one."
+SYSTEM_UNITS, USER_UNITS = Path("/etc/systemd/system"), Path("~/.config/systemd/user")
+UNIT_MAX_BYTES = 1 << 16
+START_S = 180  # kernels are compiled once, on a slow machine for a minute
+STOP_S = 45  # the watchdog ends a stuck run within 5 s; a slow disk has 30 s to sync
+RESTART_S = 5
+NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}")
+# What only the system's manager can forbid everywhere.
+WALLS = """ProtectSystem=strict
+ProtectHome=read-only
+PrivateTmp=yes
+ProtectControlGroups=yes
+ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectKernelLogs=yes
+ProtectClock=yes
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+SystemCallArchitectures=native
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+# serial ports and USB devices, and no others
+DevicePolicy=closed
+DeviceAllow=char-ttyACM rw
+DeviceAllow=char-ttyUSB rw
+DeviceAllow=char-ttyS rw
+DeviceAllow=char-pts rw
+DeviceAllow=char-usb_device rw"""
+_ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "%": "%%"}
+POLL_S = 0.05
+NOT_THE_SERVICES = ("INVOCATION_ID", "JOURNAL_STREAM", "MAINPID")
 WATCHDOG = Range(16, 3600)  # a run that looks for its lost device may be silent for 15 s
 START = Range(1, 86400)
 ANALYZE_S = 60
@@ -49,6 +76,216 @@ OF_ACTION = {  # options that have an effect with each action, beside --name, --
     "remove": set(),
     "monitoring": {"out", "force"},
 }
+
+
+# ---- the unit ----
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """What a unit is written for; `writes` are the folders that the run writes to, all paths absolute."""
+
+    name: str
+    command: tuple[str, ...]
+    folder: Path
+    writes: tuple[Path, ...]
+    watchdog_s: float
+    user: str = ""  # whom a unit of the system runs as; "" in a unit of a user's own manager
+
+
+def unit_text(service: Service) -> str:
+    """Return the unit."""
+    return "\n".join([MARK, *_directives(service)]) + "\n"
+
+
+def _directives(service: Service) -> Iterator[str]:
+    user = [f"User={service.user}"] if service.user else []
+    yield f"""[Unit]
+Description=pans run, {service.name}
+After=network.target local-fs.target
+StartLimitIntervalSec=600
+StartLimitBurst=10
+
+[Service]
+Type=notify
+NotifyAccess=main
+WatchdogSec={service.watchdog_s:g}
+ExecStart={command_line(service.command)}
+WorkingDirectory={_escaped(str(service.folder))}"""
+    yield from user
+    yield f"""Restart=on-failure
+RestartSec={RESTART_S}
+# 2: the options or a file are wrong, or the disk is full; starting again would not mend that
+RestartPreventExitStatus=2
+TimeoutStartSec={START_S}
+TimeoutStopSec={STOP_S}
+KillMode=mixed
+
+# real time: the loop asks for SCHED_FIFO and locks its memory
+LimitRTPRIO={FIFO_PRIORITY}
+LimitMEMLOCK=infinity
+LimitNOFILE=4096
+
+# compiled kernels, which cannot be kept beside the package
+CacheDirectory=pans-{service.name}
+Environment=NUMBA_CACHE_DIR=%C/pans-{service.name}
+
+# hardening; MemoryDenyWriteExecute and RestrictRealtime would forbid compiled kernels and SCHED_FIFO
+NoNewPrivileges=yes
+UMask=0027"""
+    if user:
+        yield WALLS
+        yield from (f"ReadWritePaths={quoted(str(path))}" for path in sorted({service.folder, *service.writes}))
+    yield f"\n[Install]\nWantedBy={'multi-user' if user else 'default'}.target"
+
+
+# ---- quoting ----
+
+
+def _escaped(text: str) -> str:
+    return "".join(_ESCAPES.get(letter, letter) for letter in text)
+
+
+def quoted(text: str) -> str:
+    """Return one word as a unit writes it: in quotes, with systemd's escapes and specifiers doubled."""
+    return f'"{_escaped(text)}"'
+
+
+def command_line(words: Sequence[str]) -> str:
+    """Return the value of ExecStart for a command whose first word is an absolute path.
+
+    >>> command_line(["/usr/bin/pans", "run", "50%.pans", "$HOME"])
+    '"/usr/bin/pans" "run" "50%%.pans" "$$HOME"'
+    """
+    return " ".join(quoted(word).replace("$", "$$") for word in words)
+
+
+def command_of(text: str) -> tuple[list[str], Path]:
+    """Return the command and the working directory of the unit `text`, which is one of ours; UsageError if they are not there."""
+    values = {key: value for key, _, value in (line.partition("=") for line in text.split("\n"))}
+    words = [_unescaped(found) for found in re.findall(r'"((?:[^"\\]|\\.)*)"', values.get("ExecStart", ""))]
+    folder = _unescaped(values.get("WorkingDirectory", ""))
+    if not words or not folder:
+        raise UsageError("the unit has no ExecStart or no WorkingDirectory", remedy="install it again")
+    return [word.replace("$$", "$") for word in words], Path(folder)
+
+
+def _unescaped(text: str) -> str:
+    letters = {"n": "\n", "t": "\t", "r": "\r"}
+    return re.sub(r"\\(.)", lambda found: letters.get(found[1], found[1]), text.replace("%%", "%"))
+
+
+# ---- files ----
+
+
+def check_name(name: str) -> str:
+    """Return `name`; UsageError if a unit cannot be called so."""
+    if not NAME.fullmatch(name):
+        raise UsageError(
+            f"--name {name!r}: allowed are letters, digits, dot, dash and underscore, at most 100",
+            remedy="choose a short name, such as lab",
+        )
+    return name
+
+
+def is_unit_of_ours(path: Path) -> bool:
+    """Return whether `path` is a unit that `pans service install` has written."""
+    return path.is_file() and path.stat().st_size <= UNIT_MAX_BYTES and path.read_bytes().startswith(MARK.encode())
+
+
+def read_unit(path: Path) -> str:
+    """Return the text of a unit of ours; UsageError for any other file, and if it is not there."""
+    text = read_file(path, UNIT_MAX_BYTES).decode("utf-8", "replace")
+    if not text.startswith(MARK):
+        raise UsageError(
+            f"{path}: was not written by `pans service install`", remedy="name another service with --name"
+        )
+    return text
+
+
+# ---- what a service tells systemd ----
+
+
+@dataclass(slots=True)
+class Heard:
+    """What a service said, and when: seconds since its start."""
+
+    ready_s: float | None = None
+    watchdog_s: list[float] = field(default_factory=list)
+    stopping_s: float | None = None
+    asked_s: float | None = None  # SIGTERM
+    ended_s: float = 0.0
+    exit_code: int | None = None  # None: it had to be killed
+
+    def take(self, message: str, at_s: float) -> None:
+        """Note one datagram, which may hold several lines."""
+        for line in message.split("\n"):
+            if line == "READY=1" and self.ready_s is None:
+                self.ready_s = at_s
+            elif line == "WATCHDOG=1":
+                self.watchdog_s.append(at_s)
+            elif line == "STOPPING=1":
+                self.stopping_s = at_s
+
+    def longest_silence_s(self) -> float:
+        """The longest time between two signs of life, from READY to SIGTERM or the end."""
+        if self.ready_s is None:
+            return float("inf")
+        until = self.ended_s if self.asked_s is None else self.asked_s
+        times = [self.ready_s, *(at for at in self.watchdog_s if self.ready_s <= at <= until), until]
+        return max(after - before for before, after in pairwise(times))
+
+
+def start_and_hear(
+    command: Sequence[str], folder: Path, *, watchdog_s: float, seconds: float, start_s: float, stop_s: float
+) -> tuple[Heard, str]:
+    """Run `command` in `folder` for `seconds` after it is ready, stop it with SIGTERM, and return what it said, and its stderr's end.
+
+    It has `start_s` to be ready and `stop_s` to end, as systemd gives it. UsageError where there are no such sockets.
+    """
+    if not hasattr(socket, "AF_UNIX"):
+        raise UsageError("systemd's notify protocol needs sockets of the family AF_UNIX", remedy="use Linux")
+    heard = Heard()
+    with (
+        tempfile.TemporaryDirectory(prefix="pans-notify-") as place,
+        tempfile.TemporaryFile() as stderr,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
+    ):
+        address = str(Path(place) / "notify")
+        manager.bind(address)
+        manager.settimeout(POLL_S)
+        environment = {key: value for key, value in os.environ.items() if key not in NOT_THE_SERVICES}
+        environment |= {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": str(round(watchdog_s * 1e6))}
+        began_s = time.monotonic()
+        process = subprocess.Popen(
+            command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr
+        )
+        due_s = start_s
+        while True:
+            ended = process.poll() is not None
+            try:
+                heard.take(manager.recv(4096).decode("utf-8", "replace"), time.monotonic() - began_s)
+            except TimeoutError:
+                if ended:
+                    break
+            now_s = time.monotonic() - began_s
+            if heard.ready_s is not None and heard.asked_s is None:
+                due_s = heard.ready_s + seconds
+            if now_s <= due_s or ended:
+                continue
+            if heard.asked_s is not None:
+                process.kill()
+                process.wait()
+                break
+            heard.asked_s, due_s = now_s, now_s + stop_s
+            process.send_signal(signal.SIGTERM)
+        heard.ended_s = time.monotonic() - began_s
+        heard.exit_code = process.returncode if ended else None
+        stderr.seek(max(0, stderr.tell() - 2000))
+        return heard, stderr.read().decode("utf-8", "replace")
+
+
+# ---- the command ----
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -78,7 +315,8 @@ def _run(args: argparse.Namespace) -> int:
     _check_effects(args)
     if args.action == "monitoring":
         return _monitoring(args)
-    path = units_folder(args.unit_dir, user=args.user) / f"pans-{check_name(_name(args))}.service"
+    folder = args.unit_dir or (USER_UNITS.expanduser() if args.user else SYSTEM_UNITS)
+    path = folder / f"pans-{check_name(_name(args))}.service"
     if args.action == "verify":
         return _verify(args, path)
     if args.action == "remove":

@@ -1,8 +1,8 @@
 """The computer around a run: the space left on the disk of the recording, and whether the computer's own clock was set.
 
-Owns a thread that looks every EVERY_S, what it finds (`facts`), what is to be noted (`news`), and the decision that a run must stop before
-its disk is full. The loop takes the news; it never waits for a look. Decisions use a monotonic clock: a clock that was set changes the
-times of day in a recording and nothing else.
+A thread looks every EVERY_S. What it finds stands in `facts`, what is to be noted comes out of `news`, and a run must stop before its disk
+is full. The loop takes the news; it never waits for a look. Decisions use a monotonic clock: a clock that was set changes the times of
+day in a recording and nothing else.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pans.runtime.cli import warn
 from pans.runtime.live.continuous import DISK_NEARLY_FULL, RECORDING_DELETED
 
 EVERY_S = 5.0
 FILE_EVERY_S = 0.5  # whether the recording still has a name
-SLOPE_S = 600.0  # over which the present rate is taken
-SLOPE_LEAST_S = 30.0
-SHORT_S = 3600.0  # a warning below that
-SHORT_RESERVES = 5  # or with less than so many reserves
+SLOPE_S, SLOPE_LEAST_S = 600.0, 30.0  # over which the present rate is taken
+SHORT_S, SHORT_RESERVES = 3600.0, 5  # a warning below that, or with less than so many reserves
 STEP_NS = 50_000_000  # a slewed clock moves 2.5 ms in EVERY_S: 500 ppm, the most that NTP uses (adjtimex(2))
-_UNSYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
-_TIME_ERROR = 5
+_UNSYNCHRONISED, _TIME_ERROR = 0x40, 5  # STA_UNSYNC and TIME_ERROR of adjtimex(2)
 
 
 class HostWatch:
@@ -44,8 +43,7 @@ class HostWatch:
         is_deleted: Callable[[], bool] = lambda: False,
     ) -> None:
         self._recording, self._reserve, self._stop, self._is_deleted = recording, reserve, stop, is_deleted
-        self._disk = DiskTrend()
-        self._clock = ClockSteps()
+        self._disk, self._clock = DiskTrend(), ClockSteps()
         self._facts: dict[str, Any] = {}
         self._news: deque[dict[str, Any]] = deque(maxlen=100)
         self._is_short = self._asked = False
@@ -70,20 +68,23 @@ class HostWatch:
 
     def look(self) -> None:
         """Look once."""
-        facts = self._look_at_clock()
-        path = self._recording()
-        if path is not None:
+        if step_ns := self._clock.step_ns(clock_offset_ns()):
+            self._news.append({"kind": "host_clock_step", "step_s": round(step_ns / 1e9, 3)})
+        facts: dict[str, Any] = {"host_clock_steps": self._clock.steps}
+        if (synchronised := clock_is_synchronised()) is not None:
+            facts["host_clock_synchronised"] = synchronised
+        if (path := self._recording()) is not None:
             with suppress(OSError):
                 facts |= self._look_at_disk(path)
         self._facts = facts
 
     def _keep(self) -> None:
-        due_s, told = time.monotonic() + EVERY_S, False
+        due_s, deleted = time.monotonic() + EVERY_S, False
         while not self._ending.wait(FILE_EVERY_S):
-            if not told and self._is_deleted():
-                told = True
-                warn(f"{RECORDING_DELETED}: {self._recording()}; the run ends, and what can be kept is kept beside it")
-                self._news.append({"kind": "recording_deleted", "path": str(self._recording())})
+            if not deleted and self._is_deleted():
+                deleted, path = True, self._recording()
+                warn(f"{RECORDING_DELETED}: {path}; the run ends, and what can be kept is kept beside it")
+                self._news.append({"kind": "recording_deleted", "path": str(path)})
                 self._stop(RECORDING_DELETED)
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + EVERY_S
@@ -98,26 +99,15 @@ class HostWatch:
             facts["disk_left_s"] = round(left_s)
         with suppress(OSError):
             facts["recording_bytes"] = os.stat(path).st_size
-        self._warn(free, left_s, path)
-        return facts
-
-    def _warn(self, free: int, left_s: float | None, path: Path) -> None:
         is_short = (left_s is not None and left_s < SHORT_S) or free < SHORT_RESERVES * self._reserve
-        told = {"folder": str(path.parent), "free_bytes": free, "left_s": None if left_s is None else round(left_s)}
+        event = {"folder": str(path.parent), "free_bytes": free, "left_s": facts.get("disk_left_s")}
         if is_short and not self._is_short:
-            self._news.append({"kind": "disk_short", **told})
+            self._news.append({"kind": "disk_short", **event})
         self._is_short = is_short
         if free < self._reserve and not self._asked:
             self._asked = True
-            self._news.append({"kind": "disk_nearly_full", **told, "reserve_bytes": self._reserve})
+            self._news.append({"kind": "disk_nearly_full", **event, "reserve_bytes": self._reserve})
             self._stop(DISK_NEARLY_FULL)
-
-    def _look_at_clock(self) -> dict[str, Any]:
-        if step_ns := self._clock.step_ns(clock_offset_ns()):
-            self._news.append({"kind": "host_clock_step", "step_s": round(step_ns / 1e9, 3)})
-        facts: dict[str, Any] = {"host_clock_steps": self._clock.steps}
-        if (synchronised := clock_is_synchronised()) is not None:
-            facts["host_clock_synchronised"] = synchronised
         return facts
 
 
@@ -128,7 +118,7 @@ class DiskTrend:
         self._seen: deque[tuple[float, int]] = deque(maxlen=round(SLOPE_S / EVERY_S))
 
     def add(self, at_s: float, free: int) -> None:
-        """Take one look."""
+        """Add one look."""
         if self._seen and free > self._seen[-1][1] + max(1 << 20, self._seen[-1][1] // 100):
             self._seen.clear()  # something was deleted: the rate begins anew
         self._seen.append((at_s, free))
@@ -137,10 +127,9 @@ class DiskTrend:
         """Return the seconds until the disk is full at the present rate, None while it is not known or the disk does not fill up."""
         if len(self._seen) < 2 or self._seen[-1][0] - self._seen[0][0] < SLOPE_LEAST_S:
             return None
-        mean_s = sum(at_s for at_s, _ in self._seen) / len(self._seen)
-        mean = sum(free for _, free in self._seen) / len(self._seen)
-        around = [(at_s - mean_s, free - mean) for at_s, free in self._seen]
-        slope = sum(off_s * off for off_s, off in around) / sum(off_s * off_s for off_s, _ in around)
+        seen = np.array(self._seen)
+        off_s, off = (seen - seen.mean(axis=0)).T
+        slope = float(off_s @ off / (off_s @ off_s))
         return self._seen[-1][1] / -slope if slope < 0 else None
 
 
@@ -165,9 +154,7 @@ def clock_offset_ns() -> int:
     """Return time of day minus monotonic time, of the least disturbed of five readings."""
     found = []
     for _ in range(5):
-        before = time.monotonic_ns()
-        now = time.time_ns()
-        after = time.monotonic_ns()
+        before, now, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         found.append((after - before, now - (before + after) // 2))
     return min(found)[1]
 
@@ -187,8 +174,8 @@ def clock_is_synchronised() -> bool | None:
     """Return whether the kernel takes its clock for synchronised (NTP, PTP), None where it does not tell."""
     if sys.platform != "linux":
         return None
+    facts = _Timex()
     try:
-        facts = _Timex()
         state = ctypes.CDLL(None).adjtimex(ctypes.byref(facts))
     except (OSError, AttributeError):
         return None

@@ -1,7 +1,6 @@
 """The run's figures for Prometheus: a small HTTP server that answers with the same picture as the state file.
 
-Owns names, types and the address; the figures are state_file.py's, the server http.py's. On this machine only, unless it is said twice that
-others may read: there is no password. Needs the extra `metrics`; an answer costs the loop what one thread's Python does, within limits.
+On this machine only, unless it is said twice that others may read: there is no password. Needs the extra `metrics`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A run as one flat picture: what it has done, what went wrong last, what it uses; and the file that shows it to others.
 
-Owns the picture (`picture_of`) and its writing, beside and renamed once per second, by a thread of its own; never touches the run. The file
-is not synced: it is for whoever watches, not for after a power cut.
+Whether the loop turns is judged by its own stamp: it sets `LiveRun.turned_s` at each iteration, and while it looks for a lost device at
+each attempt. The file is written anew once per second, by a thread of its own.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.container import canonical_json
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 
-from .heartbeat import is_stalled, loop_age_s
-
 if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
     from pans.runtime.record import Recorder
@@ -28,6 +26,20 @@ FORMAT = "pans-state 1"
 EVERY_S = 1.0
 GOODBYE_S = 5.0
 OTHER_WRITER_S = 1.0
+STALLED_AFTER_S = (
+    0.75  # an iteration waits 20 ms at most; the state file, written each second, says "stalled" within 2 s
+)
+LOST_STALLED_AFTER_S = 15.0  # while a lost device is looked for: pauses of 2 s, a handshake of 5 s, the upload
+
+
+def loop_age_s(run: LiveRun) -> float:
+    """Return how long ago the loop turned, in seconds."""
+    return max(0.0, time.monotonic() - run.turned_s)
+
+
+def is_stalled(run: LiveRun) -> bool:
+    """Whether the loop should have turned by now."""
+    return loop_age_s(run) > (STALLED_AFTER_S if run.outage_ns is None else LOST_STALLED_AFTER_S)
 
 
 def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 """The end of a run that does not end itself: stuck in a back end or in a call of the file system when a signal asks for its end.
 
-Owns what happens then, by a thread of its own that hears of the signal even where the main thread cannot (`signal.set_wakeup_fd`): the
-device is told to stop, what is buffered is written as far as that does not block, the state file and stderr say where the loop was, and the
-process exits. A run that ends in its own time is left alone. Native code that keeps the interpreter's lock stops this thread too: then the
-lease turns the light off, and only SIGKILL ends the process.
+A thread of its own hears of the signal even where the main thread cannot (`signal.set_wakeup_fd`): the device is told to stop, what is
+buffered is written as far as that does not block, the state file and stderr say where the loop was, and the process exits. A run that ends
+in its own time is left alone. Native code that keeps the interpreter's lock stops this thread too: then the lease turns the light off, and
+only SIGKILL ends the process.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Watchdog:
         self.run: LiveRun | None = None
         self._continuous = continuous
         self._recorder: Recorder | None = None
-        self._told: Callable[[str], None] | None = None
+        self._note: Callable[[str], None] | None = None
         self._closing = False
         self._done = threading.Event()
         self._main = threading.get_ident()
@@ -64,9 +64,9 @@ class Watchdog:
         self._thread.join()
         self._hears.close()
 
-    def watch(self, recorder: Recorder | None, told: Callable[[str], None]) -> None:
-        """Know what is to be flushed, and whom to tell why the process ends."""
-        self._recorder, self._told = recorder, told
+    def watch(self, recorder: Recorder | None, note: Callable[[str], None]) -> None:
+        """Know what is to be flushed, and what notes why the process ends."""
+        self._recorder, self._note = recorder, note
 
     def closes(self) -> None:
         """From here on the light is off and files are closed."""
@@ -114,11 +114,11 @@ class Watchdog:
         stack = _stack_of(self._main)
         why = f"{asked}: the run did not end by itself; it was in {_place(stack)}"
         # The main thread is not in the recorder, and is not expected back: what is buffered can be written from here.
-        if self._recorder is not None and not any(_module(frame).startswith("pans.runtime.record") for frame in stack):
+        modules = [str(frame.f_globals.get("__name__", "")) for frame in stack]
+        if self._recorder is not None and not any(name.startswith("pans.runtime.record") for name in modules):
             _within(STEP_S, self._recorder.flush)
-        if self._told is not None:
-            told = self._told
-            _within(STEP_S, lambda: told(why))
+        if (note := self._note) is not None:
+            _within(STEP_S, lambda: note(why))
         shown = "\x1b[?25h" if sys.stderr.isatty() else ""  # a live view had hidden the cursor
         _within(STEP_S, lambda: os.write(2, f"{shown}pans: {why}\n".encode(errors="replace")))
         os._exit(EXIT_TIMING if asked == ASKED_TO_STOP else EXIT_INTERRUPTED)
@@ -143,10 +143,6 @@ def _stack_of(thread_id: int) -> list[FrameType]:
         stack.append(frame)
         frame = frame.f_back
     return stack
-
-
-def _module(frame: FrameType) -> str:
-    return str(frame.f_globals.get("__name__", ""))
 
 
 def _place(stack: list[FrameType]) -> str:

@@ -15,8 +15,7 @@ from pans.runtime.record import Recorder
 from pans.runtime.report import summary as summary
 from pans.runtime.report import summary_page as summary_page
 from pans.runtime.timing import ledger as ledger
-from pans.runtime.watch import attendants as attendants
-from pans.runtime.watch import watchdog as watchdog
+from pans.runtime.watch import watchers as watchers
 from pans.runtime.wire import FrameDecoder
 
 _, _bundle, _plan = small_setup("sequential")

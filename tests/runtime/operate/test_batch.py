@@ -17,7 +17,7 @@ from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
-from pans.runtime.operate import batch_command
+from pans.runtime.operate import batch
 from pans.runtime.operate.batch import FORMAT, Journal, flat_rows, items_of, run_item
 
 
@@ -42,7 +42,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
         row = {"exit": 1 if bad else 0, "seconds": 0.1, "host": "here", "error": None}
         return row | {"answer": {"accuracy": 0.5, "latency_us": {"p50": 2.0}, "rows": [1, 2], "exit": 9}}
 
-    monkeypatch.setattr("pans.runtime.operate.workers.run_item", answer)
+    monkeypatch.setattr("pans.runtime.operate.batch.run_item", answer)
     return ran
 
 
@@ -93,13 +93,13 @@ def test_an_interrupted_batch_keeps_what_is_done(
     lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     in_this_process(monkeypatch)
-    results = batch_command.results_here
+    results = batch.results_here
 
     def interrupted(items: Any, folder: str) -> Any:
         yield next(results(items, folder))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(batch_command, "results_here", interrupted)
+    monkeypatch.setattr(batch, "results_here", interrupted)
     assert main(["batch", "info", "*/grid.pans", "-o", "r.jsonl"]) == 130
     assert "--resume" in capsys.readouterr().err
     assert len(Path("r.jsonl").read_text().splitlines()) == 1
@@ -109,7 +109,7 @@ def test_results_as_parquet(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the parquet extra")
     in_this_process(monkeypatch)
     words = ["batch evaluate", "a/grid.pans", "--vary", "seed=3,4", "-o", "r.parquet"]
-    monkeypatch.setattr(batch_command, "_check_words", lambda command, item: None)
+    monkeypatch.setattr(batch, "_check_words", lambda command, item: None)
     json_of(capsys, *words)
     table = parquet.read_table("r.parquet").to_pydict()
     assert table["seed"] == ["3", "4"]
@@ -141,7 +141,7 @@ def test_foreign_files_are_no_journals(lab: Path, capsys: pytest.CaptureFixture[
     ],
 )
 def test_what_cannot_be_meant(lab: Path, words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
-    if words[0] == "refit" and "refit" in batch_command.find_commands():
+    if words[0] == "refit" and "refit" in batch.find_commands():
         pytest.skip("pans refit is there")
     assert main(["batch", *words]) == 2
     said = capsys.readouterr().err
@@ -191,17 +191,17 @@ def test_two_workers_share_a_batch_and_a_killed_one_costs_no_result(lab: Path) -
         workers = [subprocess.Popen([*dask[:2], f"{dask[2]}.dask_worker", *place, *alone], **quiet) for _ in range(2)]
         started += workers
         words = ["batch", "info", "*/grid.pans", "--dask", address, "-o", "r.jsonl", "--json"]
-        batch = subprocess.Popen([*pans, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        started.append(batch)
-        _wait_for(lambda: batch.poll() is not None or Path("r.jsonl").read_text().splitlines()[0])
-        assert batch.poll() is None
+        process = subprocess.Popen([*pans, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        started.append(process)
+        _wait_for(lambda: process.poll() is not None or Path("r.jsonl").read_text().splitlines()[0])
+        assert process.poll() is None
         workers[0].kill()  # in the middle of its next item
-        found = json.loads(batch.communicate(timeout=300)[0])
+        found = json.loads(process.communicate(timeout=300)[0])
     finally:
-        for process in started:
-            process.kill()
-            process.wait()
-    assert (batch.returncode, found["items"], found["failed"]) == (0, 7, [])
+        for one in started:
+            one.kill()
+            one.wait()
+    assert (process.returncode, found["items"], found["failed"]) == (0, 7, [])
     rows = [json.loads(line) for line in Path("r.jsonl").read_text().splitlines()]
     assert len(rows) == len({row["item"] for row in rows}) == 7
     assert all(row["answer"]["classes"] for row in rows)

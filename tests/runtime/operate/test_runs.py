@@ -11,8 +11,7 @@ import pytest
 from commands import fixed_run, json_of
 
 from pans.runtime.cli import main
-from pans.runtime.operate.inventory import Run, prunable, run_of
-from pans.runtime.operate.runs import duration_s, size_bytes
+from pans.runtime.operate.runs import Run, duration_s, prunable, run_of, size_bytes
 from pans.runtime.run_folder import locked
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)

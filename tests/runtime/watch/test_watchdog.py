@@ -19,8 +19,8 @@ from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_TIMING
 from pans.runtime.record import read_recording, replay
 from pans.runtime.report.verify import verify_file
 from pans.runtime.watch import watchdog
-from pans.runtime.watch.heartbeat import is_stalled
-from pans.runtime.watch.systemd import Notifier
+from pans.runtime.watch.state_file import is_stalled
+from pans.runtime.watch.watchers import Notifier
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forkserver, signals and /proc")
 STALLED_S, ENDED_S = 2.0, 5.0  # the bars

@@ -1,15 +1,21 @@
-"""What lives as long as a run does: state file, metrics, systemd's messages, the watch on the computer, the watchdog's facts.
+"""What watches one run from beside its loop: state file, metrics, messages to systemd, the computer around it, the watchdog's facts.
 
-Owns their beginning and end. They are started before the loop asks for real-time privileges, so that none of their threads inherits them.
+All of it is started before the loop asks for real-time privileges, so that none of its threads inherits them.
 """
 
 from __future__ import annotations
 
+import os
+import socket
+import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
+
+from .host import HostWatch
+from .state_file import StateFile, is_stalled, picture_of
 
 if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
@@ -17,14 +23,14 @@ if TYPE_CHECKING:
     from pans.runtime.live.run_options import RunOptions
     from pans.runtime.record import Recorder
 
-    from .host import HostWatch
     from .metrics import MetricsServer
-    from .state_file import StateFile
-    from .systemd import Notifier
     from .watchdog import Watchdog
 
+NOTIFY_EVERY_S = 1.0  # without WATCHDOG_USEC
+NOTIFICATIONS_PER_TIMEOUT = 3
 
-class Attendants:
+
+class Watchers:
     """State file, metrics and messages of one run; enter before it, `prepared` when it is there."""
 
     def __init__(
@@ -36,19 +42,15 @@ class Attendants:
         metrics: MetricsServer | None = None,
     ) -> None:
         self._wanted, self._recorder, self._watchdog, self._stop = wanted, recorder, watchdog, stop
+        self._metrics = metrics
         self._host: HostWatch | None = None
         self._run: LiveRun | None = None
         self._state: StateFile | None = None
         self._notifier: Notifier | None = None
-        self._metrics = metrics
         self._started_s = time.monotonic()
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
-        from .host import HostWatch
-        from .state_file import StateFile
-        from .systemd import Notifier
-
         with ExitStack() as opening:
             ask = (lambda why: None) if self._stop is None else self._stop.request
             self._host = HostWatch(self._recorded, self._wanted.stop_below, ask, self._is_deleted)
@@ -63,7 +65,7 @@ class Attendants:
                 opening.callback(self._notifier.close)
             self._open = opening.pop_all()
         if self._watchdog is not None:
-            self._watchdog.watch(self._recorder, self._told)
+            self._watchdog.watch(self._recorder, self._note_end)
         return self
 
     def __exit__(
@@ -73,7 +75,7 @@ class Attendants:
             self._watchdog.closes()
         try:
             if self._run is not None and error is None:
-                self.tell(self._run)  # the recording is still open
+                self.note_news(self._run)  # the recording is still open
                 if self._recorder is not None:
                     self._recorder.flush()  # the last state names all decisions
         finally:
@@ -89,12 +91,10 @@ class Attendants:
 
     def look(self) -> dict[str, Any]:
         """Return the picture as it is now."""
-        from .state_file import picture_of
-
         facts = {} if self._host is None else self._host.facts()
         return picture_of(self._run, self._recorder, self._started_s) | facts
 
-    def tell(self, run: LiveRun) -> None:
+    def note_news(self, run: LiveRun) -> None:
         """Note in the journal of `run` what was found about the computer; called by the loop."""
         if self._host is not None:
             for event in self._host.news():
@@ -108,7 +108,56 @@ class Attendants:
     def _is_deleted(self) -> bool:
         return self._recorder is not None and self._recorder.is_deleted
 
-    def _told(self, why: str) -> None:
-        """The watchdog ends the process: leave word."""
+    def _note_end(self, why: str) -> None:
+        """The watchdog ends the process."""
         if self._state is not None:
             self._state.leave({"state": "stalled", "ended": why})
+
+
+class Notifier:
+    """Messages to systemd (sd_notify(3)): READY when the run is prepared, WATCHDOG while the loop turns, STOPPING at the end.
+
+    A loop that is stuck is not spoken for, and systemd's WatchdogSec= ends the service.
+    """
+
+    def __init__(self, address: str, every_s: float) -> None:
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._every_s = every_s
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @classmethod
+    def of_environment(cls) -> Notifier | None:
+        """Return the one that NOTIFY_SOCKET and WATCHDOG_USEC ask for, None without."""
+        address, microseconds = os.environ.get("NOTIFY_SOCKET", ""), os.environ.get("WATCHDOG_USEC", "")
+        if not address or not hasattr(socket, "AF_UNIX"):
+            return None
+        known = microseconds.isdecimal() and 0 < int(microseconds) < 1 << 62
+        return cls(address, int(microseconds) / 1e6 / NOTIFICATIONS_PER_TIMEOUT if known else NOTIFY_EVERY_S)
+
+    def begin(self, run: LiveRun) -> None:
+        """Say that the service is ready, and from here on that the loop of `run` turns."""
+        self._send("READY=1")
+        self._thread = threading.Thread(target=self._keep, args=(run,), name="pans-systemd", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Say that the service stops."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._send("STOPPING=1")
+        self._socket.close()
+
+    def _keep(self, run: LiveRun) -> None:
+        while True:
+            if run.ended or not is_stalled(run):
+                self._send("WATCHDOG=1")
+            if self._ending.wait(self._every_s):
+                return
+
+    def _send(self, message: str) -> None:
+        with suppress(OSError):  # nobody listens: a run does not end because of that
+            self._socket.sendto(message.encode(), self._address)
