@@ -1,8 +1,7 @@
 """Logs of a command through `logging`: a file of text or JSON lines that rotates, and stderr with priorities under systemd.
 
-Owns the options, the one place where handlers are set up, and the form of a line. A line never makes its writer wait: a thread writes
-the file, behind a queue of bounded length, and what a full disk or a full queue costs is counted. What the command line prints and the
-events of a run go to the logger `pans`; a program that imports pans may add handlers of its own to it.
+A line never makes its writer wait: a thread writes the file, behind a queue of bounded length, and what a full disk or queue costs is
+counted. What the command line prints and the events of a run go to the logger `pans`; a program that imports pans may add handlers to it.
 """
 
 from __future__ import annotations
@@ -69,22 +68,22 @@ def logging_of(args: argparse.Namespace) -> Iterator[None]:
         yield
         return
     waiting: queue.Queue[Any] = queue.Queue(QUEUE_LINES)
-    entrance = _Entrance(waiting)
-    entrance.addFilter(_KindLimit())
+    bounded = _BoundedQueue(waiting)
+    bounded.addFilter(_KindLimit())
     listener = _Listener(waiting, *handlers)
     level = LOGGER.level
     LOGGER.setLevel(logging.INFO)
-    LOGGER.addHandler(entrance)
+    LOGGER.addHandler(bounded)
     listener.start()
     try:
         yield
     finally:
-        LOGGER.removeHandler(entrance)
+        LOGGER.removeHandler(bounded)
         LOGGER.setLevel(level)
         listener.stop()
         for handler in handlers:
             handler.close()
-        if lost := entrance.lost + sum(handler.lost for handler in handlers):
+        if lost := bounded.lost + sum(handler.lost for handler in handlers):
             print(f"pans: {lost} lines are missing from {path or 'the journal'}", file=sys.stderr)
 
 
@@ -121,21 +120,21 @@ def _time_of(record: logging.LogRecord) -> str:
     return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
 
 
-def _told(record: logging.LogRecord) -> str:
+def _message(record: logging.LogRecord) -> str:
     facts = getattr(record, "facts", {})
     return record.getMessage() + "".join(f" {key}={_plain(value)}" for key, value in facts.items())
 
 
 class _TextLine(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        return one_line(f"{_time_of(record)} {record.levelname} {_told(record)}", LINE_MAX)
+        return one_line(f"{_time_of(record)} {record.levelname} {_message(record)}", LINE_MAX)
 
 
 class _EventLine(logging.Formatter):
     """The journal adds the time itself."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return stderr_line(one_line(f"pans: {_told(record)}", LINE_MAX), record.levelno)
+        return stderr_line(one_line(f"pans: {_message(record)}", LINE_MAX), record.levelno)
 
 
 class _JsonLine(logging.Formatter):
@@ -157,7 +156,7 @@ def _plain(value: Any) -> Any:
 # ---- handlers ----
 
 
-class _Entrance(logging.handlers.QueueHandler):
+class _BoundedQueue(logging.handlers.QueueHandler):
     """Puts lines into the queue and counts those for which there is no room."""
 
     lost = 0
@@ -178,7 +177,7 @@ class _Listener(logging.handlers.QueueListener):
 
 
 class _KindLimit(logging.Filter):
-    """Lets KIND_MOST events of a kind pass in KIND_EVERY_S, and tells with the next how many did not."""
+    """Lets KIND_MOST events of a kind pass in KIND_EVERY_S; the next one says how many did not."""
 
     def __init__(self) -> None:
         super().__init__()

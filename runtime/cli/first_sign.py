@@ -1,7 +1,6 @@
 """The first sign of life: a line within half a second, and one more while kernels are compiled.
 
-Owns a thread that looks whether anything has been printed, and a listener of numba's compiler. Both are silent where a command answers at
-once and where all kernels are in the cache.
+Nothing is printed where a command answers at once and where all kernels are in the cache.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from .printing import has_said, say
 FIRST_AFTER_S = 0.35
 LOOK_EVERY_S = 0.05
 LOOK_FOR_S = 60.0  # a command that has not loaded numba by then does not wait for it
-COMPILING = "compiling kernels: once per machine, about 10 s"
+COMPILING = "compiling kernels: once per machine, about 15 s"
 _listening: list[Any] = []  # numba keeps listeners for good: one per process
 
 
@@ -33,13 +32,13 @@ def first_sign(text: str) -> Iterator[None]:
 
 
 def _look(text: str, ended: threading.Event) -> None:
-    told, looked_s = False, 0.0
-    while not (told and _listening) and looked_s < LOOK_FOR_S and not ended.wait(LOOK_EVERY_S):
+    said, looked_s = False, 0.0
+    while not (said and _listening) and looked_s < LOOK_FOR_S and not ended.wait(LOOK_EVERY_S):
         looked_s += LOOK_EVERY_S
-        if not told and (has_said() or looked_s >= FIRST_AFTER_S):
+        if not said and (has_said() or looked_s >= FIRST_AFTER_S):
             if not has_said():
                 say(text)
-            told = True
+            said = True
         if not _listening and "numba.core.dispatcher" in sys.modules:
             _listen()
 
@@ -48,14 +47,14 @@ def _listen() -> None:
     from numba.core import event
 
     class Listener(event.Listener):  # type: ignore[misc]
-        """Tells of the first compilation only; kernels in the cache make no event."""
+        """Reports the first compilation only; kernels in the cache make no event."""
 
         def __init__(self) -> None:
-            self.told = False
+            self.said = False
 
         def on_start(self, event: Any) -> None:
-            if not self.told:
-                self.told = True
+            if not self.said:
+                self.said = True
                 say(COMPILING)
 
         def on_end(self, event: Any) -> None:

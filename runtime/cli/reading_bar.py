@@ -1,7 +1,6 @@
 """A bar on the terminal while a command reads a long file: `replay`, `verify`, `report`, `info`, `export`, `compare`.
 
-Owns when a bar is shown and what it says. There is none for a pass over a file that ends within a second, for a command whose standard
-error is no terminal, and with `--quiet`.
+There is none for a pass over a file that ends within a second, for a command whose standard error is no terminal, and with `--quiet`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""`pans calibrate`: photon level, dark rates and non-uniformity of one instrument, or with --registration where a known target stands,
-measured through the ordinary session, into a dated file.
+"""`pans calibrate`: photon level, dark rates and non-uniformity of one instrument, or with --registration where a known target stands.
 
-Owns the command's arguments, its two stages and its answers; designs and estimates are core's and registration's, files calibration.py's
-and registration's.
+Both are measured through the ordinary session, in two stages: a short one, then one that is designed with what it found. A dated file comes
+out.
 """
 
 from __future__ import annotations
@@ -90,8 +89,6 @@ def _calibrate(args: argparse.Namespace) -> int:
     from pans.runtime.instrument.calibration import save_calibration
     from pans.runtime.instrument.estimate import fit_light
 
-    if not 0.5 <= args.seconds <= 86_400:
-        raise UsageError(f"--seconds must be from 0.5 to 86400, found {args.seconds:g}")
     profile = load_profile(args.profile or profile_of(args.device))
     exposure_us = calibration_exposure_us(profile)
     model, guess = count_model(profile, exposure_us), profile_level(profile, exposure_us)
@@ -142,8 +139,8 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     seconds = design.n_cycles * design.plan.cycle_us * 1e-6
     say(f"calibrating: {len(design.drives)} patterns, {seconds:.1f} s of instrument time")
     config = RunOptions(n_cycles=design.n_cycles, lease_ms=profile.timing.lease_ms)
-    with _bar(design.n_cycles * design.plan.slots_per_cycle) as tell:
-        seen = Observers(lambda run, _: tell(run.core.tracker.next_exposure), acts=False)
+    with _bar(design.n_cycles * design.plan.slots_per_cycle) as report:
+        seen = Observers(lambda run, _: report(run.core.tracker.next_exposure), acts=False)
         result = run_live(open_link(device), profile, design.bundle, design.plan, core, config, observers=seen)
     if result.ended == INTERRUPTED:
         raise KeyboardInterrupt(result.ended)
@@ -156,7 +153,7 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
 
 @contextmanager
 def _bar(total: int) -> Iterator[Callable[[int], None]]:
-    """Yield what is told the exposures that have come, and shows them on a terminal."""
+    """Yield a call that displays on a terminal how many exposures have come."""
     if is_quiet() or not sys.stderr.isatty():
         yield lambda done: None
         return

@@ -35,7 +35,7 @@ from pans.runtime.live.continuous import (
     stop_signals,
 )
 from pans.runtime.live.run_options import FLOW, RunOptions
-from pans.runtime.operate.first_start import compiled_beside, load_ahead
+from pans.runtime.operate.warm import load_ahead
 from pans.runtime.timing.cpu import check_core
 
 from .run_files import check_run_files, claimed, gone_if_refused, part_limits, recording_header, what_was_run
@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from pans.runtime.record import Recorder
     from pans.runtime.registration.use import InUse
     from pans.runtime.report.summary import Summary
-    from pans.runtime.watch import Watchdog
     from pans.runtime.watch.metrics import MetricsServer
+    from pans.runtime.watch.watchdog import Watchdog
 
 ROUNDING = 1e-9  # of a dose cap: a sum of light is known to so many digits
 
@@ -92,7 +92,6 @@ class _Around(NamedTuple):
     stop: Stop
     watchdog: Watchdog | None
     monitor: Monitor
-    compiled: Callable[[], None]  # waits until the largest kernels are
     metrics: MetricsServer | None
     ending: ExitStack
 
@@ -153,14 +152,14 @@ def run_once(
     continuous, watchdog = not (options.seconds or options.decisions), None
     with stop_signals(continuous=continuous) as stop, ExitStack() as watched:
         if ends_process:
-            from pans.runtime.watch import Watchdog
+            from pans.runtime.watch.watchdog import Watchdog
 
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
         try:
             # ports first: a busy one is refused before anything is compiled or opened
             with _metrics_of(options) as metrics, ExitStack() as ending:
-                with _monitor_of(options) as monitor, compiled_beside() as compiled:
-                    around = _Around(stop, watchdog, monitor, compiled, metrics, ending)
+                with _monitor_of(options) as monitor:
+                    around = _Around(stop, watchdog, monitor, metrics, ending)
                     done = _prepare_and_run(options, profile, around)
                 tell(done)
                 return done
@@ -481,7 +480,7 @@ def _watched(
             seen.note_news(run)
             monitor.watch(run, output)
 
-        observers = Observers(look, prepared, around.stop, acts=False, uploaded=around.compiled)
+        observers = Observers(look, prepared, around.stop, acts=False)
         what = dark.profile, ready.bundle, ready.plan, ready.core, ready.options
         return around.ending.enter_context(running(link, *what, recorder, recovery, observers))
 

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -39,29 +40,9 @@ SYSTEM_UNITS, USER_UNITS = Path("/etc/systemd/system"), Path("~/.config/systemd/
 UNIT_MAX_BYTES = 1 << 16
 START_S = 180  # kernels are compiled once, on a slow machine for a minute
 STOP_S = 45  # the watchdog ends a stuck run within 5 s; a slow disk has 30 s to sync
-RESTART_S = 5
+TEMPLATE = SHIPPED / "pans-run.service"
+SYSTEM_ONLY = ("# what only the system's manager", "[Install]")  # left out between these in a user's own unit
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}")
-# What only the system's manager can forbid everywhere.
-WALLS = """ProtectSystem=strict
-ProtectHome=read-only
-PrivateTmp=yes
-ProtectControlGroups=yes
-ProtectKernelTunables=yes
-ProtectKernelModules=yes
-ProtectKernelLogs=yes
-ProtectClock=yes
-RestrictNamespaces=yes
-RestrictSUIDSGID=yes
-LockPersonality=yes
-SystemCallArchitectures=native
-RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
-# serial ports and USB devices, and no others
-DevicePolicy=closed
-DeviceAllow=char-ttyACM rw
-DeviceAllow=char-ttyUSB rw
-DeviceAllow=char-ttyS rw
-DeviceAllow=char-pts rw
-DeviceAllow=char-usb_device rw"""
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "%": "%%"}
 POLL_S = 0.05
 NOT_THE_SERVICES = ("INVOCATION_ID", "JOURNAL_STREAM", "MAINPID")
@@ -95,48 +76,23 @@ class Service:
 
 def unit_text(service: Service) -> str:
     """Return the unit."""
-    return "\n".join([MARK, *_directives(service)]) + "\n"
-
-
-def _directives(service: Service) -> Iterator[str]:
-    user = [f"User={service.user}"] if service.user else []
-    yield f"""[Unit]
-Description=pans run, {service.name}
-After=network.target local-fs.target
-StartLimitIntervalSec=600
-StartLimitBurst=10
-
-[Service]
-Type=notify
-NotifyAccess=main
-WatchdogSec={service.watchdog_s:g}
-ExecStart={command_line(service.command)}
-WorkingDirectory={_escaped(str(service.folder))}"""
-    yield from user
-    yield f"""Restart=on-failure
-RestartSec={RESTART_S}
-# 2: the options or a file are wrong, or the disk is full; starting again would not mend that
-RestartPreventExitStatus=2
-TimeoutStartSec={START_S}
-TimeoutStopSec={STOP_S}
-KillMode=mixed
-
-# real time: the loop asks for SCHED_FIFO and locks its memory
-LimitRTPRIO={FIFO_PRIORITY}
-LimitMEMLOCK=infinity
-LimitNOFILE=4096
-
-# compiled kernels, which cannot be kept beside the package
-CacheDirectory=pans-{service.name}
-Environment=NUMBA_CACHE_DIR=%C/pans-{service.name}
-
-# hardening; MemoryDenyWriteExecute and RestrictRealtime would forbid compiled kernels and SCHED_FIFO
-NoNewPrivileges=yes
-UMask=0027"""
-    if user:
-        yield WALLS
-        yield from (f"ReadWritePaths={quoted(str(path))}" for path in sorted({service.folder, *service.writes}))
-    yield f"\n[Install]\nWantedBy={'multi-user' if user else 'default'}.target"
+    template = TEMPLATE.read_text(encoding="utf-8")
+    if not service.user:
+        first, last = (template.index(mark) for mark in SYSTEM_ONLY)
+        template = (template[:first] + "\n" + template[last:]).replace("User={user}\n", "")
+    writes = sorted({service.folder, *service.writes})
+    return template.format(
+        name=service.name,
+        command=command_line(service.command),
+        folder=_escaped(str(service.folder)),
+        user=service.user,
+        watchdog_s=service.watchdog_s,
+        start_s=START_S,
+        stop_s=STOP_S,
+        priority=FIFO_PRIORITY,
+        writes="\n".join(f"ReadWritePaths={quoted(str(path))}" for path in writes),
+        target="multi-user" if service.user else "default",
+    )
 
 
 # ---- quoting ----
@@ -246,11 +202,10 @@ def start_and_hear(
     if not hasattr(socket, "AF_UNIX"):
         raise UsageError("systemd's notify protocol needs sockets of the family AF_UNIX", remedy="use Linux")
     heard = Heard()
-    with (
-        tempfile.TemporaryDirectory(prefix="pans-notify-") as place,
-        tempfile.TemporaryFile() as stderr,
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
-    ):
+    with ExitStack() as opened:
+        place = opened.enter_context(tempfile.TemporaryDirectory(prefix="pans-notify-"))
+        stderr = opened.enter_context(tempfile.TemporaryFile())
+        manager = opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
         address = str(Path(place) / "notify")
         manager.bind(address)
         manager.settimeout(POLL_S)
@@ -260,6 +215,7 @@ def start_and_hear(
         process = subprocess.Popen(
             command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr
         )
+        opened.callback(_end, process)
         due_s = start_s
         while True:
             ended = process.poll() is not None
@@ -274,8 +230,6 @@ def start_and_hear(
             if now_s <= due_s or ended:
                 continue
             if heard.asked_s is not None:
-                process.kill()
-                process.wait()
                 break
             heard.asked_s, due_s = now_s, now_s + stop_s
             process.send_signal(signal.SIGTERM)
@@ -285,29 +239,28 @@ def start_and_hear(
         return heard, stderr.read().decode("utf-8", "replace")
 
 
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+
+
 # ---- the command ----
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "action",
-        metavar="ACTION",
-        choices=tuple(OF_ACTION),
-        help="install, show, verify or remove the unit; or write what Prometheus and Grafana need",
-    )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="options of the run (pans run --write-config)")
-    parser.add_argument("--name", metavar="NAME", help="the unit is pans-NAME.service (default: the name of the file)")
-    parser.add_argument("--folder", type=Path, metavar="DIR", help="where the run works (default: this folder)")
-    parser.add_argument("--run-as", metavar="USER", help="whom the service runs as (default: the present user)")
-    parser.add_argument(
-        "--watchdog-s", type=WATCHDOG.option, metavar="S", help="restart after S s of silence (default 20)"
-    )
-    parser.add_argument("--user", action="store_true", help="a unit of the user's own manager, not of the system's")
-    parser.add_argument("--unit-dir", type=Path, metavar="DIR", help="where units are (default: systemd's folder)")
-    parser.add_argument(
-        "--start", type=START.option, metavar="S", help="verify: run it for S s and check what it tells systemd"
-    )
-    parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="monitoring: the folder to write to")
+    add = parser.add_argument
+    what = "install, show, verify or remove the unit; or write what Prometheus and Grafana need"
+    add("action", metavar="ACTION", choices=tuple(OF_ACTION), help=what)
+    add("--config", type=Path, metavar="FILE", help="options of the run (pans run --write-config)")
+    add("--name", metavar="NAME", help="the unit is pans-NAME.service (default: the name of the file)")
+    add("--folder", type=Path, metavar="DIR", help="where the run works (default: this folder)")
+    add("--run-as", metavar="USER", help="whom the service runs as (default: the present user)")
+    add("--watchdog-s", type=WATCHDOG.option, metavar="S", help="restart after S s of silence (default 20)")
+    add("--user", action="store_true", help="a unit of the user's own manager, not of the system's")
+    add("--unit-dir", type=Path, metavar="DIR", help="where units are (default: systemd's folder)")
+    add("--start", type=START.option, metavar="S", help="verify: run it for S s and check what it tells systemd")
+    add("-o", "--out", type=Path, metavar="DIR", help="monitoring: the folder to write to")
     add_force(parser)
 
 
@@ -496,12 +449,8 @@ def _monitoring(args: argparse.Namespace) -> int:
     make_folder(args.out)
     for path in paths:
         write_file(path, (SHIPPED / path.name).read_bytes(), force=args.force)
-    scrape = quoted("127.0.0.1:9464")
-    emit(
-        args,
-        {"files": [str(path) for path in paths]},
-        "\n".join([*map(str, paths), f"next: let Prometheus scrape {scrape}, and run with --metrics 127.0.0.1:9464"]),
-    )
+    following = 'next: let Prometheus scrape "127.0.0.1:9464", and run with --metrics 127.0.0.1:9464'
+    emit(args, {"files": [str(path) for path in paths]}, "\n".join([*map(str, paths), following]))
     return EXIT_FINE
 
 

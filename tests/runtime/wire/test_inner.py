@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import re
 from pathlib import Path
 
 import numba
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 from numba import njit
 
-from pans.runtime.operate import first_start
 from pans.runtime.wire import inner as wire_inner
 from pans.runtime.wire.bare import as_float32, copy_span, load4, load8
 from pans.runtime.wire.inner import SOURCES, TRIED, digest_of, inner
@@ -108,12 +106,3 @@ def test_the_digest_knows_every_file_of_the_packages(tmp_path: Path) -> None:
 def _digest(folder: Path) -> str:
     digest_of.cache_clear()
     return digest_of(folder)
-
-
-def test_the_first_start_looks_at_the_same_files() -> None:
-    assert first_start.PACKAGES == SOURCES
-    runtime = Path(wire_inner.__file__).parents[1]
-    holding = {
-        path.parent.name for path in runtime.glob("*/*.py") if re.search(r"^@(?:inner|outer)$", path.read_text(), re.M)
-    }
-    assert holding <= set(SOURCES)
