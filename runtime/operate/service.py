@@ -323,7 +323,7 @@ def _written_folders(config: Path, folder: Path) -> Iterator[Path]:
     parser = parser_of("run", run)
     words = ["--config", str(config)]
     if run.prepare is not None:
-        run.prepare(parser, words)
+        words = run.prepare(parser, words)
     options = parser.parse_args(words)
     if options.seconds or options.decisions:
         warn(f"{config.name} ends the run by itself (seconds, decisions); a service that ends so is not started again")
