@@ -1,8 +1,4 @@
-"""The ONNX head: from the bytes in a bundle to a checked, quiet, single-threaded onnxruntime session.
-
-Owns the session and its settings; what a model may hold and cost is checked before, from its bytes (onnx_check.py). Never decides and
-never reads a file. `open_head` returns an `OnnxHead`; onnxruntime is imported there and nowhere earlier.
-"""
+"""The bytes of an ONNX head in, a checked, quiet, single-threaded onnxruntime session out; onnxruntime is imported only here."""
 
 from __future__ import annotations
 

@@ -1,12 +1,8 @@
-"""The layers of an ONNX head, where it is a plain chain of them: weights and biases for our own kernels, in float32 and in eight bits.
+"""An ONNX head that is a plain chain of layers in; weights and biases for our own kernels out, in float32 and in eight bits.
 
-Owns the reading of the few operators that such heads consist of, and the rounding of a folded head to int8 weights and its layout; never
-runs a model, never decides and never imports onnx. `read_layers` returns None for any graph that is more than that: onnxruntime runs
-those. What was read is held against the golden vectors before it is used. `quantise_head` returns an `Int8Head` for a chain of rectified
-layers; `int8_reference` is its meaning in plain numpy.
-
-Every column of a quantised layer has its own scale. The range of each hidden value is folded into its column and out of the next layer's
-row, so that a hidden value is a whole step 0..255 of its own range. Layer one needs no rounding of its input: clicks are whole.
+`read_layers` returns None for any other graph: onnxruntime runs those. Every column of a quantised layer has its own scale. The range of
+each hidden value is folded into its column and out of the next layer's row, so that a hidden value is a whole step 0..255 of its own range.
+Layer one needs no rounding of its input: clicks are whole.
 """
 
 from __future__ import annotations

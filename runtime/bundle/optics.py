@@ -1,16 +1,11 @@
-"""Passive sensing: what light reaches the sensor from 8-bit images, and what its optics send to every detector.
+"""Passive sensing: 8-bit images in, the light that passive optics send to every detector out.
 
-Owns the meaning of grey levels for passive sensing, the optics in front of the sensor (a multimode fibre) and the facts of a passive
-encoder (its matrix W, what grey means, how much light full scale is, the exposure) and what they do to light; never detects, and never
-the modulator of active sensing (`click_law.object_transmission`). Nothing is shown and nothing is uploaded in passive sensing: W is glass,
-or a hologram, in front of the detectors. Full scale (grey 255) is amplitude 1 and intensity 1; nothing is normalised per image or per
-batch, so that no object depends on another.
-
+Full scale (grey 255) is amplitude 1 and intensity 1; nothing is normalised per image or per batch, so that no object depends on another.
 Coherent: light = |W x|**2 of fields x, W real or complex (Ma et al., passive PANS). Incoherent: light = W x of intensities x, W at least 0.
 
 The fibre is the one of the paper's release: 2-D Fourier transform, a fixed 28 x 28 mask of phases uniform in [0, 2 pi), inverse
-transform. It is linear and loses nothing (with orthonormal transforms it is unitary). The seed of the mask is the release's, 42, but which
-generator drew it is not known: OURS is numpy's RandomState(42), whose stream numpy has frozen for good.
+transform. With orthonormal transforms it is unitary. The seed of the mask is the release's, 42, but which generator drew it is not known:
+OURS is numpy's RandomState(42), whose stream numpy has frozen for good.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Float patterns -> device levels: one linear scale for all patterns of a bundle, the error stated.
+"""Float patterns in, device levels out: one linear scale for all patterns of a bundle, the error stated.
 
-Owns the rounding and nothing else: which patterns are good is the trainer's matter, whether a device can show them core/plan.py's. Every
-pixel goes to its nearest level, or its error is carried on to the next pixels, so that neighbourhoods keep their light (R. W. Floyd and
+Every pixel goes to its nearest level, or its error is passed to the next pixels, so that neighbourhoods keep their light (R. W. Floyd and
 L. Steinberg, "An adaptive algorithm for spatial grey scale", Proc. SID 17, 75, 1976; here in alternating directions).
 """
 

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.monitor import Monitor
     from pans.runtime.record import Recorder
-    from pans.runtime.registration.use import InUse
+    from pans.runtime.registration.file import InUse
     from pans.runtime.report.summary import Summary
     from pans.runtime.watch.metrics import MetricsServer
     from pans.runtime.watch.watchdog import Watchdog
@@ -264,7 +264,7 @@ def _prepare(options: RunOptions, profile: Profile) -> _Prepared:
     from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.live.gates import open_actuator
-    from pans.runtime.registration.use import in_use
+    from pans.runtime.registration.file import in_use
 
     flow, shots = flow_of(options), options.shots
     bundle, bundle_sha256 = load_bundle(options.bundle)

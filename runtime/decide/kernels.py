@@ -1,10 +1,8 @@
-"""The compiled kernels of the decision back ends: click words or counts in, labels and scores out.
+"""The compiled loops of the decision back ends: click words or counts in, labels and scores out, into arrays of the caller.
 
-Owns the loops; never allocates and never judges. Imported only where it pays: a look-up in a table must not wait for numba.
-
-The heads' kernels give the same bits for one object and for many. Two freedoms of fastmath are taken where they pay: `contract` (a product
-and a sum in one instruction) and `reassoc` (the order of a sum), so that another processor may round another last bit;
-tests/test_decide_mlp.py holds the error below the bound that any order has. NaN and infinity keep their meaning.
+The same bits for one object and for many. Two freedoms of fastmath are taken where they pay: `contract` (a product and a sum in one
+instruction) and `reassoc` (the order of a sum), so that another processor may round another last bit; test_mlp.py holds
+the error below the bound that any order has. NaN and infinity keep their meaning.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def pad_float(chain: tuple[Layer, ...]) -> Padded:
     n_weights = sum(n_in * n_out for n_in, n_out in pairwise(sizes))
     numbers = np.zeros(
         n_weights + sum(sizes[1:]) + len(groups), np.float32
-    )  # large heads stand in memory once more, not thrice
+    )  # large heads are in memory once more, not thrice
     _lay_out([layer.weights for layer in chain], sizes, numbers)
     start = n_weights
     for n_out, layer in zip(sizes[1:], chain):

@@ -1,7 +1,6 @@
-"""What rounding the patterns to a projector's levels costs in accuracy, on objects with known labels.
+"""Patterns before and after rounding, and objects with known labels, in; what the rounding costs in accuracy out.
 
-Owns the comparison: the same objects and the same random numbers, once through the patterns as they were given and once as they are shown,
-decided by the bundle's own head or table. Clicks are those of a profile, or of a detector that counts every photon. Never changes a bundle.
+The same objects and the same random numbers go through both, decided by the bundle's own head or table.
 """
 
 from __future__ import annotations

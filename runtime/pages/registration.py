@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from pans.runtime.outputs import write_file
-from pans.runtime.registration.estimate import Estimate
+from pans.runtime.registration.estimate import Estimate, pattern_residuals
 from pans.runtime.registration.measure import Registration
 from pans.runtime.registration.parameters import DARK, N_GEOMETRY, PARAMETERS, flat_basis
-from pans.runtime.registration.residuals import pattern_residuals
 
 from .charts import Axis, Chart, Curve, Mark, number
 from .page import Page, Picture

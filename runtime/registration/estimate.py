@@ -1,7 +1,6 @@
-"""Maximum likelihood of where a known target stands, from clicks under known patterns.
+"""Clicks under known patterns in; the most likely place of a known target, its intervals and the misfit out.
 
-Owns the coarse search, Fisher scoring, the intervals and the test whether the model explains the counts. Pure functions of arrays: no
-clock, no file, no random number. The likelihood is that of the click law with light and dark counts as unknowns; read noise, threshold,
+Pure functions of arrays. The likelihood is that of the click law with light and dark counts as unknowns; read noise, threshold,
 dead time and afterpulses are the profile's. The search begins on a grid over shifts and rotations, 1 px and 2.5 degrees apart; the best few
 are followed by Fisher scoring, so that a target whose structure is coarser than a step is not missed. Intervals (95 %) are those of
 the Fisher information at the estimate.
@@ -19,8 +18,7 @@ from numpy.typing import NDArray
 from pans.runtime.instrument.estimate import SATURATED, Counts
 from pans.runtime.intervals import CHI2_95, chi2_tail
 
-from .parameters import DARK, FLAT, PARAMETERS, PSF_SEEN_FROM
-from .rates import Bench
+from .parameters import DARK, FLAT, PARAMETERS, PSF_SEEN_FROM, Bench
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -181,12 +179,15 @@ class _Fit:
         self.low = np.array([one.low for one in PARAMETERS] + [0.0])
         self.high = np.array([one.high for one in PARAMETERS] + [10.0])
 
-    def value(self, vector: F64) -> float:
-        """Return the log likelihood without binomial constants."""
+    def log_miss(self, vector: F64) -> F64:
+        """Return the log probability of no click in each group."""
         means = self.bench.means(vector, self.patterns)
         means[-1] = max(vector[DARK], _LEAST_DARK)
-        log_miss = self.bench.model.log_miss(means)[self.row] + self.observed.log_other
-        clicks, exposures = self.observed.clicks, self.observed.exposures
+        return self.bench.model.log_miss(means)[self.row] + self.observed.log_other
+
+    def value(self, vector: F64) -> float:
+        """Return the log likelihood without binomial constants."""
+        log_miss, clicks, exposures = self.log_miss(vector), self.observed.clicks, self.observed.exposures
         return float((clicks * np.log(-np.expm1(log_miss)) + (exposures - clicks) * log_miss).sum())
 
     def scores(self, vector: F64) -> tuple[F64, F64]:
@@ -238,10 +239,7 @@ class _Fit:
 
     def misfit(self, vector: F64) -> tuple[float, int]:
         """Return Pearson's chi-square over groups with enough expected clicks and silences, and their number."""
-        means = self.bench.means(vector, self.patterns)
-        means[-1] = max(vector[DARK], _LEAST_DARK)
-        log_miss = self.bench.model.log_miss(means)[self.row] + self.observed.log_other
-        clicks, exposures, chance = self.observed.clicks, self.observed.exposures, -np.expm1(log_miss)
+        clicks, exposures, chance = self.observed.clicks, self.observed.exposures, -np.expm1(self.log_miss(vector))
         expected, variance = exposures * chance, exposures * chance * (1 - chance)
         enough = np.minimum(expected, exposures - expected) >= LEAST_EXPECTED
         return float(((clicks - expected)[enough] ** 2 / variance[enough]).sum()), int(enough.sum())
@@ -249,3 +247,22 @@ class _Fit:
 
 _LEAST_DARK = 1e-9  # photoelectrons per exposure
 _STRIDE = np.array([0.8, 0.8, 2.0, 0.03, 0.4, math.inf, 0.02, 0.3, 0.3, 0.3, 0.3, 0.3, math.inf])  # most in one step
+
+
+def pattern_residuals(bench: Bench, observed: Observed, vector: F64) -> tuple[F64, F64, F64]:
+    """Return of every pattern the expected and the measured share of clicks, and their difference in standard errors, float64 (patterns,).
+
+    Exposures behind a click and behind none are taken together.
+    """
+    lit, n = observed.lit, len(observed.patterns)
+    log_miss = (
+        bench.model.log_miss(bench.means(vector, observed.patterns))[observed.pattern[lit]] + observed.log_other[lit]
+    )
+    chance, exposures = -np.expm1(log_miss), observed.exposures[lit]
+    sums = np.zeros((4, n))
+    for row, values in zip(
+        sums, (exposures, observed.clicks[lit], exposures * chance, exposures * chance * (1 - chance))
+    ):
+        np.add.at(row, observed.pattern[lit], values)
+    shown = np.maximum(sums[0], 1.0)
+    return sums[2] / shown, sums[1] / shown, (sums[1] - sums[2]) / np.sqrt(np.maximum(sums[3], 1e-12))

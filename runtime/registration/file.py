@@ -1,7 +1,7 @@
-"""The registration file: where the target stood, with intervals, when and how it was measured; beside the profile, never a rewrite of it.
+"""The registration file: an estimate in; a strict JSON file with a checksum out; and back, to what a run with it shows.
 
-Owns the file (strict JSON with a checksum), its checks, and what a run takes from it. `load_registration` returns a `Registered` whose
-every figure is possible, or raises DamagedFileError; `check_usable` says why a run must not use one.
+`load_registration` returns a `Registered` whose every figure is possible, or raises DamagedFileError; `in_use` refuses one that a run must
+not use, and corrects the bundle's patterns. The bundle's file is recorded as it is: a replay needs no registration.
 """
 
 from __future__ import annotations
@@ -9,29 +9,32 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pans.runtime.bundle.facts import Bundle
 from pans.runtime.container import read_file
-from pans.runtime.errors import ConfigError, DamagedFileError
-from pans.runtime.imaging import Imaging
+from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
+from pans.runtime.imaging import IDENTITY, Imaging, tolerance_of
 from pans.runtime.instrument.calibration import MAX_AGE_H, MeasuredFile, check_made_for, sealed, unsealed
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import Range, demand, number_text
 
+from .correct import Correction, corrected
 from .estimate import Estimate
-from .parameters import DARK, PARAMETERS, Shape, Vector
+from .parameters import DARK, PARAMETERS, Shape, imaging_of
 
 FORMAT, VERSION = "pans-registration", 1
 MAX_BYTES = 1 << 20
 SIDE = Range(1, 4096, whole=True)
 CLICKS = Range(1, 1 << 53, whole=True)
 FUTURE_H = 0.1  # by which clocks may differ
+TOLERATES = "tolerates"  # where a bundle that was trained through optics says which
 
 
 class Registered(MeasuredFile):
@@ -47,7 +50,8 @@ class Registered(MeasuredFile):
 
     def imaging(self) -> Imaging:
         """Return the measured table, with its flat field."""
-        return _imaging(self.values)
+        numbers = [self.values["parameters"][one.name]["value"] for one in PARAMETERS]
+        return imaging_of(np.array([*numbers, 0.0]), self.shape)
 
     def applied_to(self, profile: Profile) -> Profile:
         """Return the profile with the measured light, so that plans expose for what is there; unchanged where the interval holds 1."""
@@ -157,11 +161,6 @@ def registration_words(path: str | Path, values: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _imaging(values: Mapping[str, Any]) -> Imaging:
-    numbers = [values["parameters"][one.name]["value"] for one in PARAMETERS]
-    return Vector(np.array([*numbers, 0.0])).imaging(tuple(values["grid"]))
-
-
 def _check(values: Mapping[str, Any]) -> None:
     grid = values["grid"]
     demand(isinstance(grid, list) and len(grid) == 2, f"grid is {number_text(grid)}, allowed: rows and columns")
@@ -179,7 +178,7 @@ def _check(values: Mapping[str, Any]) -> None:
     demand(serial is None or isinstance(serial, str), f"device.serial is {number_text(serial)}, allowed: text")
     CLICKS.checked(values["clicks"], "clicks")
     Range(0, 1).checked(values["p_value"], "p_value")
-    _imaging(values)  # refuses a flat field that is negative somewhere
+    Registered("", "", dict(values)).imaging()  # refuses a flat field that is negative somewhere
 
 
 def _check_parameter(row: Mapping[str, Any], name: str, low: float, high: float) -> None:
@@ -189,3 +188,72 @@ def _check_parameter(row: Mapping[str, Any], name: str, low: float, high: float)
         Range(-1e6, 1e6).checked(row[key], f"{name}.{key}")
     fits = row["low"] <= row["value"] <= row["high"] and math.isfinite(row["error"])
     demand(fits, f"{name} {row['value']} is not within {row['low']} to {row['high']}")
+
+
+# ---- in use ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InUse:
+    """What a run shows on the measured table, the profile with its light, and where that comes from."""
+
+    registered: Registered
+    shown: Bundle
+    profile: Profile
+    correction: Correction
+
+    def header(self) -> dict[str, Any]:
+        """What the recording says: the file, the correction, and the hash of the levels that were shown."""
+        levels = hashlib.sha256(self.shown.pattern_levels.astype("<u2").tobytes()).hexdigest()
+        return {
+            "sha256": self.registered.sha256,
+            "values": dict(self.registered.values),
+            "correction": asdict(self.correction),
+            "levels_sha256": levels,
+        }
+
+    def facts(self) -> dict[str, Any]:
+        """What the summary says."""
+        one = self.registered
+        where = {"path": one.path, "sha256": one.sha256, "made_utc": one.values["made_utc"]}
+        return {**where, **asdict(self.correction)}
+
+    def words(self) -> str:
+        """Return a line for people."""
+        found = self.correction
+        return (
+            f"patterns corrected for the table of {self.registered.path} ({self.registered.imaging().words()}): "
+            f"error of their light {found.error_before:.1%} before, {found.error_after:.1%} after, light kept {found.light_kept:.1%}"
+        )
+
+    def check_device(self, serial: str | None) -> None:
+        """Raise ConfigError if the device is another than the one that was measured."""
+        one = self.registered
+        check_made_for(one.path, one.values, self.profile, serial, "pans calibrate --registration")
+
+
+def in_use(path: Path | None, bundle: Bundle, profile: Profile, now: datetime, max_age_h: float) -> InUse | None:
+    """Return what `bundle` shows on the table that `path` measured; ConfigError or UsageError for what must not be used."""
+    if path is None:
+        return None
+    if bundle.analyser is not None:
+        raise UsageError(
+            f"{bundle.name} looks through passive optics and shows nothing: a registration has no effect",
+            remedy="leave --registration out",
+        )
+    registered = load_registration(path)
+    check_usable(registered, profile, bundle.image_shape, now, max_age_h)
+    shown, correction = corrected(bundle, registered.imaging(), trained_optics(bundle), str(path))
+    return InUse(registered, shown, registered.applied_to(profile), correction)
+
+
+def trained_optics(bundle: Bundle) -> Imaging:
+    """Return the optics for which `bundle` was trained: the middle of the tolerance that it names, else perfect ones."""
+    told = bundle.provenance.get(TOLERATES)
+    optics = told.get("optics") if isinstance(told, dict) else None
+    if not isinstance(optics, str):
+        return IDENTITY
+    try:
+        return tolerance_of(optics).middle
+    except ValueError:  # a spelling of another version: what it says is not needed to decide
+        return IDENTITY

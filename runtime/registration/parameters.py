@@ -1,7 +1,6 @@
-"""What a registration estimates, as one vector: geometry, sharpness, light, and a flat field of few numbers.
+"""What a registration estimates, as one vector (geometry, sharpness, light, a flat field), in; expected light and its slopes out.
 
-Owns the order, units, search range and wanted precision of the parameters, the polynomials of the flat field, and the way between the
-vector and an `Imaging`; never computes light.
+All pure functions of arrays. The optics are imaging's, the law of clicks instrument's.
 """
 
 from __future__ import annotations
@@ -13,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.imaging import Imaging
+from pans.runtime.imaging import Imaging, seen
+from pans.runtime.instrument.estimate import CountModel
 
 F64 = NDArray[np.float64]
 Shape = tuple[int, int]
@@ -38,13 +38,10 @@ GEOMETRY = (
     Parameter("scale", "", 0.94, 1.06, 0.01),
     Parameter("psf_px", "px", 0.002, 2.0, 0.1),
 )
-GAIN = Parameter("gain", "", 0.02, 50.0, 0.05)
-BLACK = Parameter("black", "", -0.002, 0.1, 0.001)
-FLAT_NAMES = ("flat_x", "flat_y", "flat_xx", "flat_xy", "flat_yy")
-FLAT = tuple(Parameter(name, "", -0.5, 0.5, 0.1) for name in FLAT_NAMES)
+FLAT = tuple(Parameter(f"flat_{term}", "", -0.5, 0.5, 0.1) for term in ("x", "y", "xx", "xy", "yy"))
 NO_FLAT = (0.0,) * len(FLAT)
-LIGHT = (GAIN, BLACK, *FLAT)
-PARAMETERS = (*GEOMETRY, *LIGHT)
+LIGHT = (Parameter("gain", "", 0.02, 50.0, 0.05), Parameter("black", "", -0.002, 0.1, 0.001))
+PARAMETERS = (*GEOMETRY, *LIGHT, *FLAT)
 DARK = len(
     PARAMETERS
 )  # where the vector holds the dark photoelectrons of an exposure, a nuisance: calibrations measure it
@@ -66,18 +63,12 @@ def _marks(size: int) -> F64:
     return (np.arange(size, dtype=np.float64) - (size - 1) / 2) / max((size - 1) / 2, 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Vector:
-    """The parameters' values in the order of `PARAMETERS`, then the dark photoelectrons of an exposure."""
-
-    values: F64
-
-    def imaging(self, shape: Shape) -> Imaging:
-        """Return the facts as an `Imaging` of the grid `shape`; a black level below 0 is 0, a flat field below 0 is refused."""
-        geometry = dict(zip((one.name for one in GEOMETRY), self.values.tolist()))
-        black, coefficients = max(0.0, float(self.values[6])), self.values[7:DARK]
-        flat = (1.0 + coefficients @ flat_basis(shape)).reshape(shape) if coefficients.any() else None
-        return Imaging(**geometry, black=black, gain=float(self.values[5]), flat=flat)
+def imaging_of(vector: F64, shape: Shape) -> Imaging:
+    """Return the vector as an `Imaging` of the grid `shape`; a black level below 0 is 0, a flat field below 0 is refused."""
+    geometry = dict(zip((one.name for one in GEOMETRY), vector.tolist()))
+    black, coefficients = max(0.0, float(vector[6])), vector[7:DARK]
+    flat = (1.0 + coefficients @ flat_basis(shape)).reshape(shape) if coefficients.any() else None
+    return Imaging(**geometry, black=black, gain=float(vector[5]), flat=flat)
 
 
 def vector_of(imaging: Imaging, flat: ArrayLike = NO_FLAT, dark: float = 0.0) -> F64:
@@ -99,3 +90,73 @@ def at_edge(values: F64) -> list[str]:
         for one, value in zip(PARAMETERS, values.tolist())
         if not (one.low < value < one.high or (one.name == "psf_px" and value <= one.low)) or not math.isfinite(value)
     ]
+
+
+# ---- expected light ----
+
+STEPS = np.array([1e-4, 1e-4, 1e-3, 1e-5, 1e-4])  # of the differences, in px, degrees, 1 and px
+LEAST_MEAN = 1e-9  # photoelectrons per exposure: less cannot be told from none
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """What is known beforehand: the target's transmission (pixels,) on the grid `shape`, the photoelectrons of one level per exposure
+    as the profile states them, the number of levels, and the detector's law.
+    """
+
+    target: F64
+    shape: Shape
+    photons_per_level: float
+    levels: int
+    model: CountModel
+
+    def appearance(self, geometry: F64) -> F64:
+        """Return the target as the grid meets it, float64 (pixels,), under right, down, rotation, scale, psf."""
+        facts = dict(zip((one.name for one in GEOMETRY), geometry.tolist()))
+        return seen(Imaging(**facts), self.target[None, :], self.shape)[0]
+
+    def appearances(self, geometry: F64) -> F64:
+        """Return the target as it is met, and its derivatives by the five numbers, float64 (6, pixels), central differences."""
+        rows = [self.appearance(geometry)]
+        for index, step in enumerate(STEPS):
+            ahead, behind = geometry.copy(), geometry.copy()
+            ahead[index] += step
+            behind[index] -= step
+            rows.append((self.appearance(ahead) - self.appearance(behind)) / (2 * step))
+        return np.array(rows)
+
+    def means(self, vector: F64, patterns: F64, met: F64 | None = None) -> F64:
+        """Return photoelectrons per exposure, dark counts included, float64 (patterns,); `met` is the target's appearance if known."""
+        met = self.appearance(vector[:N_GEOMETRY]) if met is None else met
+        light = self._light(vector, patterns, (1.0 + vector[7:DARK] @ flat_basis(self.shape)) * met)
+        return np.maximum(light + vector[DARK], LEAST_MEAN)
+
+    def _light(self, vector: F64, patterns: F64, met: F64) -> F64:
+        gain, black = vector[5] * self.photons_per_level, vector[6]
+        return np.asarray(gain * (black * (self.levels - 1) * met.sum() + (1 - black) * (patterns @ met)))
+
+    def slopes(self, vector: F64, patterns: F64) -> tuple[F64, F64]:
+        """Return the means (patterns,) and their derivatives (patterns, 13) by the vector's numbers."""
+        basis, shown = flat_basis(self.shape), self.appearances(vector[:N_GEOMETRY])
+        flat = 1.0 + vector[7:DARK] @ basis
+        gain, black, peak = vector[5] * self.photons_per_level, vector[6], self.levels - 1
+        fields = np.vstack([flat * shown, basis * shown[0]])  # appearance, five derivatives, five polynomials
+        lit, whole = patterns @ fields.T, fields.sum(axis=1)
+        light = gain * (black * peak * whole + (1 - black) * lit)
+        slopes = np.empty((len(patterns), DARK + 1))
+        slopes[:, :N_GEOMETRY] = light[:, 1:6]
+        slopes[:, 5] = light[:, 0] / vector[5]
+        slopes[:, 6] = gain * (peak * whole[0] - lit[:, 0])
+        slopes[:, 7:DARK] = light[:, 6:]
+        slopes[:, DARK] = 1.0
+        return np.maximum(light[:, 0] + vector[DARK], LEAST_MEAN), slopes
+
+
+def information_per_exposure(bench: Bench, vector: F64, patterns: F64) -> tuple[F64, F64]:
+    """Return the click probability (patterns,) and g (patterns, 13): one exposure tells the matrix g g^T of the vector."""
+    means, slopes = bench.slopes(vector, patterns)
+    log_miss = bench.model.log_miss(means)
+    clicks = -np.expm1(log_miss)
+    # d log(miss) / d mean, times the root of the information on log(miss), exp(log_miss) / p
+    weight = -bench.model.log_miss_slope(means) * np.sqrt(np.exp(log_miss) / clicks)
+    return clicks, weight[:, None] * slopes

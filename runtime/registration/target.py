@@ -1,8 +1,8 @@
-"""The known target of a registration: the built-in one, or a user's picture.
+"""The known target of a registration: the built-in one, or a user's picture, checked.
 
-Owns the picture and its checks; what a modulator makes of it is the profile's. The built-in target is 6 x 6 cells of black and clear,
-which pixels represent exactly: 48 edges between cells, as many upright as level, and of 20 000 random ones of that kind the one whose
-autocorrelation has the lowest side lobes within two cells (0.25 of the peak), so that no shift looks like another.
+The built-in target is 6 x 6 cells of black and clear, which pixels represent exactly: 48 edges between cells, as many upright as level, and
+of 20 000 random ones of that kind the one whose autocorrelation has the lowest side lobes within two cells (0.25 of the peak), so that no
+shift looks like another.
 """
 
 from __future__ import annotations
@@ -19,10 +19,7 @@ from pans.runtime.npz_file import read_arrays
 CELLS = ("#.#..#", "##.#..", "..#..#", "..#...", "..#..#", "##.###")
 SIDE = 28
 BUILT_IN = "built-in"
-LEAST_SIDE, MOST_PIXELS = (
-    14,
-    4096,
-)  # fewer pixels than two per cell blur into each other; beyond, optics' matrices take too much memory
+LEAST_SIDE, MOST_PIXELS = 14, 4096  # fewer than two pixels per cell blur; beyond, optics' matrices take too much memory
 TARGET_BYTES = 1 << 24
 LEAST_SPREAD = 0.05  # standard deviation of the transmission, below which a picture is hardly a target
 

@@ -12,7 +12,7 @@ from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.errors import ConfigError
 from pans.runtime.imaging import IDENTITY, Imaging, seen
 from pans.runtime.registration.correct import corrected
-from pans.runtime.registration.use import trained_optics
+from pans.runtime.registration.file import trained_optics
 
 SHAPE = (28, 28)
 TURNED = Imaging(right_px=1.0, down_px=1.0, rotation_deg=2.0)
