@@ -10,15 +10,7 @@ or opens a port. `Instrument` is the device; `DeviceClock` is the truth about it
 b''
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
 from .clock import DeviceClock, SteppedDevice
-
-if TYPE_CHECKING:
-    from .instrument import Instrument
+from .instrument import Instrument
 
 __all__ = ["DeviceClock", "Instrument", "SteppedDevice"]
-
-__getattr__ = lazy_names(__name__, {"Instrument": ".instrument"})

@@ -10,15 +10,7 @@ True
 0.5
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
 from .faults import Faults, parse_faults
-
-if TYPE_CHECKING:
-    from .serve import open_sim
+from .serve import open_sim
 
 __all__ = ["Faults", "open_sim", "parse_faults"]
-
-__getattr__ = lazy_names(__name__, {"open_sim": ".serve"})

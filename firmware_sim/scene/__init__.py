@@ -8,27 +8,10 @@ Everything is a function of a seed and the number of the exposure; never knows m
 True
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .detector_kernels import sample_words
-    from .detector_model import DetectorModel
-    from .moving import SceneFile
-    from .scene_file import open_scene
-    from .still import Scene, load_scene
+from .detector_kernels import sample_words
+from .detector_model import DetectorModel
+from .moving import SceneFile
+from .scene_file import open_scene
+from .still import Scene, load_scene
 
 __all__ = ["DetectorModel", "Scene", "SceneFile", "load_scene", "open_scene", "sample_words"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "DetectorModel": ".detector_model",
-        "Scene": ".still",
-        "SceneFile": ".moving",
-        "load_scene": ".still",
-        "open_scene": ".scene_file",
-        "sample_words": ".detector_kernels",
-    },
-)

@@ -14,12 +14,12 @@ rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.tra
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pans.runtime import __version__ as __version__
 from pans.runtime.errors import UsageError, as_usage_error
-from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -45,21 +45,22 @@ __all__ = [
     "run",
 ]
 
-_load = lazy_names(
-    __name__,
-    {
-        "build_plan": "pans.runtime.core.plan",
-        "evaluate": "pans.trainer.evaluate",
-        "load_profile": "pans.runtime.instrument.profile",
-        "read_recording": "pans.runtime.record",
-        "replay": "pans.runtime.record",
-    },
-)
+_HOMES = {
+    "build_plan": ("pans.runtime.core.plan", "build_plan"),
+    "evaluate": ("pans.trainer.evaluate", "evaluate"),
+    "load_profile": ("pans.runtime.instrument.profile", "load_profile"),
+    "load_recording": ("pans.runtime.record", "read_recording"),
+    "replay": ("pans.runtime.record", "replay"),
+}
 
 
 def __getattr__(name: str) -> object:
+    """Load a name when it is first used, since its package loads numba or torch (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'pans' has no attribute {name!r}")
+    module, found = _HOMES[name]
     try:
-        return _load("read_recording" if name == "load_recording" else name)
+        globals()[name] = getattr(import_module(module), found)
     except ModuleNotFoundError as error:
         if name != "evaluate":
             raise
@@ -67,6 +68,7 @@ def __getattr__(name: str) -> object:
             f"pans.evaluate needs the package {error.name}, which is not installed",
             remedy="pip install 'pans-runtime[train]'",
         ) from error
+    return globals()[name]
 
 
 def __dir__() -> list[str]:

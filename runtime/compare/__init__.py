@@ -7,24 +7,8 @@ Owns the tests and their words. It reads recordings, folders of runs and summari
 0.021484
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .comparison import Comparison, compare
-    from .side import Side, read_side
-    from .statistics import mcnemar_exact
+from .comparison import Comparison, compare
+from .side import Side, read_side
+from .statistics import mcnemar_exact
 
 __all__ = ["Comparison", "Side", "compare", "mcnemar_exact", "read_side"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "Comparison": ".comparison",
-        "Side": ".side",
-        "compare": ".comparison",
-        "mcnemar_exact": ".statistics",
-        "read_side": ".side",
-    },
-)

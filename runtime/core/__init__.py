@@ -14,17 +14,11 @@ decisions bit for bit. Objects in flow are handled by the package flow, which bu
 (10, 2)
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
+from .dark_guard import DarkGuard
 from .decision import NO_LABEL, Action, Decision, DecisionFlag, Output, Passage
 from .follower import Follower
 from .plan import Plan, build_plan
-
-if TYPE_CHECKING:
-    from .dark_guard import DarkGuard
-    from .still import Core
+from .still import Core
 
 __all__ = [
     "NO_LABEL",
@@ -39,5 +33,3 @@ __all__ = [
     "Plan",
     "build_plan",
 ]
-
-__getattr__ = lazy_names(__name__, {"Core": ".still", "DarkGuard": ".dark_guard"})

@@ -5,17 +5,9 @@ afterwards. Like core it does no input or output and reads no clock; pulses are 
 settings (`read_flow`) ask for, `build_flow_plan` its plan.
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
+from .core import FlowCore
+from .make import make_flow_core
 from .plan import build_flow_plan
 from .settings import FlowSettings, read_flow
 
-if TYPE_CHECKING:
-    from .core import FlowCore
-    from .make import make_flow_core
-
 __all__ = ["FlowCore", "FlowSettings", "build_flow_plan", "make_flow_core", "read_flow"]
-
-__getattr__ = lazy_names(__name__, {"FlowCore": ".core", "make_flow_core": ".make"})

@@ -8,18 +8,12 @@ the level of light). It talks to no device and decides nothing: a test returns f
 'sequential'
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
 from .calibration import Calibration, load_calibration
 from .click_law import ClickLaw, click_law, click_probability
+from .cusum import ChannelWatch
+from .dead_channels import DeadChannelTest
 from .dead_time import DeadTime
 from .profile import Profile, load_profile, parse_profile, shipped_profiles
-
-if TYPE_CHECKING:
-    from .cusum import ChannelWatch
-    from .dead_channels import DeadChannelTest
 
 __all__ = [
     "Calibration",
@@ -35,5 +29,3 @@ __all__ = [
     "parse_profile",
     "shipped_profiles",
 ]
-
-__getattr__ = lazy_names(__name__, {"ChannelWatch": ".cusum", "DeadChannelTest": ".dead_channels"})

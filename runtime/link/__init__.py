@@ -11,21 +11,7 @@ pans.runtime.errors.UsageError: 'nothing' is no device URL
   remedy: write scheme:target, for example sim:ideal or serial:/dev/ttyACM0
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .base import Link, open_link
-    from .connection import Connection
+from .base import Link, open_link
+from .connection import Connection
 
 __all__ = ["Connection", "Link", "open_link"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "Connection": ".connection",
-        "Link": ".base",
-        "open_link": ".base",
-    },
-)

@@ -5,15 +5,8 @@ times per second and hands it to a child process, which draws: the loop waits fo
 and never changes a run.
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .history import History
-    from .monitor import Monitor
-    from .snapshot import Snapshots
+from .history import History
+from .monitor import Monitor
+from .snapshot import Snapshots
 
 __all__ = ["History", "Monitor", "Snapshots"]
-
-__getattr__ = lazy_names(__name__, {"History": ".history", "Monitor": ".monitor", "Snapshots": ".snapshot"})

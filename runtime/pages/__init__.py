@@ -10,18 +10,8 @@ whole run are those of its summary. No page runs a script or loads anything.
 True
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .charts import Axis, Bars, Chart, Curve, Mark
-    from .page import Page
-    from .run import page_of
+from .charts import Axis, Bars, Chart, Curve, Mark
+from .page import Page
+from .run import page_of
 
 __all__ = ["Axis", "Bars", "Chart", "Curve", "Mark", "Page", "page_of"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {**dict.fromkeys(("Axis", "Bars", "Chart", "Curve", "Mark"), ".charts"), "Page": ".page", "page_of": ".run"},
-)

@@ -11,24 +11,8 @@ pans.runtime.errors.UsageError: none.pansrec: cannot be read: No such file or di
   remedy: check the path and its permissions
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .recorder import PartLimits, Recorder
-    from .recording import Recording, read_recording
-    from .replaying import replay
+from .recorder import PartLimits, Recorder
+from .recording import Recording, read_recording
+from .replaying import replay
 
 __all__ = ["PartLimits", "Recorder", "Recording", "read_recording", "replay"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "PartLimits": ".recorder",
-        "Recorder": ".recorder",
-        "Recording": ".recording",
-        "read_recording": ".recording",
-        "replay": ".replaying",
-    },
-)

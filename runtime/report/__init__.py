@@ -8,22 +8,7 @@ changes a file. `summarise` turns a run's result into a `Summary`, `verify_file`
 True
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .summary import Summary, summarise
-    from .verify import FileVerdict, verify_file
+from .summary import Summary, summarise
+from .verify import FileVerdict, verify_file
 
 __all__ = ["FileVerdict", "Summary", "summarise", "verify_file"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "FileVerdict": ".verify",
-        "Summary": ".summary",
-        "summarise": ".summary",
-        "verify_file": ".verify",
-    },
-)

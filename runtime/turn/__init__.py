@@ -4,14 +4,7 @@ Owns the kernels that wait, read, decide and answer by themselves, and their mem
 (live/run.py), whose decisions they give bit for bit. live/compiled.py uses it.
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .engine import Turn
-    from .streaming import StreamCore
+from .engine import Turn
+from .streaming import StreamCore
 
 __all__ = ["StreamCore", "Turn"]
-
-__getattr__ = lazy_names(__name__, {"StreamCore": ".streaming", "Turn": ".engine"})
