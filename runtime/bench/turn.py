@@ -28,7 +28,6 @@ from pans.runtime.errors import LinkError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import make_flow_core
 from pans.runtime.flow.settings import FlowSettings
-from pans.runtime.flow.steps import FlowSteps
 from pans.runtime.link.base import Link, descriptor_of, open_link
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.turn import rings as ring
@@ -145,12 +144,11 @@ def flow_row(bundle: Bundle, quick: bool) -> Row:
     plain.begin(0, 0)
     wanted = np.array([one for data in reads for frame in decoder.feed(data) for one in plain.step(frame).decisions],
                       DECISION_DTYPE)  # fmt: skip
-    steps = FlowSteps(core, plan)
-    turn = Turn(steps, BulkDecoder())
+    turn = Turn(core.steps(SESSION), BulkDecoder())
 
     def compiled() -> Rows:
         core.begin(0, 0)
-        steps.begin(SESSION)
+        core.steps(SESSION)
         rows = [wanted[:0]]
         for data in reads:
             ended = turn.feed([(1, data)])
@@ -263,8 +261,7 @@ def _framed(trips: Trips) -> tuple[NDArray[np.int64], int, int, float]:
     core = Core(plan, decider, 1, 0)
     core.warm_up()
     core.begin(0, 0)
-    steps = core.bulk_steps(SESSION)
-    assert steps is not None
+    steps = core.steps(SESSION)
     assert plan.automaton is not None
     driver = HostDriver(core, WalkPlace(plan, plan.automaton))
     turn = Turn(steps, BulkDecoder(), driver.arrays(SESSION))

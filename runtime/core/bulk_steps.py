@@ -1,13 +1,11 @@
-"""Many of a core's steps at once: ordinary messages through compiled kernels, on the state of the core itself.
+"""The state of a `still.Core` as arrays that the kernel continues: loaded before a call, stored after it.
 
-Owns the hand-over between `still.Core` and stream_kernels.py: both continue the same state, so that the rows are those that Core alone
-would give. What is not ordinary (out of order, behind a gap, no stream message) it leaves to the caller, who gives it to the core by
-`step`. Never waits, records or acts.
+Both continue the same state, so that the kernel's rows are those that the core alone would give. `Core.steps` makes it; turn/engine.py
+calls the kernel.
 """
 
 from __future__ import annotations
 
-import struct
 import zlib
 from typing import Any
 
@@ -16,95 +14,60 @@ import numpy.typing as npt
 
 from pans.runtime.decide.verdict import Decider, verdicts_of
 from pans.runtime.wire import walk as place
-from pans.runtime.wire.frame import Frame, Messages
-from pans.runtime.wire.messages import Mark, MessageType
+from pans.runtime.wire.messages import Mark
 
 from . import stream_kernels as kernels
-from .decision import (
-    DECISION_DTYPE,
-    NO_LABEL,
-    RUN_DTYPE,
-    VERDICT_DTYPE,
-    DecisionFlag,
-    NumberedDecisions,
-    Output,
-    RowDecisions,
-)
-from .follower import Follower
+from .decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
 from .plan import Plan
-from .stream_arrays import DecisionTables, FrameWalkArrays, MarkArrays, NumberArrays, WalkArrays
+from .stream_arrays import DecisionTables, FrameWalkArrays, IdleArrays, MarkArrays, WalkArrays
 from .window import DecisionWindows
-from .window_kernels import ONES, WindowArrays
+from .window_kernels import WindowArrays
 
-ROWS_PER_BATCH = 65536  # fewer and longer ways through Python; memory for them is a megabyte per 18 000
-NUMBERS_PER_BATCH = 1 << 17  # of decisions that are numbered: at a frame a microsecond, those between two clock probes
-ASKED_FOR = 1 << 12  # of them, rows that are asked for again and again: as many as a recorder's buffer holds
+ROWS_PER_CALL = 65536  # decisions of one call, beside those of a block; a megabyte per 18 000
 WORD_FEATURES = 24  # of tables by word: what stream_kernels.py looks up at once
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
-_KINDS = {"parallel": place.FRAMES, "sequential": place.CLICKS}
 _LARGEST = (1 << 62) - 1
 
 Rows = npt.NDArray[np.void]
 
 
-def rows_needed(n_windows: int, aim: int = ROWS_PER_BATCH) -> int:
-    """Return how many rows hold `aim` decisions and those of one block more."""
-    return aim + min(n_windows, CLICKS_MAX)
-
-
 class BulkSteps:
-    """The compiled steps of `core`, whose windows are `windows`; all memory is allocated here, before arming.
+    """What the kernel continues of `core` (a still.Core), whose windows are `windows`; all memory is allocated here, before arming."""
 
-    `rows_max` decisions are given at once.
-    """
-
-    def __init__(
-        self,
-        core: Follower,
-        windows: DecisionWindows,
-        plan: Plan,
-        decider: Decider,
-        shots: int,
-        rows_max: int = ROWS_PER_BATCH,
-    ) -> None:
+    def __init__(self, core: Any, windows: DecisionWindows, plan: Plan, decider: Decider, shots: int) -> None:
         self.core, self.windows = core, windows
         self._decider, self._shots = decider, shots
         self.tables = decision_tables(decider, shots, plan)
-        self._verdicts = word_verdicts(self.tables, decider.n_features)
+        rows_max = self.block_rows + ROWS_PER_CALL
         # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
-        self._numbered = _numbers(rows_max if len(self._verdicts) else 0, windows)
-        self._rows: Rows = np.zeros(rows_max, DECISION_DTYPE)
-        self._rows[: ASKED_FOR if len(self._verdicts) else rows_max] = np.zeros((), DECISION_DTYPE)
+        self._rows: Rows = np.full(rows_max, 0, DECISION_DTYPE)
         self._counts = np.full((0 if self.tables.labels.size else rows_max, decider.n_features), 0, np.int64)
-        self._marks, self._told = _no_marks(), _no_marks()  # as the kernel knows them, and as the core does
-        sequential = plan.mode != "parallel"
-        self._windows = WindowArrays(
+        n = kernels.MARK_SLOTS
+        self._marks = MarkArrays(np.full(n, -1, np.int64), np.full(n, 0, np.int16), np.full(n, 0, np.float32))
+        one_by_one = 0 if windows.parallel else CLICKS_MAX
+        arrays = WindowArrays(
             *windows.arrays(),
             np.zeros(-(-decider.n_features // 8), np.uint64),
             np.zeros(decider.n_features, np.int64),
             plan.slot_offset_ticks.astype(np.int64),
-            np.full(CLICKS_MAX if sequential else 0, 0, np.uint16),
-            np.full(CLICKS_MAX if sequential else 0, 0, np.uint8),
+            np.full(one_by_one, 0, np.uint16),
+            np.full(one_by_one, 0, np.uint8),
         )
-        self._state = np.zeros(kernels.N_STATE, np.int64)
-        self._state[kernels.EXPOSURE_TICKS] = plan.exposure_ticks
-        self._state[kernels.VISIT_EXPOSURES] = windows.visit_exposures
-        self._state[kernels.SHOTS] = shots
-        self._state[kernels.PERIOD_TICKS], self._state[kernels.CYCLE_TICKS] = plan.slot_period_ticks, plan.cycle_ticks
-        self._state[kernels.N_CLASSES] = core.n_classes
-        self._state[kernels.KIND] = _KINDS[plan.mode]
-        out = self._rows, self._counts, self._numbered
-        self._walk = WalkArrays(self._state, self._marks, self._windows, self.tables, *out, core.tracker.heard)
+        state = self._state = np.zeros(kernels.N_STATE, np.int64)
+        state[kernels.EXPOSURE_TICKS], state[kernels.VISIT_EXPOSURES] = plan.exposure_ticks, windows.visit_exposures
+        state[kernels.PERIOD_TICKS], state[kernels.CYCLE_TICKS] = plan.slot_period_ticks, plan.cycle_ticks
+        state[kernels.SHOTS], state[kernels.N_CLASSES] = shots, core.n_classes
+        kind = FrameWalkArrays if windows.parallel else WalkArrays
+        self.walk = kind(state, self._marks, arrays, self.tables, self._rows, self._counts, core.tracker.heard)
 
     @property
-    def walk(self) -> WalkArrays:
-        """What a kernel continues between `load` and `store`."""
-        made = FrameWalkArrays if self._state[kernels.KIND] == place.FRAMES else WalkArrays
-        return made(*self._walk)
+    def takes(self) -> bool:
+        """Whether the kernel may take the core's messages."""
+        return bool(self.core.tracker.open)
 
     @property
     def decides(self) -> bool:
-        """Whether kernels give the labels, too: with a table or an automaton. Else `labelled` asks the back end for many at once."""
+        """Whether the kernel gives the labels, too: with a table or an automaton. Else `rows` asks the back end for many at once."""
         return bool(self.tables.labels.size)
 
     @property
@@ -112,89 +75,37 @@ class BulkSteps:
         """Most decisions of one block."""
         return min(self.windows.n_windows, CLICKS_MAX)
 
-    @property
-    def stamps(self) -> npt.NDArray[np.uint16]:
-        """The patterns shown of the latest CLICKS block that a kernel looked at, and whatever stood behind them before."""
-        return self._windows.stamps
-
-    @property
-    def bits(self) -> npt.NDArray[np.uint8]:
-        """The clicks that belong to `stamps`."""
-        return self._windows.bits
-
-    def warm_up(self) -> None:
-        """Compile or load the kernels, before arming."""
-        self.begin(0)
-        self.take(Messages(np.zeros(8, np.uint8), np.zeros((0, 2), np.int64)), 0)
-
     def begin(self, session: int) -> None:
         """Follow the stream of `session`, from where the core stands: its marks are known, others forgotten."""
         self._state[kernels.SESSION] = session
-        self._marks.objects[:] = self._told.objects[:] = -1
+        self._marks.objects[:] = -1
         for mark in self.core.marks.values():
-            self._remember(mark)
+            self.remember(mark)
 
-    def take(self, messages: Messages, first: int, blocks: int = 0) -> tuple[int, Rows, bool]:
-        """Take messages from `first` on: how far that went, the decisions (n,) of it, and whether the message there is not ordinary.
-
-        It ends at what is not ordinary, when there is no room for more decisions, and behind `blocks` blocks (0: any number). Rows are
-        valid until the next call.
-        """
-        state = self._state
-        state[kernels.MESSAGE] = first
-        state[kernels.STEPS] = blocks
-        self.load()
-        ended = kernels.ODD
-        if self.core.tracker.open:
-            ended = kernels.walk_messages(*messages, self._walk)
-        self.store()
-        return int(state[kernels.MESSAGE]), self.labelled(int(state[kernels.N_ROWS])), ended == kernels.ODD
-
-    def step(self, frame: Frame) -> Output:
-        """Let the core take a message that is not ordinary."""
-        self.hand_over()
-        output = self.core.step(frame)
-        if frame.type == MessageType.MARK and self.core.marks:
-            mark = self.core.marks[next(reversed(self.core.marks))]
-            if struct.pack("<II", mark.seq, mark.object_index) == frame.payload[:8]:  # it was taken
-                self._remember(mark)
-        return output
+    def remember(self, mark: Mark) -> None:
+        """Know a mark from here on."""
+        slot = mark.object_index % kernels.MARK_SLOTS
+        self._marks.objects[slot], self._marks.truths[slot] = mark.object_index, mark.truth
+        self._marks.photons[slot] = mark.photons
 
     def photons_of(self, objects: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
         """Return the expected photoelectrons of one shot on each object, float32 (n,), NaN where no mark told them."""
         slots = objects.astype(np.int64) % kernels.MARK_SLOTS
-        known = self._marks.objects[slots] == objects
-        return np.where(known, self._marks.photons[slots], np.float32(np.nan))
+        return np.where(self._marks.objects[slots] == objects, self._marks.photons[slots], np.float32(np.nan))
 
-    def labelled(self, n: int) -> Rows:
-        """Return the first `n` rows; those that the kernel could not label from a table get their verdicts here, all at once."""
-        if self._numbered.numbers.size:
-            return self.decisions(slice(0, n)).rows
+    def rows(self, n: int) -> Rows:
+        """Return the first `n` rows; those that the kernel could not decide get their verdicts here, all at once."""
         rows = self._rows[:n]
-        if self.tables.labels.size or not n:
+        if self.decides or not n:
             return rows
         whole = np.flatnonzero(rows["flags"] == 0)
         labels, probabilities = _finite(*verdicts_of(self._decider, self._counts[whole], self._shots))
         rows["label"][whole], rows["probability"][whole] = labels, probabilities
         silent = labels == NO_LABEL
-        if silent.any():
-            why = np.where(probabilities > 0, int(DecisionFlag.AMBIGUOUS), int(DecisionFlag.NOT_FINITE))
-            rows["flags"][whole[silent]] = why[silent] | int(DecisionFlag.ABSTAINED)
-            self.core.n_abstained += int(silent.sum())
+        why = np.where(probabilities > 0, int(DecisionFlag.AMBIGUOUS), int(DecisionFlag.NOT_FINITE))
+        rows["flags"][whole[silent]] = why[silent] | int(DecisionFlag.ABSTAINED)
+        self.core.n_abstained += int(silent.sum())
         return rows
-
-    def decisions(self, place: slice) -> RowDecisions:
-        """Return the decisions at `place`, as `labelled` gives them; their rows are made when somebody asks for them, if that can be."""
-        if not self._numbered.numbers.size:
-            return RowDecisions(self.labelled(place.stop))
-        decided = self._verdicts, self._numbered.numbers[place], self._numbered.runs[place]
-
-        def rows_of(first: int, stop: int) -> Rows:
-            rows = self._rows[: stop - first]
-            kernels.write_rows(*decided, first, stop, rows)
-            return rows
-
-        return NumberedDecisions(*decided, rows_of)
 
     def load(self) -> None:
         """Copy what Core, its tracker and its windows know into the kernel's state."""
@@ -205,7 +116,7 @@ class BulkSteps:
         state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT] = self.windows.position
         state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED] = core.n_decisions, core.n_abstained
         state[place.END_EXPOSURE], state[kernels.LAST_TICK] = (
-            min(core.end_exposure, (1 << 62)),
+            min(core.end_exposure, 1 << 62),
             min(core.last_tick, _LARGEST),
         )
         state[kernels.JITTER] = min(core.jitter_ticks, _LARGEST)
@@ -213,78 +124,38 @@ class BulkSteps:
     def store(self) -> None:
         """Copy what the kernel did back."""
         core, state = self.core, self._state.tolist()
-        if state[place.MESSAGES] or state[kernels.N_ROWS]:
-            core.tracker.advance(
-                (state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]),
-                state[place.MESSAGES],
-                state[place.EXPOSURES],
-            )
-            self.windows.go_on((state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT]))
+        if state[place.MESSAGES]:
+            position = state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]
+            core.tracker.advance(position, state[place.MESSAGES], state[place.EXPOSURES])
+            self.windows.advance((state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT]))
             if state[kernels.LAST_TICK] != min(core.last_tick, _LARGEST):  # a larger one only Python's integers hold
                 core.last_tick = state[kernels.LAST_TICK]
             core.jitter_ticks = max(core.jitter_ticks, state[kernels.JITTER])
         core.n_decisions, core.n_abstained = state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED]
 
-    def hand_over(self) -> None:
-        """Tell the core of the marks that the kernel has taken: before the core does anything by itself."""
-        marks, core = self._marks, self.core
-        new = np.flatnonzero((marks.objects != self._told.objects) | (marks.truths != self._told.truths))
-        for slot in new.tolist():
-            core.marks.pop(int(self._told.objects[slot]), None)
-            number = int(marks.objects[slot])
-            core.marks[number] = Mark(0, number, int(marks.truths[slot]), 0, 0, float(marks.photons[slot]))
-        self._told.objects[new], self._told.truths[new] = marks.objects[new], marks.truths[new]
 
-    def told(self, mark: Mark) -> None:
-        """Note that the core knows of a mark which the kernel has taken."""
-        slot = mark.object_index % kernels.MARK_SLOTS
-        self._told.objects[slot], self._told.truths[slot] = mark.object_index, mark.truth
-        self._told.photons[slot] = mark.photons
+class IdleSteps:
+    """What the kernel has of a core (a Follower) that takes every message itself: it only receives and checks."""
 
-    def _remember(self, mark: Mark) -> None:
-        slot = mark.object_index % kernels.MARK_SLOTS
-        for marks in (self._marks, self._told):
-            marks.objects[slot], marks.truths[slot] = mark.object_index, mark.truth
-            marks.photons[slot] = mark.photons
+    takes, decides, block_rows = False, True, 1
 
+    def __init__(self, core: Any) -> None:
+        self.walk = IdleArrays(np.zeros(kernels.N_STATE, np.int64), np.zeros(1, DECISION_DTYPE), core.tracker.heard)
 
-def _no_marks() -> MarkArrays:
-    n = kernels.MARK_SLOTS
-    return MarkArrays(np.full(n, -1, np.int64), np.full(n, 0, np.int16), np.full(n, 0, np.float32))
+    def begin(self, session: int) -> IdleSteps:
+        """Receive messages of `session`."""
+        self.walk.state[kernels.SESSION] = session
+        return self
 
+    def rows(self, n: int) -> Rows:
+        """Return no rows."""
+        return self.walk.rows[:0]
 
-def _numbers(n: int, windows: DecisionWindows) -> NumberArrays:
-    """Return room for `n` numbered decisions in memory that has been touched; of a plan's stretches only with room."""
-    _, window_at, *_ = windows.arrays()
-    goes_on = np.where(window_at[:-1] < 0, window_at[1:] == window_at[:-1], window_at[1:] == window_at[:-1] + 1)
-    ends = np.append(np.flatnonzero(~goes_on) + 1, len(window_at))
-    ends = ends[np.searchsorted(ends, np.arange(len(window_at) if n else 0), side="right")]
-    return NumberArrays(np.full(n, 0, np.uint32), np.full(n, 0, RUN_DTYPE), ends.astype(np.int32))
+    def load(self) -> None:
+        """Nothing is continued."""
 
-
-def word_verdicts(tables: DecisionTables, n_features: int) -> Rows:
-    """Return the verdict on each row of the table, VERDICT_DTYPE (rows,), where words are looked up at once; else none."""
-    n_bytes = len(tables.word_rows)
-    verdicts: Rows = np.zeros(len(tables.labels) if n_bytes else 0, VERDICT_DTYPE)
-    words = np.arange(1 << n_features if n_bytes else 0)
-    rows, clicks, crc = np.zeros_like(words), np.zeros_like(words), np.full(len(words), tables.crc_zero[0])
-    for byte in range(n_bytes):
-        part = words >> 8 * byte & 0xFF
-        rows += tables.word_rows[byte, part]
-        clicks += ONES[part]
-        crc ^= tables.word_crc[byte, part]
-    if n_bytes:
-        verdicts["label"], verdicts["probability"] = tables.labels, tables.probabilities
-        why = np.where(tables.probabilities > 0, int(DecisionFlag.AMBIGUOUS), int(DecisionFlag.NOT_FINITE))
-        verdicts["flags"] = np.where(tables.labels == NO_LABEL, why | int(DecisionFlag.ABSTAINED), 0)
-        verdicts["clicks"][rows], verdicts["counts_crc"][rows] = clicks, crc
-    return verdicts
-
-
-def is_numbered(decider: Decider, shots: int, plan: Plan) -> bool:
-    """Whether frames of parallel channels are decided word by word: by a table, each by itself."""
-    by_table = hasattr(decider, "radix") and decider.n_features <= WORD_FEATURES
-    return shots == 1 and plan.mode == "parallel" and by_table
+    def store(self) -> None:
+        """Nothing was."""
 
 
 def decision_tables(decider: Decider, shots: int, plan: Plan) -> DecisionTables:
@@ -299,7 +170,8 @@ def decision_tables(decider: Decider, shots: int, plan: Plan) -> DecisionTables:
     if found is not None or (plan.automaton is not None and getattr(decider, "automaton", None) is plan.automaton):
         labels, probabilities = _finite(getattr(decider, "labels"), getattr(decider, "probabilities"))  # noqa: B009
     table, zero = count_crc_tables(n_features, shots)
-    n_bytes = -(-n_features // 8) if is_numbered(decider, shots, plan) else 0
+    by_word = shots == 1 and plan.mode == "parallel" and found is not None and n_features <= WORD_FEATURES
+    n_bytes = -(-n_features // 8) if by_word else 0
     word_rows, word_crc = np.zeros((n_bytes, 256), np.int64), np.zeros((n_bytes, 256), np.uint32)
     for feature in range(n_features if n_bytes else 0):
         byte, bit = feature >> 3, feature & 7

@@ -6,7 +6,7 @@ is made of; never decides.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 from typing import Any, NamedTuple, Protocol, overload
@@ -120,54 +120,6 @@ class RowDecisions(Sequence[Decision]):
         return [Decision(*row) for row in found] if isinstance(at, slice) else Decision(*found)
 
 
-class NumberedDecisions(RowDecisions):
-    """Decisions of which each is a row of a table, valid until the next call: what frames of parallel channels give, one by one.
-
-    `numbers` uint32 (n,) are places in `verdicts`, VERDICT_DTYPE. `runs` RUN_DTYPE (n,) tell the rest: the run that begins with decision i
-    stands at runs[i], and the next one behind its `count`; places in between are not looked at. Whole rows are made by `rows_of`, from
-    one place up to another, when somebody asks for them; they are valid until the next are asked for.
-    """
-
-    def __init__(
-        self,
-        verdicts: npt.NDArray[np.void],
-        numbers: npt.NDArray[np.uint32],
-        runs: npt.NDArray[np.void],
-        rows_of: Callable[[int, int], npt.NDArray[np.void]],
-    ) -> None:
-        self.verdicts, self.numbers, self.runs, self._rows_of = verdicts, numbers, runs, rows_of
-
-    @property
-    def rows(self) -> npt.NDArray[np.void]:
-        """See RowDecisions."""
-        return self._rows_of(0, len(self))
-
-    @property
-    def first(self) -> int:
-        """See RowDecisions."""
-        return int(self.runs["index"][0]) if len(self) else 0
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    def __iter__(self) -> Iterator[Decision]:
-        return iter(self[:])
-
-    @overload
-    def __getitem__(self, at: int) -> Decision: ...
-
-    @overload
-    def __getitem__(self, at: slice) -> list[Decision]: ...
-
-    def __getitem__(self, at: int | slice) -> Decision | list[Decision]:
-        place = range(len(self))[at]
-        if isinstance(place, int):
-            return Decision(*self._rows_of(place, place + 1)[0].tolist())
-        if place.step != 1:
-            return [self[one] for one in place]
-        return [Decision(*row) for row in self._rows_of(place.start, max(place.start, place.stop)).tolist()]
-
-
 class Action(NamedTuple):
     """A pulse that decision `number` asks for: output `channel` from `tick` on; worthless after `tick`. Absolute device ticks."""
 
@@ -225,7 +177,7 @@ class Output(NamedTuple):
     In flow `passages` says, for every decision in its place, what it was made from; `actions` is what is to be done.
     """
 
-    decisions: list[Decision]
+    decisions: Sequence[Decision]
     events: Sequence[CoreEvent]
     block_end_tick: int | None
     passages: tuple[Passage, ...] = ()
@@ -235,22 +187,9 @@ class Output(NamedTuple):
 def joined(first: Output, then: Output, block_end_tick: int | None = None) -> Output:
     """Return what two outputs say together, in their order."""
     return Output(
-        first.decisions + then.decisions,
+        [*first.decisions, *then.decisions],
         [*first.events, *then.events],
         block_end_tick,
         first.passages + then.passages,
         first.actions + then.actions,
     )
-
-
-class Rows:
-    """What one call gathers of objects in flow."""
-
-    def __init__(self) -> None:
-        self.decisions: list[Decision] = []
-        self.passages: list[Passage] = []
-        self.actions: list[Action] = []
-
-    def output(self) -> Output:
-        """Return it as a core's output."""
-        return Output(self.decisions, [], None, tuple(self.passages), tuple(self.actions))

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import (
     ClickBlock,
     DeviceState,
@@ -96,6 +95,7 @@ class Follower:
         self._slots_per_cycle, self._cycles_per_object = plan.slots_per_cycle, plan.cycles_per_object
         self.end_exposure = self._exposures_of(n_cycles)
         self._begun = False
+        self._idle_steps: Any = None
         self._status: Status | None = None  # the latest of this stream
         self._told_end: int | None = None  # tick of the first STATUS that told of the end
         self._told_wrong = False  # whether that one has been found to contradict the plan
@@ -135,6 +135,14 @@ class Follower:
 
     def _go_on_from(self, place: dict[str, Any]) -> None:
         raise NotImplementedError
+
+    def steps(self, session: int) -> Any:
+        """Return what the kernel continues of this core (turn/engine.Steps), ready for messages of `session`."""
+        if self._idle_steps is None:
+            from .bulk_steps import IdleSteps  # numba is loaded only by who receives
+
+            self._idle_steps = IdleSteps(self)
+        return self._idle_steps.begin(session)
 
     # -- parts of a recording ------------------------------------------------------------------------------------------
 
@@ -194,13 +202,6 @@ class Follower:
 
     def _exposures_of(self, n_cycles: int) -> int:
         return n_cycles * self._slots_per_cycle if n_cycles else 1 << 63
-
-    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
-        """Take stream messages from `place` on, at least one, up to the first of which something came; return how many, and that.
-
-        The outputs together are those of `step` on each of them. Subclasses may take many at once.
-        """
-        return 1, self.step(messages.frame(place))
 
     def step(self, frame: Frame) -> Output:
         """Take one frame (CLICKS, FRAMES, MARK or STATUS) in the order of arrival."""

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from pans.runtime.decide.backends import Decider
 from pans.runtime.instrument.channel_health import Finding
-from pans.runtime.wire.frame import Messages
-from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock
+from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark
 
-from .bulk_steps import NUMBERS_PER_BATCH, ROWS_PER_BATCH, BulkSteps, is_numbered, rows_needed
+from .bulk_steps import BulkSteps, IdleSteps
 from .dark_guard import DarkGuard
 from .decision import NO_LABEL, Decision, DecisionFlag, Output
 from .follower import ANY_CLASS, Follower, Place
@@ -38,9 +37,8 @@ class Core(Follower):
         self.shots = shots
         self._decider = decider
         self._visits_before = 0  # in streams that have ended
-        self._bulk: BulkSteps | None = None  # once warmed up, where they give all that is asked for
-        self._steps: BulkSteps | None = None  # the same, where they decide block by block, too
-        self._session_known = False  # to them
+        self._bulk: BulkSteps | None = None
+        self._session_known = False  # to it
 
     @property
     def tallies(self) -> NDArray[np.int64]:
@@ -52,43 +50,28 @@ class Core(Follower):
         self.windows.warm_up()
         if self.guard is not None:
             self.guard.warm_up()
-        if self._plan.largest == 1 and (self.guard is None or self.guard.policy == "warn"):
-            many = is_numbered(self._decider, self.shots, self._plan)
-            rows = rows_needed(self.windows.n_windows, NUMBERS_PER_BATCH if many else ROWS_PER_BATCH)
-            steps = self._bulk = BulkSteps(self, self.windows, self._plan, self._decider, self.shots, rows)
-            ordinary = steps.decides and not self.windows.parallel  # others decide one by one, as `step` does
-            self._steps = steps if ordinary else None
-
-    def warm_up_steps(self) -> None:
-        """Compile or load what `step_messages` needs to take a block in one call, where that can be; else it is asked for none."""
-        if self._steps is not None:
-            self._steps.warm_up()
-
-    def leave_steps(self) -> None:
-        """Ordinary messages are taken elsewhere, by `bulk_steps`: `step_messages` takes what is left one by one."""
-        self._steps = None
 
     @property
-    def counts_photons(self) -> bool:
-        """Whether exposures are numbers: of photons, or of the clicks of several detectors."""
-        return self._plan.largest > 1
+    def takes(self) -> bool:
+        """Whether the kernel may take messages: exposures are clicks, not numbers, and no guard changes decisions."""
+        return self._plan.largest == 1 and (self.guard is None or self.guard.policy == "warn")
 
-    @property
-    def compiles(self) -> bool:
-        """Whether compiled steps give all that is asked for, once warmed up: clicks, and no guard, or one that only warns."""
-        return self._bulk is not None
-
-    @property
-    def decides_compiled(self) -> bool:
-        """Whether they give each decision at once, too."""
-        return self._bulk is not None and self._bulk.decides
-
-    def bulk_steps(self, session: int) -> BulkSteps | None:
-        """Return the compiled steps, ready for messages of `session`; None where they do not give all that is asked for."""
-        if self._bulk is not None and not self._session_known:
+    def steps(self, session: int) -> BulkSteps | IdleSteps:
+        """See Follower."""
+        if not self.takes:
+            return super().steps(session)
+        if self._bulk is None:
+            self._bulk = BulkSteps(self, self.windows, self._plan, self._decider, self.shots)
+        if not self._session_known:
             self._bulk.begin(session)
             self._session_known = True
         return self._bulk
+
+    def remember(self, mark: Mark) -> None:
+        """See Follower."""
+        super().remember(mark)
+        if self._bulk is not None:
+            self._bulk.remember(mark)
 
     def begin(self, start_tick: int, n_cycles: int) -> Output:
         """See Follower."""
@@ -97,24 +80,8 @@ class Core(Follower):
 
     def part(self) -> Place | None:
         """See Follower."""
-        self._session_known = False  # of the marks that are forgotten here the compiled steps must not know either
+        self._session_known = False  # of the marks that are forgotten here the kernel must not know either
         return super().part()
-
-    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
-        """See Follower: an ordinary block of one detector's exposures is one call of a kernel."""
-        if self._steps is None:
-            if self._bulk is None:
-                return super().step_messages(messages, place)
-            return 1, self._bulk.step(messages.frame(place))
-        if not self._session_known:
-            self.bulk_steps(messages.frame(place).session)
-        next_exposure = self.tracker.next_exposure
-        stop, rows, _ = self._steps.take(messages, place, blocks=1)
-        if stop == place:
-            return 1, self._steps.step(messages.frame(place))
-        n = self.tracker.next_exposure - next_exposure
-        events = self.watch_blocks(self._steps.stamps[:n], self._steps.bits[:n], next_exposure, rows)
-        return stop - place, Output([Decision(*row) for row in rows.tolist()], events, self.last_tick)
 
     def watch_blocks(
         self, stamps: NDArray[np.uint16], bits: NDArray[np.uint8], first: int, rows: NDArray[np.void]

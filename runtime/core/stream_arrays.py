@@ -40,18 +40,6 @@ class MarkArrays(NamedTuple):
     photons: npt.NDArray[np.float32]
 
 
-class NumberArrays(NamedTuple):
-    """Decisions that are rows of a table, as decision.NumberedDecisions: numbers uint32 (m,) and runs RUN_DTYPE (m,).
-
-    `ends` int32 (visit,): behind which exposure ends the stretch, all dark or one window each, that an exposure of a visit belongs to. All
-    are of length 0 where kernels write whole rows at once.
-    """
-
-    numbers: npt.NDArray[np.uint32]
-    runs: npt.NDArray[np.void]
-    ends: npt.NDArray[np.int32]
-
-
 class Block(NamedTuple):
     """An accepted block: its frames (of CLICKS: exposures) from `at` on in the buffer, from exposure `first`, `relative` in the visit, on.
 
@@ -72,10 +60,9 @@ class Block(NamedTuple):
 
 
 class WalkArrays(NamedTuple):
-    """What `take_message` continues: state int64 (N_STATE,), marks, windows, tables, rows DECISION_DTYPE (m,), counts int64 (m, d_f).
+    """What `take_clicks` continues: state int64 (N_STATE,), marks, windows, tables, rows DECISION_DTYPE (m,), counts int64 (m, d_f).
 
-    Where `numbered` has room, decisions go there, and `rows` is only as long. `heard` is StreamTracker's: whoever calls `take_message`
-    fills it.
+    `heard` is StreamTracker's: whoever calls the kernel fills it.
     """
 
     state: npt.NDArray[np.int64]
@@ -84,9 +71,16 @@ class WalkArrays(NamedTuple):
     tables: DecisionTables
     rows: npt.NDArray[np.void]
     counts: npt.NDArray[np.int64]
-    numbered: NumberArrays
     heard: npt.NDArray[np.int64]
 
 
 class FrameWalkArrays(WalkArrays):
-    """The same of a stream of frames: a turn is compiled for these (`take_frames`) or for one detector's exposures (`take_clicks`)."""
+    """The same of a stream of frames, for `take_frames`: the kernel is compiled for one of the two."""
+
+
+class IdleArrays(NamedTuple):
+    """What the kernel has of a core that takes every message itself: state int64 (N_STATE,), rows DECISION_DTYPE (1,), `heard`."""
+
+    state: npt.NDArray[np.int64]
+    rows: npt.NDArray[np.void]
+    heard: npt.NDArray[np.int64]

@@ -1,8 +1,7 @@
-"""The compiled kernel of the core: decoded CLICKS, FRAMES and MARK bodies in, rows of the decision log out.
+"""The kernel of the core: decoded CLICKS, FRAMES and MARK bodies in, rows of the decision log out.
 
-Owns the ordinary case: messages in order, nothing lost, blocks that fit the plan. Whatever else comes it leaves untouched and says so: its
-caller gives it to `still.Core`, whose state this kernel continues (bulk_steps.py joins them). What exposures of one detector mean is
-window_kernels.py's. Never allocates.
+It takes the ordinary case: messages in order, nothing lost, blocks that fit the plan. Any other message it leaves untouched: its caller
+gives it to `still.Core`, whose state this kernel continues (bulk_steps.py joins them). It never allocates.
 """
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from pans.runtime.wire import walk as stream
-from pans.runtime.wire.bare import bare, load4, load8
-from pans.runtime.wire.inner import inner, outer
+from pans.runtime.wire.bare import load4, load8
+from pans.runtime.wire.inner import inner
 from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 
 from .decision import NO_LABEL, DecisionFlag
@@ -24,21 +23,17 @@ from .window_kernels import (
     add_exposures,
     add_walks,
     begin_visit,
-    clicks_of_words,
     complete,
-    number_words,
     spill,
     sum_up,
 )
 
-# state, int64 (N_STATE,): where the stream (stream.N_PLACE columns) and the walk stand; what it continues of Core and DecisionWindows
-MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT = range(stream.N_PLACE, stream.N_PLACE + 7)
-N_DECISIONS, N_ABSTAINED, LAST_TICK, JITTER = range(OBJECT + 1, OBJECT + 5)
-EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK, PERIOD_TICKS, CYCLE_TICKS, N_CLASSES = range(JITTER + 1, JITTER + 8)
-# blocks that may be taken before the kernel returns, and then no marks (0: any number); the kind of the plan's blocks
-STEPS, KIND, N_STATE = range(N_CLASSES + 1, N_CLASSES + 4)
-# what `walk_messages` and `take_message` return; TOOK_URGENT is a block of which the caller must know at once (flow/deciding.py's alone)
-ALL_DONE, ROWS_FULL, ODD, TOOK_MARK, TOOK_BLOCK, TOOK_URGENT = range(6)
+# state, int64 (N_STATE,): where the stream (stream.N_PLACE columns) and the windows stand; what it continues of Core and DecisionWindows
+N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABSTAINED = range(stream.N_PLACE, stream.N_PLACE + 7)
+LAST_TICK, JITTER, EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK = range(N_ABSTAINED + 1, N_ABSTAINED + 7)
+PERIOD_TICKS, CYCLE_TICKS, N_CLASSES, N_STATE = range(START_TICK + 1, START_TICK + 5)
+# what `take_frames` and `take_clicks` return; TOOK_URGENT is a block of which the caller must know at once
+ODD, TOOK_MARK, TOOK_BLOCK, TOOK_URGENT = range(4)
 MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
 
 _U = np.uint64
@@ -48,74 +43,49 @@ _NOT_FINITE, _AMBIGUOUS = int(DecisionFlag.NOT_FINITE) | _ABSTAINED, int(Decisio
 _NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
 
 
-@outer
-def walk_messages(buffer, spans, walk):  # type: ignore[no-untyped-def]
-    """Take messages from state[MESSAGE] on until all are done, the rows are full, or one is not ordinary; say which.
-
-    Behind the state[STEPS]-th block all are done, too. buffer uint8, spans int64 (n, 2), walk WalkArrays.
-    """
-    buffer, walk = bare(buffer), bare(walk)
-    state, marks, windows, tables, rows, counts_out, numbered, heard = walk
-    blocks = 0
-    while state[MESSAGE] < spans.shape[0]:
-        if state[STEPS] and blocks == state[STEPS]:
-            return ALL_DONE
-        if state[N_ROWS] == rows.size:
-            return ROWS_FULL
-        start, stop = _U(spans[state[MESSAGE], 0]), _U(spans[state[MESSAGE], 1])
-        if state[STEPS] and buffer[start] == stream.MARK:
-            return ODD  # a live run looks into the core's own marks
-        took = take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out, numbered)
-        if took in (ODD, ROWS_FULL):
-            return took
-        stream.hear(buffer, start, stop, heard, state)
-        blocks += took == TOOK_BLOCK
-        state[MESSAGE] += 1
-    return ALL_DONE
-
-
 @inner
-def take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out, numbered):  # type: ignore[no-untyped-def]
-    """Take the message from `start` to `stop`, uint64: TOOK_MARK, TOOK_BLOCK, ODD where it is not ordinary (and nothing is done).
-
-    ROWS_FULL: the rows are, within a block; state[FRAME] says where it goes on.
-    """
+def take_frames(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Take a message of a stream of frames, from `start` to `stop`, uint64; ODD, and nothing done, where it is not ordinary."""
     if not _is_ours(buffer, start, stop, state):
         return ODD
     kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
     if kind == stream.MARK:
         return TOOK_MARK if _take_mark(buffer, payload, stop, state, marks) else ODD
-    if kind == stream.FRAMES:
-        return _take_frames(buffer, payload, stop, state, marks, windows, tables, rows, counts_out, numbered)
-    if kind == stream.CLICKS:
-        return _take_clicks(buffer, payload, stop, state, marks, windows, tables, rows, counts_out)
-    return ODD
-
-
-@inner
-def take_frames(buffer, start, stop, state, marks, windows, tables, rows, counts_out, numbered):  # type: ignore[no-untyped-def]
-    """Take a message as `take_message` does, of a stream of frames: with nothing compiled of other blocks."""
-    if not _is_ours(buffer, start, stop, state):
+    if kind != stream.FRAMES or not _accept_frames(buffer, payload, stop, state, windows):
         return ODD
-    kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
-    if kind == stream.MARK:
-        return TOOK_MARK if _take_mark(buffer, payload, stop, state, marks) else ODD
-    if kind == stream.FRAMES:
-        return _take_frames(buffer, payload, stop, state, marks, windows, tables, rows, counts_out, numbered)
-    return ODD
+    block = _block_of(buffer, payload, state, marks, windows)
+    if tables.word_rows.shape[0]:
+        _take_words(buffer, block, state, windows, tables, rows)
+    else:
+        _take_windows(buffer, block, state, windows, tables, rows, counts_out)
+    return _took(state, tables)
 
 
 @inner
 def take_clicks(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
-    """Take a message as `take_message` does, of a stream of one detector's exposures: with nothing compiled of frames."""
+    """Take a message as `take_frames` does, of a stream of one detector's exposures."""
     if not _is_ours(buffer, start, stop, state):
         return ODD
     kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
     if kind == stream.MARK:
         return TOOK_MARK if _take_mark(buffer, payload, stop, state, marks) else ODD
-    if kind == stream.CLICKS:
-        return _take_clicks(buffer, payload, stop, state, marks, windows, tables, rows, counts_out)
+    if kind != stream.CLICKS or not _accept_clicks(buffer, payload, stop, state, windows):
+        return ODD
+    block = _block_of(buffer, payload, state, marks, windows)
+    _settle(block, state, windows, tables, rows, counts_out)
+    return _took(state, tables)
+
+
+@inner
+def take_nothing(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
+    """Leave every message to the caller."""
     return ODD
+
+
+@inner
+def _took(state, tables):  # type: ignore[no-untyped-def]
+    """TOOK_URGENT where a back end that is not the kernel's has to decide."""
+    return TOOK_URGENT if tables.labels.size == 0 and state[N_ROWS] > 0 else TOOK_BLOCK
 
 
 @inner
@@ -126,32 +96,6 @@ def _is_ours(buffer, start, stop, state):  # type: ignore[no-untyped-def]
         and stream.is_plain(buffer, start)
         and load4(buffer, start + _U(4)) == _U(state[SESSION])
     )
-
-
-@inner
-def _take_frames(buffer, payload, stop, state, marks, windows, tables, rows, counts_out, numbered):  # type: ignore[no-untyped-def]
-    if state[FRAME] == 0 and not _accept_block(buffer, payload, stop, state, windows):
-        return ODD
-    block = _block_of(buffer, payload, state, marks, windows)
-    if numbered.numbers.size:
-        _take_words(buffer, block, state, windows, tables, numbered)
-    else:
-        _take_windows(buffer, block, state, windows, tables, rows, counts_out)
-    if state[FRAME] < block.frames:
-        return ROWS_FULL
-    state[FRAME] = 0
-    return TOOK_BLOCK
-
-
-@inner
-def _take_clicks(buffer, payload, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
-    if state[FRAME] == 0 and not _accept_clicks(buffer, payload, stop, state, windows):
-        return ODD
-    block = _block_of(buffer, payload, state, marks, windows)
-    if not _settle(block, state, windows, tables, rows, counts_out):
-        return ROWS_FULL
-    state[FRAME] = 0
-    return TOOK_BLOCK
 
 
 @inner
@@ -177,10 +121,10 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
 
 
 @inner
-def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
+def _accept_frames(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
     """Account for a block of frames that is the next one and fits the plan; else False, and nothing done."""
     count, word_bytes = stream.next_block(buffer, payload, stop, state)
-    if count == 0 or state[KIND] != stream.FRAMES or word_bytes < windows.lanes.size:
+    if count == 0 or word_bytes < windows.lanes.size:
         return False
     return _accept(buffer, payload, count, state, windows)
 
@@ -189,7 +133,7 @@ def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-unt
 def _accept_clicks(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
     """Count a block of one detector's exposures, if it is the next one and fits the plan; else False, and nothing done."""
     count = stream.next_clicks(buffer, payload, stop, state)
-    if count == 0 or state[KIND] != stream.CLICKS:
+    if count == 0:
         return False
     stamps, bits = windows.stamps[:count], windows.bits[:count]
     stream.unpack_clicks(buffer, payload, count, stamps, bits)
@@ -206,7 +150,6 @@ def _accept_clicks(buffer, payload, stop, state, windows):  # type: ignore[no-un
         add_walks(relative, stamps, bits, maps, windows.walks, counts, seen, tallies)
     else:
         add_exposures(relative, stamps, bits, windows.feature_at, windows.window_at, counts, seen, tallies)
-    state[FRAME] = count
     return True
 
 
@@ -276,69 +219,42 @@ def _block_of(buffer, payload, state, marks, windows):  # type: ignore[no-untype
 
 
 @inner
-def _take_words(buffer, block, state, windows, tables, numbered):  # type: ignore[no-untyped-def]
-    """K = 1 with a table, frames from state[FRAME] on: every frame with light is a window, every word a row of the table."""
+def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no-untyped-def]
+    """K = 1 with a table: every frame with light is a window, every word a row of the table."""
     window_at, tallies, n_features = windows.window_at, windows.tallies, windows.counts.shape[1]
-    numbers, runs, ends = numbered.numbers, numbered.runs, numbered.ends
-    n, frame, window, silent = state[N_ROWS], state[FRAME], state[NEXT_WINDOW], np.int64(0)
-    before = state[N_DECISIONS] - n
-    while frame < block.frames and n < numbers.size:
-        here = np.int64(window_at[block.relative + frame])
-        stop = min(np.int64(ends[block.relative + frame]) - block.relative, block.frames)
-        at, top = block.at + _U(frame) * block.word_bytes, _U(block.top_mask)
+    word_rows, word_crc, last = tables.word_rows, tables.word_crc, _U(tables.word_rows.shape[0] - 1)
+    at, n = block.at, state[N_ROWS]
+    for i in range(block.frames):
+        top = _U(buffer[at + last]) & _U(block.top_mask)
+        clicks, index, crc = ONES[top], word_rows[last, top], tables.crc_zero[0] ^ word_crc[last, top]
+        for byte in range(last):
+            part = buffer[at + byte]
+            clicks += ONES[part]
+            index += word_rows[byte, part]
+            crc ^= word_crc[byte, part]
+        at += block.word_bytes
+        here = np.int64(window_at[block.relative + i])
         if here < 0:
-            tallies[DARK_CLICKS] += clicks_of_words(buffer, at, stop - frame, block.word_bytes, top, windows.lanes.size)
-            tallies[DARK_EXPOSURES] += n_features * (stop - frame)
-            frame = stop
+            tallies[DARK_CLICKS] += clicks
+            tallies[DARK_EXPOSURES] += n_features
             continue
-        stop = min(stop, frame + numbers.size - n)
-        silent += number_words(
-            buffer, at, block.word_bytes, top, tables.word_rows, tables.labels, numbers, n, stop - frame
-        )
-        run = runs[n]
-        run["index"], run["exposure_index"], run["shot"] = before + n, block.first + frame, here
-        run["tick"], run["tick_step"] = block.end_tick + frame * block.period_ticks, block.period_ticks
-        run["object"], run["truth"], run["count"] = block.object, block.truth, stop - frame
-        run["exposure_step"], run["shot_step"], run["continues"] = 1, 1, 0
-        n, window, frame = n + stop - frame, here + stop - frame, stop
-    state[N_ROWS], state[FRAME], state[NEXT_WINDOW] = n, frame, window
-    state[N_DECISIONS], state[N_ABSTAINED] = before + n, state[N_ABSTAINED] + silent
-
-
-@outer
-def write_rows(verdicts, numbers, runs, first, stop, rows):  # type: ignore[no-untyped-def]
-    """Write NumberedDecisions from place `first` to `stop` whole: rows DECISION_DTYPE (stop - first,)."""
-    begin, none = np.int64(0), np.uint32(0)
-    while begin < stop:
-        run, number = runs[begin], runs[begin]["object"]
-        index, tick, exposure, shot = _U(run["index"]), _U(run["tick"]), _U(run["exposure_index"]), _U(run["shot"])
-        tick_step, exposure_step, shot_step = _U(run["tick_step"]), _U(run["exposure_step"]), _U(run["shot_step"])
-        truth, end = run["truth"], begin + np.int64(run["count"])
-        for i in range(max(begin, first), min(end, stop)):
-            row, verdict, k = rows[i - first], verdicts[numbers[i]], _U(i - begin)
-            row["index"], row["tick"], row["exposure_index"] = (
-                index + k,
-                tick + k * tick_step,
-                exposure + k * exposure_step,
-            )
-            row["object"], row["truth"], row["shot"] = number, truth, shot + k * shot_step
-            row["clicks"], row["label"], row["flags"] = verdict["clicks"], verdict["label"], verdict["flags"]
-            row["probability"], row["counts_crc"] = verdict["probability"], verdict["counts_crc"]
-            row["exposures"] = none
-        begin = end
+        label, probability, flags = _look_up(tables.labels, tables.probabilities, index)
+        _put_row(rows[n], state, block, i, here, (clicks, label, flags, probability, crc))
+        n += 1
+        state[NEXT_WINDOW] = here + 1
+    state[N_ROWS] = n
 
 
 @inner
 def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
-    """Any K and any back end, frames from state[FRAME] on: clicks gather in byte lanes until a window, a block or a lane is full."""
+    """Any K and any back end: clicks gather in byte lanes until a window, a block or a lane is full."""
     window_at, last, counts, seen = windows.window_at, windows.last, windows.counts, windows.seen
     lanes, whole, tallies = windows.lanes, windows.whole, windows.tallies
     labels, probabilities, radix, crc_table = tables.labels, tables.probabilities, tables.radix, tables.crc
     n_features, n_lanes, crc_zero, shots = counts.shape[1], lanes.size, tables.crc_zero[0], state[SHOTS]
-    n_rows, done = state[N_ROWS], block.frames
-    at = block.at + _U(state[FRAME]) * block.word_bytes
+    n_rows, at = state[N_ROWS], block.at
     window, held = np.int64(-1), np.int64(0)  # `held` frames of `window` are in the lanes
-    for i in range(state[FRAME], block.frames):
+    for i in range(block.frames):
         here = np.int64(window_at[block.relative + i])
         if here < 0:
             for p in range(n_lanes):
@@ -371,12 +287,9 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
         _put_row(rows[n_rows], state, block, i, here * shots, (clicks, label, flags, probability, crc))
         n_rows += 1
         state[NEXT_WINDOW] = here + 1
-        if n_rows == rows.size:
-            done = i + 1
-            break
     if held:
         spill(lanes, counts, seen, window, held)
-    state[N_ROWS], state[FRAME] = n_rows, done
+    state[N_ROWS] = n_rows
 
 
 @inner
@@ -388,16 +301,14 @@ def _keep_counts(counts_out, row, counts):  # type: ignore[no-untyped-def]
 
 @inner
 def _settle(block, state, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
-    """Rows of the windows that CLICKS `block`, whose exposures are counted, settles; False while some wait for room."""
+    """Rows of the windows that CLICKS `block`, whose exposures are counted, settles."""
     need, last, counts, seen = windows.walks.need, windows.last, windows.counts, windows.seen
     end, n_states = block.relative + block.frames, windows.walks.successors.shape[0]
     while state[NEXT_WINDOW] < counts.shape[0]:
         index = state[NEXT_WINDOW]
         right, wrong = seen[index, 0], seen[index, 1]
         if right < need[index] and last[index] >= end:
-            return True
-        if state[N_ROWS] == rows.size:
-            return False
+            return
         clicks, row, crc = sum_up(counts[index], tables.radix, tables.crc, tables.crc_zero[0])
         label, probability = np.int64(_NO_LABEL), np.float32(0.0)
         flags = (_WRONG if wrong else 0) | (_GAP if right + wrong < need[index] else 0)
@@ -412,7 +323,6 @@ def _settle(block, state, windows, tables, rows, counts_out):  # type: ignore[no
         here["exposures"] = right if n_states else 0
         state[N_ROWS] += 1
         state[NEXT_WINDOW] += 1
-    return True
 
 
 @inner

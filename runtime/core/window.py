@@ -135,12 +135,12 @@ class DecisionWindows:
 
     @position.setter
     def position(self, value: tuple[int, int, int]) -> None:
-        self.go_on(value)
+        self.advance(value)
         self.walks.nodes[: self._next_window] = len(
             self.walks.successors
         )  # at a leaf: what is left of the cycle is dark
 
-    def go_on(self, position: tuple[int, int, int]) -> None:
+    def advance(self, position: tuple[int, int, int]) -> None:
         """Take over a `position` to which a kernel has brought the same arrays."""
         self._visit, self._next_window, self._object = position
 

@@ -1,7 +1,6 @@
 """The compiled kernels of the windows: exposures in; clicks, and how many exposures were right, out. Sums over a whole window's clicks.
-Frames that are a window each: words in, rows of a table out.
 
-Owns the loops, and with them what every exposure of a visit means; never allocates. The arrays are window.DecisionWindows'.
+They say what every exposure of a visit means, and never allocate. The arrays are window.DecisionWindows'.
 
 A window is whole when `seen` right exposures are as many as it needs. With fixed patterns that is a number of the plan. A walk of an
 automaton needs as many as it takes to reach a leaf, which is known when it is there: until then it needs those of the longest walk.
@@ -14,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import DARK_PATTERN
 
@@ -209,34 +207,3 @@ def sum_up(whole, radix, crc_table, crc):  # type: ignore[no-untyped-def]
         for feature in range(whole.size):
             crc ^= crc_table[byte, feature, (whole[feature] >> (8 * byte)) & 0xFF]
     return clicks, index, crc
-
-
-@inner
-def number_words(buffer, at, word_bytes, top, word_rows, labels, numbers, first, count):  # type: ignore[no-untyped-def]
-    """Put the rows of the table that `count` words from byte `at` on lead to behind numbers[:first]; return how many of them abstain.
-
-    `top` are the bits of a word's last byte that are channels; at, word_bytes and top uint64.
-    """
-    last, silent = _U(word_rows.shape[0] - 1), np.int64(0)
-    for i in range(_U(first), _U(first + count)):
-        row = word_rows[last, _U(buffer[at + last]) & top]
-        if last:  # one by one: a loop of one turn, made for many, took longer than all the rest
-            row += word_rows[0, buffer[at]]
-            if last > _U(1):
-                row += word_rows[1, buffer[at + _U(1)]]
-        numbers[i] = row
-        silent += labels[_U(row)] == NO_LABEL
-        at += word_bytes
-    return silent
-
-
-@inner
-def clicks_of_words(buffer, at, count, word_bytes, top, n_bytes):  # type: ignore[no-untyped-def]
-    """The clicks of `count` words from byte `at` on, each of them in its first `n_bytes` bytes; as number_words."""
-    clicks, last = np.int64(0), _U(n_bytes - 1)
-    for _ in range(count):
-        clicks += ONES[_U(buffer[at + last]) & top]
-        for byte in range(last):
-            clicks += ONES[buffer[at + byte]]
-        at += word_bytes
-    return clicks

@@ -1,8 +1,7 @@
-"""Decisions about objects in flow, one for each: what cells (cells.py) and a tape (tape.py) have in common.
+"""Decisions about objects in flow, cells or the bars of a tape, one for each.
 
-Owns the ring of the last frames, the verdict on a window, the pulse it asks for and why a passage is given up; frames run through
-kernels.py. Never reads a clock and never learns the truth before it has decided: matching.py compares afterwards. A core of a flow has
-the shape of core.Core; its outputs also carry the passages and the pulses. make.py makes one.
+`FlowCore` takes frames and marks one by one (`step`), or lets the kernel take them (`steps`): both continue the same arrays, and kernels.py
+decides. What a decision was worth, matching.py says afterwards. Outputs also carry the passages and the pulses. make.py makes a core.
 
 A cell's row of the decision log says: `object` the number of the passage, `exposure_index` the last exposure of the best window,
 `clicks` those of that window. No window overlaps a gap: the row is then flagged GAP and abstains.
@@ -11,35 +10,47 @@ A cell's row of the decision log says: `object` the number of the passage, `expo
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from pans.runtime.core import stream_kernels as columns
+from pans.runtime.core.bulk_steps import decision_tables
 from pans.runtime.core.dark_guard import DarkGuard
-from pans.runtime.core.decision import NO_LABEL, Action, Decision, DecisionFlag, Output, Passage, Rows, joined
+from pans.runtime.core.decision import (
+    DECISION_DTYPE,
+    NO_LABEL,
+    Action,
+    CoreEvent,
+    Decision,
+    DecisionFlag,
+    Output,
+    Passage,
+    joined,
+)
 from pans.runtime.core.follower import Follower
 from pans.runtime.core.plan import Plan
+from pans.runtime.core.stream_arrays import DecisionTables
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
 from pans.runtime.decide.backends import Decider
 from pans.runtime.decide.verdict import Verdict, log_evidence, softmax_winner
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import Finding
-from pans.runtime.wire import walk as stream
-from pans.runtime.wire.frame import Messages
-from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
+from pans.runtime.wire import walk as place
+from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock, Mark, Status
 
-from . import columns, kernels
-from . import walk as walking
-from .arrays import FlowArrays, NewMarks
+from . import kernels
+from .kernels import FlowArrays, FlowWalk
 from .matching import PassageMatcher
-from .settings import WATCHED_FRAMES, FlowLimits, FlowSettings
+from .settings import WATCHED_FRAMES, FlowLimits, FlowSettings, Q
 
 MAX_CHANNELS = 64  # bits of a ring word
-MAX_PASSAGES = 64  # of one call of the kernel; it is called again
-MAX_MARKS_AT_ONCE = 64
-NO_FLAGS = DecisionFlag(0)
+MAX_PASSAGES = 64  # of one call of `scan`; it is called again
+ROWS_MORE = 2048  # decisions of one call, beside those of a block
+MOST_BLOCKS = 4096  # whose empty frames have not been told yet: as many as a call keeps times of (turn/rings.py)
+_LARGEST = (1 << 62) - 1
+_PART = (1 << Q) - 1
 _GAP, _ABSTAINED, _NOT_FINITE, _AMBIGUOUS = (
     int(flag) for flag in (DecisionFlag.GAP, DecisionFlag.ABSTAINED, DecisionFlag.NOT_FINITE, DecisionFlag.AMBIGUOUS)
 )  # plain integers: an enumeration's operators cost a microsecond each
@@ -48,7 +59,7 @@ I64 = npt.NDArray[np.int64]
 
 
 class FlowCore(Follower):
-    """What cells and tape share: the ring of frames, the verdict on a window, the pulse it asks for."""
+    """The decisions on one flow; `walk` is what the kernel continues, and what `step` continues with the same kernels."""
 
     moving = True
 
@@ -63,121 +74,283 @@ class FlowCore(Follower):
         n_cycles: int,
     ) -> None:
         super().__init__(plan, n_cycles, decider.n_classes)
-        if plan.mode != "parallel" or decider.n_features > MAX_CHANNELS:
+        n = decider.n_features
+        if plan.mode != "parallel" or n > MAX_CHANNELS:
             raise UsageError(
-                f"a flow needs a parallel plan of up to {MAX_CHANNELS} channels, this one is {plan.mode} with {decider.n_features}"
+                f"a flow needs a parallel plan of up to {MAX_CHANNELS} channels, this one is {plan.mode} with {n}"
             )
-        self.settings, self.limits, self.shots = settings, limits, shots
+        self.settings, self.limits, self.shots, self.decider = settings, limits, shots, decider
         self.frames = shots * settings.pool  # of a decision
-        self.guard: DarkGuard | None = None  # of the dark counts; None: they are only added up
+        self._guard: DarkGuard | None = None
         self.watched_frames = 0  # empty ones that it has been told of
-        self._watched_channels: I64 = np.zeros(decider.n_features, np.int64)
-        self.matcher = PassageMatcher(decider.n_classes, gated, self._lag(), touching=settings.kind == "tape")
-        self.n_passages = 0
+        self._watched_channels: I64 = np.zeros(n, np.int64)
+        self._is_tape = settings.kind == "tape"
+        lag = 64 + 4 * self.frames if self._is_tape else 4 * limits.longest + 4 * limits.onset_frames
+        self.matcher = PassageMatcher(decider.n_classes, gated, lag, touching=self._is_tape)
         self.dark_probability = 0.0  # of a click, that the limits were worked out with
-        self.dark_channels: I64 = np.zeros(decider.n_features, np.int64)  # clicks in dark frames
-        self.empty_channels: I64 = np.zeros(decider.n_features, np.int64)  # clicks in frames without an object
-        self.decider = decider
         self.gated = gated  # classes for which a pulse is asked
         self._cycles_before = 0  # in streams that have ended
-        self._state: I64 = np.zeros(kernels.N_STATE, np.int64)
-        self._words = np.zeros(limits.ring, np.uint64)
-        self._counts = np.zeros(limits.ring, np.int16)
-        self._clicks: I64 = np.zeros((settings.pool, decider.n_features), np.int64)
-        self._channel_mask = np.uint64((1 << decider.n_features) - 1)
+        self._told = 0  # of walk.empty
         self._dark_cycle = plan.slots_per_cycle if plan.slot_pattern[-1] == DARK_PATTERN else 0
-        self._period_ticks = plan.slot_period_ticks
-        self._max_block = plan.block_exposures
-        self._facts = self.new_facts()
-        self._slot_offsets = plan.slot_offset_ticks.astype(np.int64)
-        self._new = NewMarks(
-            np.zeros((MAX_MARKS_AT_ONCE, walking.N_MARK), np.int64), np.zeros(MAX_MARKS_AT_ONCE, np.float32)
+        self._period_ticks, self._max_block = plan.slot_period_ticks, plan.block_exposures
+        self.block_rows = plan.block_exposures + 1 + MAX_PASSAGES
+        self.walk = self._new_walk(plan, n)
+        self._ring = self.walk.flow
+        self.dark_channels, self.empty_channels = self._ring.dark_channels, self._ring.empty_channels
+        if self._is_tape:
+            self._prepare_tape(plan)
+
+    def _new_walk(self, plan: Plan, n: int) -> FlowWalk:
+        limits, pool, n_rows = self.limits, self.settings.pool, self.block_rows + ROWS_MORE
+        state = np.zeros(kernels.N_FACTS, np.int64)
+        state[columns.EXPOSURE_TICKS], state[columns.PERIOD_TICKS] = plan.exposure_ticks, plan.slot_period_ticks
+        state[columns.CYCLE_TICKS], state[kernels.MAX_BLOCK] = plan.cycle_ticks, plan.block_exposures
+        state[columns.N_CLASSES], state[kernels.DARK_EVERY] = self.n_classes, self._dark_cycle
+        state[kernels.FRAMES] = self.frames
+        # of what looks for passages; none where their times are known
+        looks = np.array([] if self._is_tape else [*limits[:8], self._dark_cycle], np.int64)
+        flow = FlowArrays(
+            np.zeros(limits.ring, np.uint64),
+            np.zeros(limits.ring, np.int16),
+            looks,
+            np.zeros(kernels.N_STATE, np.int64),
+            np.zeros(n, np.int64),
+            np.zeros(n, np.int64),
+            np.zeros((MAX_PASSAGES, kernels.N_COLUMNS), np.int64),
         )
-        self._limits: I64 = np.zeros(0, np.int64)  # of what looks for passages; none where their times are known
-        self._passages: I64 = np.zeros((MAX_PASSAGES, kernels.N_COLUMNS), np.int64)
-        self._prepare(plan)
-        self.arrays = FlowArrays(
-            self._words,
-            self._counts,
-            self._limits,
-            self._state,
-            self.dark_channels,
-            self.empty_channels,
-            self._passages,
+        gated = np.zeros(max(1, self.decider.n_classes), np.uint8)
+        gated[sorted(self.gated)] = 1
+        tables = decision_tables(self.decider, self.shots, plan)
+        if pool > 1:  # evidence is added up by the back end
+            tables = _undecided(tables)
+        # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
+        return FlowWalk(
+            state,
+            flow,
+            plan.slot_offset_ticks.astype(np.int64),
+            np.full(1, (1 << n) - 1, np.uint64),
+            tables,
+            np.full(1, self.settings.sure, np.float64),
+            gated,
+            np.full(n_rows, 0, DECISION_DTYPE),
+            np.full((n_rows, kernels.N_PASSAGE), 0, np.int64),
+            np.full((n_rows, pool, n), 0, np.int64),
+            np.full((MOST_BLOCKS, 2 + n), 0, np.int64),
+            np.zeros(kernels.N_EDGES, np.int64),
+            self.tracker.heard,
         )
 
-    def _prepare(self, plan: Plan) -> None:
-        """Make what this kind of flow needs besides, once, before arming."""
-        raise NotImplementedError
+    @property
+    def guard(self) -> DarkGuard | None:
+        """The guard of the dark counts; None: they are only added up."""
+        return self._guard
 
-    def _lag(self) -> int:
-        """Exposures after which a passage can no longer be decided."""
-        return 4 * self.limits.longest + 4 * self.limits.onset_frames
+    @guard.setter
+    def guard(self, guard: DarkGuard | None) -> None:
+        self._guard = guard
+        if guard is not None and guard.policy != "warn":  # each verdict depends on what it has found
+            self.walk = self.walk._replace(tables=_undecided(self.walk.tables))
 
     @property
     def tallies(self) -> I64:
         """Dark exposures, dark clicks and wrong patterns (never seen: static patterns carry no stamp), int64 (window.N_TALLIES,)."""
         tallies: I64 = np.zeros(N_TALLIES, np.int64)
-        n_dark = int(self._state[kernels.DARK_FRAMES])
+        n_dark = int(self._ring.state[kernels.DARK_FRAMES])
         tallies[DARK_EXPOSURES], tallies[DARK_CLICKS] = n_dark * len(self.dark_channels), self.dark_channels.sum()
         return tallies
 
     @property
     def empty_frames(self) -> int:
         """Light frames far from every object; their clicks per channel are `empty_channels`."""
-        return int(self._state[kernels.EMPTY_FRAMES])
+        return int(self._ring.state[kernels.EMPTY_FRAMES])
 
     @property
     def dark_frames(self) -> int:
         """Dark frames; their clicks per channel are `dark_channels`."""
-        return int(self._state[kernels.DARK_FRAMES])
+        return int(self._ring.state[kernels.DARK_FRAMES])
+
+    @property
+    def n_passages(self) -> int:
+        """Objects so far."""
+        return int(self.walk.state[kernels.OBJECTS])
+
+    @property
+    def bars_per_s(self) -> float | None:
+        """A tape's speed: as it was said, or as it was last found; None of cells."""
+        pitch, nominal = self.walk.state[kernels.PITCH], self.walk.state[kernels.NOMINAL_PITCH]
+        return float(self.settings.bars_per_s * nominal / pitch) if self._is_tape else None
 
     def cycles_left(self, n_cycles: int) -> int:
         """Return how many of `n_cycles` cycles stand out: those that have not begun."""
         return n_cycles - self._cycles_before - -(-self.tracker.next_exposure // self._slots_per_cycle)
-
-    def new_facts(self) -> I64:
-        """Return the facts of a stream that has not begun, int64 (columns.N_FACTS,)."""
-        return walking.facts_of(self._plan, self.n_classes, self._dark_cycle)
 
     @property
     def watches_empty(self) -> bool:
         """Whether the guard is told of the empty field: there are no dark frames."""
         return self.guard is not None and not self._dark_cycle
 
-    # -- the compiled turn ---------------------------------------------------------------------------------------------
+    # -- the kernel ----------------------------------------------------------------------------------------------------
+
+    def steps(self, session: int) -> FlowCore:
+        """See Follower."""
+        self.walk.state[columns.SESSION] = session
+        return self
 
     @property
-    def excluded(self) -> str:
-        """Why no compiled turn can be taken, for people; "" where it can."""
-        if self.guard is not None and self.guard.policy != "warn":
-            return "--on-dark changes decisions while they are made"
-        if self.settings.pool > 1:
-            return "the evidence of windows side by side is added in Python"
-        return (
-            "" if getattr(self.decider, "radix", None) is not None else "the back end is no table: it decides in Python"
+    def takes(self) -> bool:
+        """Whether the kernel may take messages."""
+        return self.tracker.open
+
+    @property
+    def decides(self) -> bool:
+        """Whether it gives the labels, too: with a table, and where nothing else has a say. Else `account` asks the back end."""
+        return bool(self.walk.tables.labels.size)
+
+    def rows(self, n: int) -> npt.NDArray[np.void]:
+        """Return the first `n` rows."""
+        return self.walk.rows[:n]
+
+    def load(self) -> None:
+        """Copy what the core and its tracker know into the kernel's state."""
+        state = self.walk.state
+        state[columns.N_ROWS] = state[place.MESSAGES] = state[place.EXPOSURES] = state[kernels.ASKS] = 0
+        state[columns.START_TICK] = min(self.start_tick, _LARGEST)
+        state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE], state[place.DROPS] = self.tracker.position
+        state[columns.N_DECISIONS], state[columns.N_ABSTAINED] = self.n_decisions, self.n_abstained
+        state[place.END_EXPOSURE] = min(self.end_exposure, 1 << 62)
+        state[columns.LAST_TICK], state[columns.JITTER] = (
+            min(self.last_tick, _LARGEST),
+            min(self.jitter_ticks, _LARGEST),
         )
+        state[kernels.WATCH_AT] = self.watched_frames + WATCHED_FRAMES if self.watches_empty else 1 << 62
 
-    def lend(self, state: I64) -> None:
-        """Put what this kind of flow knows besides into `state`, int64 (columns.N_FACTS,)."""
+    def store(self) -> None:
+        """Copy what the kernel did back."""
+        state = self.walk.state.tolist()
+        if state[place.MESSAGES]:
+            position = state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]
+            self.tracker.advance(position, state[place.MESSAGES], state[place.EXPOSURES])
+            if state[columns.LAST_TICK] != min(self.last_tick, _LARGEST):  # a larger one only Python's integers hold
+                self.last_tick = state[columns.LAST_TICK]
+            self.jitter_ticks = max(self.jitter_ticks, state[columns.JITTER])
+        self.n_decisions, self.n_abstained = state[columns.N_DECISIONS], state[columns.N_ABSTAINED]
 
-    def take_back(self, state: Sequence[int]) -> None:
-        """Go on from `state`."""
+    def told_empty(self) -> list[list[int]]:
+        """Return what the empty field gave and has not been accounted for: rows of `FlowWalk.empty`."""
+        first, self._told = self._told, int(self.walk.state[kernels.TOLD])
+        return self.walk.empty[np.arange(first, self._told) % MOST_BLOCKS].tolist()
+
+    def leave_ticks(self, n: int) -> I64:
+        """Return when the objects of the first `n` rows left, int64 (n,) device ticks."""
+        return self.walk.passages[:n, kernels.W_LEAVE]
+
+    def pulses(self, n: int) -> list[Action]:
+        """Return the pulses that the first `n` rows ask for, in order."""
+        places = np.flatnonzero(np.isin(self.walk.rows["label"][:n], sorted(self.gated))) if self.gated else ()
+        numbers, leaves = self.walk.rows["index"], self.leave_ticks(n)
+        return [self._pulse(int(numbers[place]), int(leaves[place])) for place in places]
+
+    def watch(self, empty: list[int] | None) -> list[Finding]:
+        """Let the guard see what the empty field gave with a block, a row of `told_empty`; return what it found with that, and before."""
+        if self.guard is None:
+            return []
+        frames = self.watched_frames if empty is None else empty[1]
+        return self._watch_empty(self.guard, frames, np.array([] if empty is None else empty[2:], np.int64))
+
+    def account(
+        self, rows: slice, behind: int, end_tick: int | None, empty: list[int] | None, block: FrameBlock | None
+    ) -> Output:
+        """Account for what the kernel decided on a block that ended at `end_tick`; exposure `behind` follows.
+
+        `rows` are its decisions, `empty` what the empty field gave with it; `block` is for the guard of dark frames. Where the kernel
+        does not decide, the back end does so here.
+        """
+        guard = self.guard
+        events: list[CoreEvent] = [] if block is None or guard is None else [*guard.take(block)]
+        decided = self._decided(rows)
+        if self.watches_empty:
+            events = [*self.watch(empty)]
+        self.matcher.settle(behind)
+        return Output(decided.decisions, events, end_tick, decided.passages, decided.actions)
+
+    def _watch_empty(self, guard: DarkGuard, empty_frames: int, empty_channels: I64) -> list[Finding]:
+        """Without dark slots, the frames in which no object was found, so many with these clicks, tell the dark rates."""
+        frames = empty_frames - self.watched_frames
+        if frames < WATCHED_FRAMES:
+            return guard.news()
+        clicks = empty_channels - self._watched_channels
+        self.watched_frames, self._watched_channels = empty_frames, empty_channels.copy()
+        return guard.take_empty(frames, np.minimum(clicks, frames))
+
+    # -- one decision --------------------------------------------------------------------------------------------------
+
+    def _decided(self, rows: slice) -> Output:
+        """Give verdicts to the rows that wait for one, compare all with the truth, and ask for pulses."""
+        walk, guard = self.walk, self.guard
+        decisions, passages, actions = list[Decision](), list[Passage](), list[Action]()
+        for at in range(rows.start, rows.stop):
+            row, counts = walk.rows[at], walk.counts[at]
+            if guard is not None and not row["flags"] & _GAP:
+                guard.take_object(counts.sum(axis=0), NO_OBJECT)
+            if not self.decides:
+                self._judge(row, counts)
+            decision, passage = Decision(*row.tolist()), Passage(*walk.passages[at].tolist())
+            gated = decision.label in self.gated
+            if gated:
+                actions.append(self._pulse(decision.number, passage.leave_tick))
+            self.matcher.add_decision(decision, passage, gated)
+            decisions.append(decision)
+            passages.append(passage)
+        return Output(decisions, [], None, tuple(passages), tuple(actions))
+
+    def _judge(self, row: Any, counts: I64) -> None:
+        """Complete a row that the kernel has not decided, from the clicks of its windows int64 (pool, d_f)."""
+        flags, alarmed = int(row["flags"]), 0 if self.guard is None else int(self.guard.flags)
+        waits = not flags
+        if not flags & _GAP:
+            row["clicks"], row["counts_crc"] = counts.sum(), zlib.crc32(counts.tobytes())
+        if alarmed & _ABSTAINED:
+            flags |= alarmed
+        if not flags:
+            verdict = self._verdict(counts)
+            if not verdict.probability > 0:
+                flags |= _NOT_FINITE
+            elif verdict.probability < self.settings.sure or verdict.label == NO_LABEL:
+                flags |= _AMBIGUOUS
+            row["label"], row["probability"] = NO_LABEL if flags else verdict.label, verdict.probability
+        flags |= _ABSTAINED if flags else 0
+        self.n_abstained += bool(waits and flags)
+        row["flags"] = flags | alarmed  # decided, but with another table
+
+    def _verdict(self, counts: I64) -> Verdict:
+        decider = self.decider
+        if self.guard is not None:
+            decider = self.guard.decider(decider)
+            for one in counts:
+                self.guard.count_word(one)
+        if self.settings.pool == 1:
+            return Verdict(*decider.decide(counts[0], self.shots))
+        return softmax_winner(log_evidence(decider.scores_batch(counts, self.shots)).sum(axis=0))
+
+    def _pulse(self, number: int, leave_tick: int) -> Action:
+        """Return the pulse that decision `number` asks for, whose object left at `leave_tick`."""
+        tick = leave_tick + self.limits.gate_delay_ticks
+        return Action(number, tick, self.limits.gate_ticks, self.settings.gate_channel)
+
+    # -- what the follower asks for ------------------------------------------------------------------------------------
 
     def warm_up(self) -> None:
         """Run every compiled kernel of the hot path once, before arming, on state of its own."""
-        block = np.frombuffer(bytes(8 * 2), np.uint8).reshape(2, 8)
-        state, words, counts = np.zeros_like(self._state), self._words.copy(), self._counts.copy()
-        spare = np.zeros_like(self.dark_channels)
-        kernels.put_frames(block, 0, words, counts, self._dark_cycle, state, spare, self._channel_mask)
+        ring, block = self._ring, np.frombuffer(bytes(8 * 2), np.uint8).reshape(2, 8)
+        state, words, counts = np.zeros_like(ring.state), ring.words.copy(), ring.counts.copy()
+        spare, mask = np.zeros_like(self.dark_channels), self.walk.mask[0]
+        kernels.put_frames(block, 0, words, counts, self._dark_cycle, state, spare, mask)
         kernels.skip_frames(2, 3, words, counts, state)
-        kernels.window_clicks(words, counts, 0, 1, spare)
+        kernels.settle(self.walk, 0, 0, 0)
+        kernels.close_passage(self.walk, 0)
         self.decider.decide(np.zeros(len(spare), np.int64), self.shots)
-        self._walk(Messages(np.zeros(8, np.uint8), np.zeros((0, 2), np.int64)), 0)
         if self.guard is not None:
             self.guard.warm_up()
-
-    # -- what the follower asks for ------------------------------------------------------------------------------------
 
     def _fits(self, block: ClickBlock | FrameBlock) -> bool:
         if not isinstance(block, FrameBlock):
@@ -189,80 +362,67 @@ class FlowCore(Follower):
 
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
         assert isinstance(block, FrameBlock)  # _fits has seen to it
+        ring, first = self._ring, block.exposure_index
         kernels.put_frames(
-            block.words, block.exposure_index, self._words, self._counts, self._dark_cycle, self._state, self.dark_channels,
-            self._channel_mask,
-        )  # fmt: skip
+            block.words,
+            first,
+            ring.words,
+            ring.counts,
+            self._dark_cycle,
+            ring.state,
+            self.dark_channels,
+            self.walk.mask[0],
+        )
         events = [] if self.guard is None or not self._dark_cycle else self.guard.take(block)
-        came = self._came(block.exposure_index + n_exposures, end_tick, 0)
-        return joined(Output([], events, None), came) if events else came
-
-    def _came(self, stop: int, end_tick: int, found: int) -> Output:
-        """Decide on what exposures up to `stop` - 1, now in the ring, settle; `found` passages stand in `_passages` already."""
-        output = self._settle(stop, end_tick, found)
+        stop = first + n_exposures
+        output = self._settle(stop, end_tick - (stop - 1) * self._period_ticks, 0)
         if self.guard is not None and self.watches_empty:
-            news = self.watch_empty(self.guard, self.empty_frames, self.empty_channels)
-            output = joined(output, Output([], news, None)) if news else output
+            events = self._watch_empty(self.guard, self.empty_frames, self.empty_channels)
         self.matcher.settle(stop)
+        return (
+            joined(output, Output([], events, None)) if self.watches_empty else joined(Output([], events, None), output)
+        )
+
+    def _settle(self, stop: int, origin_tick: int, flags: int) -> Output:
+        """Decide on what exposures before `stop` settle; exposure e ended at `origin_tick` + e periods. With `flags` none is decided."""
+        output, done = Output([], [], None), False
+        while not done:
+            self.load()
+            self.walk.state[kernels.WATCH_AT] = 1 << 62
+            done = bool(kernels.settle(self.walk, stop, origin_tick, flags))
+            self.store()
+            output = joined(output, self._decided(slice(0, int(self.walk.state[columns.N_ROWS]))))
         return output
-
-    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
-        """See Follower: ordinary messages are taken in one call of a kernel, up to the first block of which something comes."""
-        by_block = self.guard is not None and self._dark_cycle  # it wants to see every block
-        taken = 0 if by_block or not self.tracker.open else self._walk(messages, place)
-        if not taken:
-            return super().step_messages(messages, place)
-        facts = self._facts.tolist()
-        n_marks, n_messages = facts[columns.MARKS], facts[stream.MESSAGES]
-        position = facts[stream.NEXT_SEQ], facts[stream.NEXT_EXPOSURE]
-        self.tracker.advance(position, n_messages, facts[stream.EXPOSURES])
-        if n_marks:
-            for mark, photons in zip(self._new.rows[:n_marks].tolist(), self._new.photons[:n_marks].tolist()):
-                self.remember(Mark._make([*mark[: walking.M_HALF], photons, mark[walking.M_HALF]]))
-        if n_messages == n_marks:
-            return taken, Output([], [], None)
-        self.last_tick, self.jitter_ticks = facts[columns.END_TICK], facts[columns.JITTER_TICKS]
-        came = self._came(position[1], self.last_tick, facts[columns.PASSAGES])
-        return taken, Output(came.decisions, came.events, self.last_tick, came.passages, came.actions)
-
-    def _walk(self, messages: Messages, place: int) -> int:
-        """Bring the kernel's facts up to date and let it take messages; return how many it took."""
-        facts = self._facts
-        watch_at = 1 << 62 if self.guard is None else self.watched_frames + WATCHED_FRAMES
-        facts[: stream.MESSAGES] = (*self.tracker.position, min(self.end_exposure, 1 << 62))
-        facts[columns.START_TICK], facts[columns.WATCH_AT] = self.start_tick, watch_at
-        facts[columns.JITTER_TICKS] = self.jitter_ticks
-        shape = self._slot_offsets, self.arrays, self._channel_mask
-        taken = walking.walk(messages, place, facts, *shape, self._new, self.tracker.heard)
-        return int(taken)
-
-    def watch_empty(self, guard: DarkGuard, empty_frames: int, empty_channels: I64) -> list[Finding]:
-        """Without dark slots, the frames in which no object was found, so many with these clicks, tell the dark rates."""
-        frames = empty_frames - self.watched_frames
-        if frames < WATCHED_FRAMES:
-            return guard.news()
-        clicks = empty_channels - self._watched_channels
-        self.watched_frames, self._watched_channels = empty_frames, empty_channels.copy()
-        return guard.take_empty(frames, np.minimum(clicks, frames))
 
     def _skip_to(self, exposure_index: int, tick: int) -> Output:
-        following = int(self._state[kernels.NEXT])
+        ring, output = self._ring, Output([], [], None)
+        following = int(ring.state[kernels.NEXT])
         if exposure_index <= following:
-            return Output([], [], None)
+            return output
         self.matcher.add_gap(following, exposure_index)
-        output = self._lose(exposure_index, tick)
-        kernels.skip_frames(following, exposure_index, self._words, self._counts, self._state)
+        if self._is_tape:
+            output = self._settle(exposure_index, tick - exposure_index * self._period_ticks, _GAP)
+        kernels.skip_frames(following, exposure_index, ring.words, ring.counts, ring.state)
         return output
 
+    def _close(self) -> Output:
+        """Give up what the end of the stream leaves open."""
+        self.load()
+        kernels.close_passage(self.walk, min(self.last_tick, _LARGEST))
+        self.store()
+        return self._decided(slice(0, int(self.walk.state[columns.N_ROWS])))
+
     def _give_up(self) -> Output:
-        output = self._close()
+        output, state = self._close(), self._ring.state
         self._cycles_before += -(-self.tracker.next_exposure // self._slots_per_cycle)
         if self.guard is not None:
             self.guard.restart()
         self.matcher.finish()
-        dark, empty = self._state[kernels.DARK_FRAMES], self._state[kernels.EMPTY_FRAMES]
-        self._state[:] = 0
-        self._state[kernels.DARK_FRAMES], self._state[kernels.EMPTY_FRAMES] = dark, empty
+        dark, empty = state[kernels.DARK_FRAMES], state[kernels.EMPTY_FRAMES]
+        state[:] = 0
+        state[kernels.DARK_FRAMES], state[kernels.EMPTY_FRAMES] = dark, empty
+        if self._is_tape:
+            self._begin_tape()
         return output
 
     def _finish(self, status: Status) -> Output:
@@ -274,117 +434,97 @@ class FlowCore(Follower):
         return self.tracker.next_exposure >= self.end_exposure
 
     def remember(self, mark: Mark) -> None:
+        """See Follower."""
         super().remember(mark)
         self.matcher.add_mark(mark)
 
+    # -- parts of a recording ------------------------------------------------------------------------------------------
+
     def _place(self) -> dict[str, Any] | None:
-        if self._state[kernels.STATE] == kernels.OPEN:
+        ring, state = self._ring, self.walk.state
+        if ring.state[kernels.STATE] == kernels.OPEN:
             return None
         if self.guard is not None and self.guard.policy != "warn":
             return None  # what it has learnt decides too
-        frames = np.arange(int(self._state[kernels.NEXT]) - self._kept_frames(), int(self._state[kernels.NEXT]))
-        slots = frames & (len(self._words) - 1)
-        return {
+        kept, tracks = 2 * self.limits.longest, self._is_tape and self.settings.track > 0
+        if self._is_tape:
+            kept = max(self.frames, int(state[kernels.PITCH]) >> Q) + (2 * self.frames + 2 if tracks else 0)
+        slots = np.arange(int(ring.state[kernels.NEXT]) - kept, int(ring.state[kernels.NEXT])) & (len(ring.words) - 1)
+        found: dict[str, Any] = {
             "passages": self.n_passages,
             "cycles_before": self._cycles_before,
-            "state": self._state.tolist(),
-            "words": self._words[slots].astype("<u8").tobytes().hex(),
-            "counts": self._counts[slots].tolist(),
+            "state": ring.state.tolist(),
+            "words": ring.words[slots].astype("<u8").tobytes().hex(),
+            "counts": ring.counts[slots].tolist(),
         }
+        if self._is_tape:
+            found["position"] = int(state[kernels.POSITION])
+        if tracks:
+            found |= {"middle": self._middle(kernels.MIDDLE), "pitch": int(state[kernels.PITCH])}
+            found["before"] = [int(state[kernels.BEFORE]), self._middle(kernels.BEFORE_MIDDLE)]
+        return found
 
     def _go_on_from(self, place: dict[str, Any]) -> None:
-        self.n_passages, self._cycles_before = int(place["passages"]), int(place["cycles_before"])
-        self._state[:] = place["state"]
-        stop = int(self._state[kernels.NEXT])
-        slots = np.arange(stop - len(place["counts"]), stop) & (len(self._words) - 1)
-        self._words[slots] = np.frombuffer(bytes.fromhex(place["words"]), "<u8")
-        self._counts[slots] = place["counts"]
+        ring, state = self._ring, self.walk.state
+        state[kernels.OBJECTS], self._cycles_before = int(place["passages"]), int(place["cycles_before"])
+        ring.state[:] = place["state"]
+        stop = int(ring.state[kernels.NEXT])
+        slots = np.arange(stop - len(place["counts"]), stop) & (len(ring.words) - 1)
+        ring.words[slots] = np.frombuffer(bytes.fromhex(place["words"]), "<u8")
+        ring.counts[slots] = place["counts"]
+        if self._is_tape:
+            state[kernels.POSITION] = int(place["position"])
+            self._put_middle(kernels.MIDDLE, self._origin + int(place["position"]) * self._nominal_pitch)
+        if self._is_tape and self.settings.track:
+            self._put_middle(kernels.MIDDLE, int(place["middle"]))
+            state[kernels.PITCH], state[kernels.BEFORE] = int(place["pitch"]), int(place["before"][0])
+            self._put_middle(kernels.BEFORE_MIDDLE, int(place["before"][1]))
         self.matcher.forget_marks(stop - self.frames // 2)  # they were decided in the part before
 
-    # -- what cells and tape do each in their way ----------------------------------------------------------------------
+    # -- a tape --------------------------------------------------------------------------------------------------------
 
-    def _settle(self, stop: int, end_tick: int, found: int) -> Output:
-        """Decide on what is settled by exposures up to `stop` - 1, the last of which ended at `end_tick`.
+    def _prepare_tape(self, plan: Plan) -> None:
+        """Work out when bars are aligned, in 2^-Q exposures; UsageError where a decision does not fit into a bar."""
+        settings, period_us = self.settings, plan.slot_period_ticks * plan.tick_us
+        pitch = self._nominal_pitch = round((1 << Q) * 1e6 / settings.bars_per_s / period_us)
+        first_us = settings.first_bar * 1e6 / settings.bars_per_s - plan.exposure_us / 2
+        self._origin = round((1 << Q) * first_us / period_us)
+        if pitch < self.frames << Q:
+            raise UsageError(
+                f"a bar passes in {pitch / (1 << Q):.3g} frames, a decision takes {self.frames}",
+                remedy="fewer shots, shorter exposures or a slower tape",
+            )
+        if settings.track and pitch < (self.frames + 2) << Q:
+            raise UsageError(
+                f"a bar passes in {pitch / (1 << Q):.3g} frames: following the tape needs two beside those of the decision",
+                remedy="shorter exposures, or track = 0",
+            )
+        self._begin_tape()
 
-        `found` rows of `_passages` are there already.
-        """
-        raise NotImplementedError
+    def _begin_tape(self) -> None:
+        """Look for position 0, or the first one whose window does not begin before the stream."""
+        pitch, state = self._nominal_pitch, self.walk.state
+        position = max(0, -self._origin // pitch)
+        while self.window_of(self._origin + position * pitch) < 0:
+            position += 1
+        state[kernels.PITCH] = state[kernels.NOMINAL_PITCH] = pitch
+        state[kernels.TRACK], state[kernels.POSITION] = self.settings.track, position
+        self._put_middle(kernels.MIDDLE, self._origin + position * pitch)
+        state[kernels.BEFORE] = -1
+        self._put_middle(kernels.BEFORE_MIDDLE, 0)
 
-    def _kept_frames(self) -> int:
-        """How many of the last frames a decision to come may need, while no object is being followed."""
-        raise NotImplementedError
+    def window_of(self, middle: int) -> int:
+        """Return the first exposure of the window that is centred at `middle`, in 2^-Q exposures."""
+        return (middle - ((self.frames - 1) << (Q - 1)) + (1 << (Q - 1))) >> Q
 
-    def _lose(self, stop: int, tick: int) -> Output:
-        """Give up what needs an exposure before `stop` that never came."""
-        return Output([], [], None)
+    def _middle(self, column: int) -> int:
+        """Return the time at `column` of the state and the one behind it, in 2^-Q exposures."""
+        return (int(self.walk.state[column]) << Q) + int(self.walk.state[column + 1])
 
-    def _close(self) -> Output:
-        """Give up what the end of the stream leaves open."""
-        return Output([], [], None)
+    def _put_middle(self, column: int, middle: int) -> None:
+        self.walk.state[column], self.walk.state[column + 1] = middle >> Q, middle & _PART
 
-    # -- one decision --------------------------------------------------------------------------------------------------
 
-    def _row(self, passage: Passage, first: int, end_tick: int, why: DecisionFlag, out: Rows) -> None:
-        """Decide on the window from exposure `first` on, which ended at `end_tick`; `why` it must not be decided."""
-        label, probability, clicks, crc, flags = NO_LABEL, 0.0, 0, 0, int(why)
-        if not flags & _GAP:
-            unlit = self._sum_clicks(first)
-            if unlit:
-                flags |= _GAP
-            else:
-                clicks, crc = int(self._clicks.sum()), zlib.crc32(self._clicks.tobytes())
-                if self.guard is not None:
-                    self.guard.take_object(self._clicks.sum(axis=0), NO_OBJECT)
-        alarmed = 0 if self.guard is None else int(self.guard.flags)
-        if alarmed & _ABSTAINED:
-            flags |= alarmed
-        if not flags:
-            label, probability = self._verdict()
-            if not probability > 0:
-                flags |= _NOT_FINITE
-            elif probability < self.settings.sure:
-                flags |= _AMBIGUOUS
-        if flags:
-            label, flags = NO_LABEL, flags | _ABSTAINED
-            self.n_abstained += 1
-        flags |= alarmed  # decided, but with another table
-        last = first + self.frames - 1
-        decision = Decision(
-            self.n_decisions, end_tick, max(0, last), self.n_passages, 0, clicks, label, UNKNOWN_TRUTH, flags, probability, crc
-        )  # fmt: skip
-        self.n_decisions += 1
-        self.n_passages = (self.n_passages + 1) & 0xFFFFFFFF
-        self.put_row(decision, passage, out)
-
-    def pulse(self, number: int, leave_tick: int) -> Action:
-        """Return the pulse that decision `number` asks for, whose object left at `leave_tick`."""
-        tick = leave_tick + self.limits.gate_delay_ticks
-        return Action(number, tick, self.limits.gate_ticks, self.settings.gate_channel)
-
-    def put_row(self, decision: Decision, passage: Passage, out: Rows) -> None:
-        """Say a decision, ask for its pulse, and compare it with the truth."""
-        out.decisions.append(decision)
-        out.passages.append(passage)
-        gated = decision.label in self.gated
-        if gated:
-            out.actions.append(self.pulse(decision.number, passage.leave_tick))
-        self.matcher.add_decision(decision, passage, gated)
-
-    def _sum_clicks(self, first: int) -> int:
-        """Fill the clicks of the windows from `first` on; return how many of their frames had no light or never came."""
-        unlit = 0
-        for window in range(self.settings.pool):
-            start = first + window * self.shots
-            unlit += kernels.window_clicks(self._words, self._counts, start, self.shots, self._clicks[window])
-        return unlit
-
-    def _verdict(self) -> Verdict:
-        decider = self.decider
-        if self.guard is not None:
-            decider = self.guard.decider(decider)
-            for counts in self._clicks:
-                self.guard.count_word(counts)
-        if self.settings.pool == 1:
-            return decider.decide(self._clicks[0], self.shots)
-        scores = decider.scores_batch(self._clicks, self.shots)
-        return softmax_winner(log_evidence(scores).sum(axis=0))
+def _undecided(tables: DecisionTables) -> DecisionTables:
+    """Return tables that decide nothing."""
+    return tables._replace(labels=tables.labels[:0].copy(), probabilities=tables.probabilities[:0].copy())

@@ -1,41 +1,97 @@
-"""The compiled kernels of a flow: frames into a ring, onsets and releases, two maxima, the clicks of a window.
+"""The kernels of a flow: frames into a ring, onsets and releases, the windows that are decided on, rows of the decision log out.
 
-Owns the loops over frames; keeps no state of its own and allocates nothing. Each kernel has a twin in plain loops in
-tests/naive_flow.py. The ring holds the last frames by exposure number modulo its length, a power of two: `words` uint64 (ring,) (bit c
-is channel c) and `counts` int16 (ring,) clicks, -1 for a dark frame and -2 for one that never came.
+`take_message` is the kernel's case for a flow (turn/kinds.py); `settle` does the same for frames that `FlowCore` has put into the ring by
+itself, behind a gap, say. Whatever is not ordinary, `take_message` leaves untouched. A table decides here; of any other back end the
+clicks of the window are kept, and the row waits for its verdict. Nothing is allocated.
+
+The ring holds the last frames by exposure number modulo its length, a power of two: `words` uint64 (ring,) (bit c is channel c) and
+`counts` int16 (ring,) clicks, -1 for a dark frame and -2 for one that never came. tests/oracles/naive_flow.py has the loops in plain words.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
+import numpy as np
+import numpy.typing as npt
 
+from pans.runtime.core import stream_kernels as core
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag
+from pans.runtime.core.stream_arrays import DecisionTables
+from pans.runtime.core.window_kernels import sum_up
+from pans.runtime.wire import walk as stream
+from pans.runtime.wire.bare import bare, load4
 from pans.runtime.wire.inner import inner, outer
+from pans.runtime.wire.schema import NO_OBJECT, UNKNOWN_TRUTH
 
-# state, int64 (N_STATE,)
-(
-    NEXT,
-    SUM,
-    SEEN,
-    STATE,
-    FIRST,
-    CLICKS,
-    MOMENT,
-    FLAGS,
-    HOLD,
-    WHOLE_SINCE,
-    EMPTY_FRAMES,
-    DARK_FRAMES,
-    BUSY,
-    N_STATE,
-) = range(14)
+from .settings import WATCHED_FRAMES, Q
+
+# ring state, int64 (N_STATE,)
+NEXT, SUM, SEEN, STATE, FIRST, CLICKS, MOMENT, FLAGS, HOLD, WHOLE_SINCE, EMPTY_FRAMES, DARK_FRAMES, BUSY = range(13)
+N_STATE = 13
 IDLE, OPEN, BLIND = 0, 1, 2
 # a passage, int64 (N_COLUMNS,): its frames, where it is centred (times 256), clicks, BROKEN or TOO_LONG, the exposure that settled it
 P_FIRST, P_LAST, P_CENTRE, P_CLICKS, P_FLAGS, P_RELEASE, N_COLUMNS = range(7)
 BROKEN, TOO_LONG = 1, 2
 N_EDGES = 5  # figures of count_edges
 DARK, NEVER_CAME = -1, -2
-# limits, int64: the first eight of flow_settings.FlowLimits, then the frames of a cycle that ends with a dark one (0: none does)
+# limits, int64: the first eight of settings.FlowLimits, then the frames of a cycle that ends with a dark one (0: none does)
 W, ON, OFF, LONGEST, REFRACTORY, BACKGROUND, VALLEY_FRAMES, VALLEY_SIGMA2, DARK_CYCLE, N_LIMITS = range(10)
+
+# stream state, int64 (N_FACTS,): the columns of a core's state, and of a flow alone the most frames of a block, the frames of a cycle that
+# ends with a dark one (0: none does), from how many empty frames on they are told, the frames of a decision, objects so far, how often the
+# empty field was told, whether a pulse is asked for; ...
+MAX_BLOCK, DARK_EVERY, WATCH_AT, FRAMES, OBJECTS, TOLD, ASKS = range(core.N_STATE, core.N_STATE + 7)
+# ... of a tape the middle of the next window in whole exposures and 2^-Q of one, the pitch and what it is by the settings, and how fast it
+# is followed; the window before (-1: not known) and its middle; the position
+MIDDLE, MIDDLE_PART, PITCH, NOMINAL_PITCH, TRACK, BEFORE, BEFORE_MIDDLE, BEFORE_PART, POSITION, N_FACTS = range(
+    ASKS + 1, ASKS + 11
+)
+W_FIRST, W_LAST, W_CENTRE, W_LEAVE, W_CLICKS, N_PASSAGE = range(6)  # of core.decision.Passage
+_GAP, _ABSTAINED, _NOT_FINITE, _AMBIGUOUS, _COINCIDENCE, _INCOMPLETE = (
+    int(DecisionFlag[name]) for name in ("GAP", "ABSTAINED", "NOT_FINITE", "AMBIGUOUS", "COINCIDENCE", "INCOMPLETE")
+)
+_U = np.uint64
+_NO_LABEL, _UNKNOWN, _OBJECTS, _NO_OBJECT = NO_LABEL, UNKNOWN_TRUTH, 0xFFFFFFFF, np.uint64(NO_OBJECT)
+_HALF, _PART, _WATCHED = 1 << (Q - 1), (1 << Q) - 1, WATCHED_FRAMES
+
+
+class FlowArrays(NamedTuple):
+    """The ring and what follows it; `limits` is empty where no passages are looked for. `out` are the passages."""
+
+    words: npt.NDArray[np.uint64]
+    counts: npt.NDArray[np.int16]
+    limits: npt.NDArray[np.int64]
+    state: npt.NDArray[np.int64]
+    dark_channels: npt.NDArray[np.int64]
+    empty_channels: npt.NDArray[np.int64]
+    out: npt.NDArray[np.int64]
+
+
+class FlowWalk(NamedTuple):
+    """What the kernel continues of a flow: the stream's place and the settings, int64 (N_FACTS,), the ring, and what comes of each object.
+
+    `offsets` int64 (slots of a cycle,) in ticks; `mask` uint64 (1,) of the channels; `sure` float64 (1,): below it a posterior is
+    ambiguous; `gated` uint8 (classes,): of which a pulse is asked. Decisions stand in `rows`, DECISION_DTYPE (m,), in the same place
+    their passages int64 (m, 5), in the order of `core.decision.Passage`, and the clicks of their windows int64 (m, pool, d_f). What the
+    empty field gave stands in `empty` int64 (k, 2 + d_f), by its number modulo k: the exposure behind the block, empty frames, clicks of
+    each channel, since the run began. `heard` is StreamTracker's.
+    """
+
+    state: npt.NDArray[np.int64]
+    flow: FlowArrays
+    offsets: npt.NDArray[np.int64]
+    mask: npt.NDArray[np.uint64]
+    tables: DecisionTables
+    sure: npt.NDArray[np.float64]
+    gated: npt.NDArray[np.uint8]
+    rows: npt.NDArray[np.void]
+    passages: npt.NDArray[np.int64]
+    counts: npt.NDArray[np.int64]
+    empty: npt.NDArray[np.int64]
+    edges: npt.NDArray[np.int64]
+    heard: npt.NDArray[np.int64]
 
 
 @inner
@@ -230,3 +286,277 @@ def total_clicks(counts, first, stop):  # type: ignore[no-untyped-def]
         clicks = counts[exposure & mask]
         total += clicks if clicks > 0 else 0
     return total
+
+
+# -- messages --------------------------------------------------------------------------------------------------------------
+
+
+@inner
+def _mark_fits(buffer, payload, stop, facts):  # type: ignore[no-untyped-def]
+    """Whether the MARK from `payload` to `stop` is whole, the next message, and says what can be."""
+    return stream.is_next_mark(buffer, payload, stop, facts) and stream.mark_fits(
+        buffer, payload, facts, facts[core.N_CLASSES]
+    )
+
+
+@inner
+def _take_frames(buffer, payload, stop, facts, slot_offsets, flow, mask):  # type: ignore[no-untyped-def]
+    """Put the frames from `payload` to `stop` into the ring and return how many; 0, and nothing done, where they are not ordinary."""
+    first = facts[stream.NEXT_EXPOSURE]
+    count, width = stream.next_block(buffer, payload, stop, facts)
+    if count == 0 or count > facts[MAX_BLOCK] or 8 * width < flow.dark_channels.size:
+        return 0
+    if flow.state[NEXT] != first:  # the block before was left out: it did not fit the plan
+        return 0
+    tick, period = stream.block_times(buffer, payload)
+    if period != facts[core.PERIOD_TICKS] or load4(buffer, payload + _U(32)) != _NO_OBJECT:
+        return 0
+    cycle = first // slot_offsets.size
+    planned = facts[core.START_TICK] + cycle * facts[core.CYCLE_TICKS] + slot_offsets[first - cycle * slot_offsets.size]
+    if tick < planned - period:
+        return 0
+    frames_at = np.int64(payload) + stream.BLOCK_HEADER
+    frames = buffer[frames_at : frames_at + count * width].reshape(count, width)
+    put_frames(frames, first, flow.words, flow.counts, facts[DARK_EVERY], flow.state, flow.dark_channels, mask)
+    stream.go_on(facts, count)
+    _note_end(tick, count, facts, slot_offsets)
+    return count
+
+
+@inner
+def _note_end(tick, count, facts, slot_offsets):  # type: ignore[no-untyped-def]
+    """Note when the block's last exposure ended, and by how much that is not the plan's time."""
+    last = facts[stream.NEXT_EXPOSURE] - 1
+    facts[core.LAST_TICK] = tick + (count - 1) * facts[core.PERIOD_TICKS] + facts[core.EXPOSURE_TICKS]
+    cycle = last // slot_offsets.size
+    planned = facts[core.START_TICK] + cycle * facts[core.CYCLE_TICKS] + slot_offsets[last - cycle * slot_offsets.size]
+    facts[core.JITTER] = max(facts[core.JITTER], abs(facts[core.LAST_TICK] - planned - facts[core.EXPOSURE_TICKS]))
+
+
+@inner
+def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
+    """As core/stream_kernels.py's, of a flow: the message from `start` to `stop`, uint64; TOOK_MARK, TOOK_BLOCK or ODD.
+
+    TOOK_URGENT is a block of which a pulse is asked for.
+
+    A mark is only counted: who compares decisions with the truth looks for it in what was kept.
+    """
+    state, flow = walk.state, walk.flow
+    if stop < start + _U(stream.BODY_HEADER) or load4(buffer, start + _U(4)) != _U(state[core.SESSION]):
+        return core.ODD
+    if not stream.is_plain(buffer, start):
+        return core.ODD
+    payload = start + _U(stream.BODY_HEADER)
+    if buffer[start] == stream.MARK:
+        if not _mark_fits(buffer, payload, stop, state):
+            return core.ODD
+        stream.go_on(state, np.int64(0))
+        return core.TOOK_MARK
+    if buffer[start] != stream.FRAMES:
+        return core.ODD
+    count = _take_frames(buffer, payload, stop, state, walk.offsets, flow, walk.mask[0])
+    if count == 0:
+        return core.ODD
+    behind = state[stream.NEXT_EXPOSURE]
+    _settle(walk, behind, state[core.LAST_TICK] - (behind - 1) * state[core.PERIOD_TICKS], 0)
+    asks, state[ASKS] = state[ASKS], 0
+    return core.TOOK_URGENT if asks else core.TOOK_BLOCK
+
+
+@outer
+def settle(walk, behind, origin, flags):  # type: ignore[no-untyped-def]
+    """Decide on what exposures before `behind`, in the ring, settle; exposure e ended at tick `origin` + e periods.
+
+    With `flags` above 0 all of it is given up for that reason. False when the rows were full first: call again.
+    """
+    return _settle(bare(walk), behind, origin, flags)
+
+
+@inner
+def _settle(walk, behind, origin, flags):  # type: ignore[no-untyped-def]
+    flow = walk.flow
+    if not flow.limits.size:
+        if not _take_bars(walk, behind, origin, flags):
+            return False
+        if not flags:
+            flow.state[NEXT] = behind
+        return True
+    while flow.state[NEXT] < behind:
+        if walk.state[core.N_ROWS] + flow.out.shape[0] > walk.rows.size:
+            return False
+        n = scan(behind, flow.words, flow.counts, flow.limits, flow.state, flow.empty_channels, flow.out)
+        for i in range(n):
+            _take_passage(walk, flow.out[i], origin)
+    if flow.state[EMPTY_FRAMES] >= walk.state[WATCH_AT]:
+        _tell_empty(walk, behind)
+    return True
+
+
+@outer
+def close_passage(walk, last_tick):  # type: ignore[no-untyped-def]
+    """Give up the passage that is open at the end of a stream, whose last exposure ended at `last_tick`."""
+    walk = bare(walk)
+    flow, state, frames = walk.flow.state, walk.state, walk.state[FRAMES]
+    if walk.flow.limits.size == 0 or flow[STATE] != OPEN:
+        return
+    first, last = flow[FIRST], flow[NEXT] - 1
+    passage = walk.passages[state[core.N_ROWS]]
+    passage[W_FIRST], passage[W_LAST], passage[W_CENTRE] = first, last, (first + last) // 2
+    passage[W_LEAVE], passage[W_CLICKS] = last_tick, flow[CLICKS]
+    _put_row(walk, max(0, last + 1 - frames), last_tick, _INCOMPLETE)
+    flow[STATE] = IDLE
+
+
+@inner
+def _tell_empty(walk, behind):  # type: ignore[no-untyped-def]
+    """Keep what the empty field gave up to here."""
+    state, flow = walk.state, walk.flow
+    row = walk.empty[state[TOLD] % walk.empty.shape[0]]
+    row[0], row[1] = behind, flow.state[EMPTY_FRAMES]
+    for channel in range(flow.empty_channels.size):
+        row[2 + channel] = flow.empty_channels[channel]
+    state[TOLD] += 1
+    state[WATCH_AT] = flow.state[EMPTY_FRAMES] + _WATCHED
+
+
+# -- cells -----------------------------------------------------------------------------------------------------------------
+
+
+@inner
+def _take_passage(walk, found, origin):  # type: ignore[no-untyped-def]
+    """Decide on a passage, of a cell; exposure e ended at `origin` + e periods."""
+    flow, state = walk.flow, walk.state
+    limits, frames = flow.limits, state[FRAMES]
+    first, last, centre = found[P_FIRST], found[P_LAST], found[P_CENTRE]
+    flags = 0
+    if found[P_FLAGS] & BROKEN:
+        flags = _GAP
+    elif (
+        found[P_FLAGS] & TOO_LONG
+        or last - first >= limits[LONGEST]
+        or has_two_maxima(flow.counts, first, last, limits[VALLEY_FRAMES], limits[VALLEY_SIGMA2])
+    ):
+        flags = _COINCIDENCE
+    start = (centre - 128 * (frames - 1) + 128) >> 8
+    if state[DARK_EVERY]:
+        dark = start + state[DARK_EVERY] - 1 - start % state[DARK_EVERY]
+        if dark < start + frames:
+            back, ahead = start + frames - dark, dark + 1 - start
+            start += -back if back < ahead else ahead
+    start = max(0, min(start, flow.state[NEXT] - frames))
+    passage = walk.passages[state[core.N_ROWS]]
+    passage[W_FIRST], passage[W_LAST], passage[W_CENTRE] = first, last, (centre + 128) >> 8
+    passage[W_LEAVE] = origin + last * state[core.PERIOD_TICKS]
+    passage[W_CLICKS] = found[P_CLICKS]
+    _put_row(walk, start, origin + (start + frames - 1) * state[core.PERIOD_TICKS], flags)
+
+
+# -- a tape ----------------------------------------------------------------------------------------------------------------
+
+
+@inner
+def _take_bars(walk, behind, origin, flags):  # type: ignore[no-untyped-def]
+    """Decide on every position whose window ends before exposure `behind`; with `flags` none is decided. False when the rows are full."""
+    state, flow, period = walk.state, walk.flow, walk.state[core.PERIOD_TICKS]
+    frames = state[FRAMES]
+    while True:
+        start = state[MIDDLE] + ((state[MIDDLE_PART] - (frames - 1) * _HALF + _HALF) >> Q)
+        last = start + frames - 1
+        if last >= behind:
+            return True
+        if state[core.N_ROWS] == walk.rows.size:
+            return False
+        pitch = state[PITCH]
+        end, since = origin + last * period, max(0, last + 1 - (pitch >> Q))
+        passage = walk.passages[state[core.N_ROWS]]
+        passage[W_FIRST], passage[W_LAST] = since, last
+        passage[W_CENTRE] = state[MIDDLE] + ((state[MIDDLE_PART] + _HALF) >> Q)
+        part = pitch & _PART  # of an exposure; times the period it may be longer than a number
+        ticks = (pitch >> Q) * period + (((part >> 16) * period + ((part & 0xFFFF) * period >> 16)) >> (Q - 16))
+        passage[W_LEAVE] = end + (ticks >> 1)
+        passage[W_CLICKS] = 0 if flags else total_clicks(flow.counts, since, last + 1)
+        state[POSITION] += 1
+        if state[TRACK]:
+            _follow(walk, start, flags != 0)
+        _move_on(state, state[PITCH])
+        _put_row(walk, start, end, flags)
+
+
+@inner
+def _move_on(state, by):  # type: ignore[no-untyped-def]
+    """Move the middle of the next window by so many 2^-Q exposures."""
+    part = state[MIDDLE_PART] + by
+    state[MIDDLE] += part >> Q
+    state[MIDDLE_PART] = part & _PART
+
+
+@inner
+def _follow(walk, start, lost):  # type: ignore[no-untyped-def]
+    """Correct phase and pitch by the bars that changed between the window before and the one at `start`, if they are known.
+
+    A phase-locked loop of second order, directed by decisions: a channel whose bar changes tells when, by how many of the exposures in
+    between were lit. Bars that come on are seen too early, since little light is enough for a click, and bars that go off too late by as
+    much; the mean of both is the edge. Each edge moves the next window by 2^-track of what it is off and the pitch by 2^-(2 track + 2):
+    critical damping. Exposures count from the window before, so that no number is too long.
+    """
+    state, flow, edges, frames = walk.state, walk.flow, walk.edges, walk.state[FRAMES]
+    before, middle_before, part_before = (
+        state[BEFORE],
+        state[BEFORE_MIDDLE],
+        state[BEFORE_PART],
+    )
+    state[BEFORE], state[BEFORE_MIDDLE] = np.int64(-1) if lost else start, state[MIDDLE]
+    state[BEFORE_PART] = state[MIDDLE_PART]
+    if lost or before < 0:
+        return
+    count_edges(flow.words, flow.counts, before, start, frames, edges)
+    up, down = edges[0], edges[1]
+    if up == 0 or down == 0 or edges[4]:
+        return
+    between = (frames - 1 + start - before) << (Q - 1)
+    found = between + ((edges[3] * up - edges[2] * down) << Q) // (2 * up * down)
+    first = ((middle_before - before) << Q) + part_before
+    then = ((state[MIDDLE] - before) << Q) + state[MIDDLE_PART]
+    limit, nominal = state[PITCH] >> 2, state[NOMINAL_PITCH]
+    off = min(max(found - ((first + then) >> 1), -limit), limit)
+    _move_on(state, off >> state[TRACK])
+    pitch = state[PITCH] + (off >> (2 * state[TRACK] + 2))
+    state[PITCH] = min(max(pitch, nominal - (nominal >> 3)), nominal + (nominal >> 3))
+
+
+# -- one decision ----------------------------------------------------------------------------------------------------------
+
+
+@inner
+def _put_row(walk, first, end, flags):  # type: ignore[no-untyped-def]
+    """Decide on the windows from exposure `first` on, which ended at tick `end`; `flags` why they must not be decided."""
+    state, flow, tables, n_row = walk.state, walk.flow, walk.tables, walk.state[core.N_ROWS]
+    counts, clicks, crc, unlit = walk.counts[n_row], np.int64(0), np.uint32(0), 0
+    label, probability, index = np.int64(_NO_LABEL), np.float32(0.0), np.int64(0)
+    if not flags & _GAP:
+        shots = state[FRAMES] // counts.shape[0]
+        for window in range(counts.shape[0]):
+            unlit += window_clicks(flow.words, flow.counts, first + window * shots, shots, counts[window])
+        if unlit:
+            flags |= _GAP
+        elif counts.shape[0] == 1:
+            clicks, index, crc = sum_up(counts[0], tables.radix, tables.crc, tables.crc_zero[0])
+    if flags == 0 and tables.labels.size:
+        label, probability = np.int64(tables.labels[index]), tables.probabilities[index]
+        if not probability > 0:
+            flags |= _NOT_FINITE
+        elif np.float64(probability) < walk.sure[0] or label == _NO_LABEL:
+            flags |= _AMBIGUOUS
+    if flags:
+        label, flags = np.int64(_NO_LABEL), flags | _ABSTAINED
+        state[core.N_ABSTAINED] += 1
+    elif tables.labels.size == 0 or walk.gated[label]:
+        state[ASKS] = 1
+    row = walk.rows[n_row]
+    row["index"], row["tick"], row["exposure_index"] = state[core.N_DECISIONS], end, max(0, first + state[FRAMES] - 1)
+    row["object"], row["shot"], row["clicks"], row["label"] = state[OBJECTS], 0, clicks, label
+    row["truth"], row["flags"], row["probability"] = _UNKNOWN, flags, probability
+    row["counts_crc"], row["exposures"] = crc, 0
+    state[core.N_DECISIONS] += 1
+    state[OBJECTS] = (state[OBJECTS] + 1) & _OBJECTS
+    state[core.N_ROWS] += 1

@@ -16,12 +16,10 @@ from pans.runtime.errors import UsageError
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.profile import Profile
 
-from .cells import CellCore
 from .core import FlowCore
 from .matching import PassageFigures
 from .plan import build_flow_plan
 from .settings import FlowSettings, flow_limits, flow_of_header
-from .tape import TapeCore
 
 
 def make_flow_core(
@@ -45,9 +43,8 @@ def make_flow_core(
         raise UsageError(
             f"{shots} shots times {settings.pool} windows, allowed: 1 to {plan.block_exposures * 4} frames"
         )
-    kind = CellCore if settings.kind == "cells" else TapeCore
     gated = frozenset(classes.index(name) for name in settings.gate_classes)
-    core = kind(plan, decider, settings, flow_limits(settings, plan, dark_probability), gated, shots, n_cycles)
+    core = FlowCore(plan, decider, settings, flow_limits(settings, plan, dark_probability), gated, shots, n_cycles)
     core.dark_probability = dark_probability
     return core
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
@@ -17,16 +17,12 @@ from pans.runtime.errors import DeviceError, LinkError, PansError
 from pans.runtime.timing.clock import ClockModel, ClockStep
 from pans.runtime.timing.evidence import Evidence, Stamped
 from pans.runtime.wire.fields import wrong_facts
-from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome, pack_body
 from pans.runtime.wire.session import ANSWER_TYPES, HostSession
 
 from .base import Link
 from .fit import upload_commands
 from .reader import Chunk, LinkReader
-
-if TYPE_CHECKING:
-    from pans.runtime.wire.bulk import BulkDecoder
 
 NS_PER_S = 1_000_000_000
 # for ARM and GRANT to arrive, one retransmission, and a host that does not run for some 50 ms
@@ -37,10 +33,10 @@ PROBE_GIVE_UP_NS = NS_PER_S // 4  # of one probe of the burst: a lost one is not
 
 
 class Arrived(NamedTuple):
-    """A frame for the core, or many stream messages of one read (valid until the next `pump`), and when their bytes were read."""
+    """A frame for the core, and when its bytes were read."""
 
     arrival_ns: int
-    what: Frame | Messages
+    what: Frame
 
 
 class Connection:
@@ -92,21 +88,18 @@ class Connection:
                 self.evidence.arrived(chunk.arrival_ns)
         return chunks
 
-    def rest(self) -> list[Arrived]:
-        """Stop reading and return what has arrived and was never taken: what a host finds that stood still while its device was lost."""
-        return self._take(self.reader.rest())
+    def rest(self) -> None:
+        """Stop reading and digest what has arrived and was never taken: a host finds it that stood still while its device was lost."""
+        self._take(self.reader.rest())
 
     def _take(self, chunks: list[Chunk]) -> list[Arrived]:
         """Digest chunks and return what of them is the core's, in order."""
-        stream: list[Arrived] = []
-        bulk = self.decoder.bulk
-        for place, chunk in enumerate(chunks):
-            if bulk is None:
-                for frame in self.decoder.feed(chunk.data):
-                    self.sort(frame, chunk.arrival_ns, stream)
-            else:
-                self._digest(bulk, chunk, stream, last=place + 1 == len(chunks))
-        return stream
+        return [
+            Arrived(chunk.arrival_ns, frame)
+            for chunk in chunks
+            for frame in self.decoder.feed(chunk.data)
+            if self.sort(frame, chunk.arrival_ns)
+        ]
 
     def raise_failure(self) -> None:
         """Raise what ended the session, once all that came with it has been delivered."""
@@ -128,36 +121,17 @@ class Connection:
                 reached_ns, left_ns = (self.clock.to_host_ns(tick)[0] for tick in (pong.rx_tick, pong.tx_tick))
                 self.evidence.stamped(Stamped(pong.host_ns, reached_ns, left_ns, arrival_ns))
 
-    def _digest(self, bulk: BulkDecoder, chunk: Chunk, stream: list[Arrived], *, last: bool) -> None:
-        """Decode a chunk and sort its messages: runs of stream messages stay together; unless they are the `last`, as a copy."""
-        session, arrival_ns = self.session, chunk.arrival_ns
-        parts = bulk.pieces(chunk.data)
-        for number, part in enumerate(parts):
-            spans = bulk.take(part)
-            place, stays = 0, last and number + 1 == len(parts)
-            while place < len(spans):
-                stop = bulk.stream_stop(spans, place, session.nonce)
-                if stop > place:
-                    session.heard_ns = arrival_ns
-                    messages = Messages(bulk.buffer, spans[place:stop])
-                    stream.append(Arrived(arrival_ns, messages if stays else messages.kept()))
-                    self.delivered += stop - place
-                if stop < len(spans):
-                    self.sort(bulk.frame(*spans[stop].tolist()), arrival_ns, stream)
-                place = stop + 1
-
-    def sort(self, frame: Frame, arrival_ns: int, stream: list[Arrived]) -> None:
-        """Give a frame to the session, and to the core what is the core's; an answer is on record before it can end the session.
+    def sort(self, frame: Frame, arrival_ns: int) -> bool:
+        """Give a frame to the session and return whether it is the core's too; an answer is on record before it can end the session.
 
         What ends the session waits until the frames that came with it are delivered.
         """
         if self.on_answer is not None and frame.type in ANSWER_TYPES:
             self.on_answer(arrival_ns, pack_body(frame))
-        if self.digest(frame, arrival_ns):
-            stream.append(Arrived(arrival_ns, frame))
-            self.delivered += 1
-        else:
-            self.answers += 1
+        is_cores = self.digest(frame, arrival_ns)
+        self.delivered += is_cores
+        self.answers += not is_cores
+        return is_cores
 
     def digest(self, frame: Frame, arrival_ns: int) -> bool:
         """Give a frame to the session and return whether it is the core's too; what ends the session waits for `raise_failure`."""

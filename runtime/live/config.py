@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -17,26 +17,10 @@ if TYPE_CHECKING:
     from pans.runtime.core.follower import Place
     from pans.runtime.instrument.channel_health import DarkReport
     from pans.runtime.timing.ledger import TimingLedger
-    from pans.runtime.wire.frame import Messages
     from pans.runtime.wire.messages import Frame, Mark
     from pans.runtime.wire.tracker import StreamTracker
 
     from .tally import RunTally
-
-
-AUTO, COMPILED, PYTHON = "auto", "compiled", "python"
-TURNS = (AUTO, COMPILED, PYTHON)
-
-
-class TurnChoice(NamedTuple):
-    """Which turn a run took, COMPILED or PYTHON, and why, "" where nothing was in the way of the compiled one."""
-
-    taken: str = PYTHON
-    why: str = ""
-
-    def words(self) -> str:
-        """Return it as it stands in a summary."""
-        return f"{self.taken}: {self.why}" if self.why else self.taken
 
 
 @dataclass(slots=True)
@@ -66,7 +50,6 @@ class RunResult:
     late_slots: int = 0  # that stayed dark because the host named no state in time
     turn_us: dict[str, float] = field(default_factory=dict)  # of the host's turns, where it drives
     states_shown: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # exposures of each state
-    turn: TurnChoice = field(default_factory=TurnChoice)
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
     page_faults: dict[str, int] = field(default_factory=dict)  # of the loop's thread while armed; its switches too
@@ -98,7 +81,9 @@ class LiveCore(Protocol):
 
     def step(self, frame: Frame) -> Output: ...
 
-    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]: ...
+    def steps(self, session: int) -> Any: ...
+
+    def remember(self, mark: Mark) -> None: ...
 
     def end(self) -> Output: ...
 
@@ -107,3 +92,17 @@ class LiveCore(Protocol):
     def cycles_left(self, n_cycles: int) -> int: ...
 
     def part(self) -> Place | None: ...
+
+
+class Receives(Protocol):
+    """What a live run needs of its receiver (receiver.Receiver)."""
+
+    def prepare(self) -> None: ...
+
+    def receive(self, poll_s: float) -> list[Output]: ...
+
+    def last(self, poll_s: float) -> None: ...
+
+    def rest(self) -> None: ...
+
+    def next_id(self) -> int: ...

@@ -6,16 +6,16 @@ from the recording's header (`recorded_guard`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard, recorded_guard
-from pans.runtime.core.decision import Decision, DecisionFlag, NumberedDecisions, Output, RowDecisions
+from pans.runtime.core.decision import DECISION_DTYPE, Decision, DecisionFlag, Output, RowDecisions
 from pans.runtime.core.plan import Plan
 from pans.runtime.detector import afterpulses_of
 from pans.runtime.errors import UsageError
@@ -176,11 +176,7 @@ class DarkRun:
         ]
 
 
-def _measured_clicks(decisions: object) -> NDArray[np.integer]:
+def _measured_clicks(decisions: Sequence[Decision]) -> NDArray[np.integer]:
     """Return the clicks of the decisions that were measured as planned."""
-    if isinstance(decisions, NumberedDecisions):  # all measured
-        return np.asarray(decisions.verdicts["clicks"][decisions.numbers])
-    if isinstance(decisions, RowDecisions):
-        return np.asarray(decisions.rows["clicks"][decisions.rows["flags"] & np.uint32(NOT_MEASURED) == 0])
-    several = cast(Iterable[Decision], decisions)
-    return np.array([one.clicks for one in several if not one.flags & NOT_MEASURED], np.int64)
+    rows = decisions.rows if isinstance(decisions, RowDecisions) else np.array(decisions, DECISION_DTYPE)
+    return np.asarray(rows["clicks"][rows["flags"] & np.uint32(NOT_MEASURED) == 0])

@@ -101,7 +101,7 @@ class HostDriver:
         """Exposure and state that were named last."""
         return self._sent
 
-    def went_on(self, sent: tuple[int, int], turns_ns: npt.NDArray[np.int64]) -> None:
+    def account(self, sent: tuple[int, int], turns_ns: npt.NDArray[np.int64]) -> None:
         """Take over what a compiled turn has named, and how long each turn took from the arrival of its block, int64 (n,)."""
         self._sent = sent
         self.turns.add_many(turns_ns)

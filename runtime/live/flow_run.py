@@ -1,7 +1,6 @@
 """A run with passing objects: core and gates joined, what compiled turns brought of it, and what came of it all.
 
-Owns the actuator while the run lasts, what is settled of a flow behind a compiled turn (compiled.py owns the rest of it), and
-the flow's part of the summary; the order of a run is loop.py's.
+`FlowReceiver` settles what a call of the kernel brought of a flow; `FlowRun` holds the actuator and makes the flow's part of the summary.
 """
 
 from __future__ import annotations
@@ -14,17 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.decision import Output
-from pans.runtime.errors import LinkError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.matching import PassageFigures
-from pans.runtime.flow.steps import FlowSteps
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn.engine import Turn
 from pans.runtime.wire.messages import Mark, MessageType, decode_frames, decode_mark
 from pans.runtime.wire.schema import HEADER
 
-from .compiled import CompiledTurns
 from .gates import Actuator
+from .receiver import Receiver
 from .second_device import SecondInstrument
 
 if TYPE_CHECKING:
@@ -79,7 +76,7 @@ class FlowRun:
             "kind": settings.kind,
             "frames_per_decision": core.frames,
             "pool": settings.pool,
-            "bars_per_s": getattr(core, "bars_per_s", None),  # of a tape: as said, or as last found
+            "bars_per_s": core.bars_per_s,  # of a tape: as said, or as last found
             "onset_clicks": limits.onset_clicks,
             "release_clicks": limits.release_clicks,
             "onset_frames": limits.onset_frames,
@@ -92,70 +89,60 @@ class FlowRun:
         return FlowFigures(flow, core.matcher.figures(core.frames), gates, second)
 
 
-# -- behind compiled turns -------------------------------------------------------------------------------------------------
+# -- behind the kernel -------------------------------------------------------------------------------------------------
 
 
-class FlowTurns(CompiledTurns):
-    """What is settled of a flow: block by block where something came, in the order in which Python's turn would have seen it.
+class FlowReceiver(Receiver):
+    """The receiver of a flow: the core sees block by block where something came, in the order of the stream.
 
     A pulse is sent here, once its decision is on record: a block that asks for one ends the kernel's call.
     """
 
-    def __init__(self, run: LiveRun, core: FlowCore, *, prompt: bool) -> None:
-        super().__init__(run, core, prompt=prompt)
-        self._lent: FlowSteps | None = None
-
-    def _steps(self, nonce: int) -> FlowSteps:
-        if self._lent is None:
-            assert isinstance(self._core, FlowCore)
-            self._lent = FlowSteps(self._core, self._run.plan)
-        self._lent.begin(nonce)
-        return self._lent
-
-    def _warm_up(self, turn: Turn) -> None:
-        _blocks_behind(turn)
-
-    def _gathered(self, poll_s: float) -> Sequence[tuple[int, bytes]]:
-        return self._run.connection.chunks(poll_s)
+    _outputs: Sequence[Output] = ()
 
     def _settle_marks(self, turn: Turn) -> None:
         if not turn.counts.steps:
-            for mark in turn.marks():
-                self._core.remember(mark)
+            super()._settle_marks(turn)
 
     def _record(self, turn: Turn) -> None:
         """Record decisions, too, and send the pulses that they ask for: before all else, since their time runs."""
         super()._record(turn)
         run, steps = self._run, turn.steps
-        assert isinstance(steps, FlowSteps)
+        if turn.counts.steps and not steps.decides:
+            self._outputs = list(settled_blocks(turn))  # the back end decides
+            turn.blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
+        assert isinstance(steps, FlowCore)
         if turn.counts.steps and run.recorder is not None:
             run.recorder.add_decisions(turn.rows)
-        if turn.counts.steps and (pulses := steps.pulses(turn.place)):
+        if turn.counts.steps and (pulses := steps.pulses(len(turn.rows))):
             run.gates.take(pulses)
             run.pulse()
 
     def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
-        run, blocks = self._run, turn.blocks
-        if run.connection.link.virtual:
-            blocks[:, ring.DECODED : ring.RECORDED + 1] = blocks[:, ring.ARRIVAL, None]  # no time passes in between
-        for block, output in settled_blocks(turn):
-            if output is not None:
-                arrival_ns, decoded_ns, decided_ns = blocks[block, : ring.DECIDED + 1].tolist()
-                run.book(output, (arrival_ns, decoded_ns, decided_ns), outputs, kept=True)
-        try:
-            run.take([])
-        except LinkError as error:  # met while pulses were sent
-            self._error = self._error or error
+        run, blocks, rows, steps = self._run, turn.blocks, turn.rows, turn.steps
+        assert isinstance(steps, FlowCore)
+        for output in settled_blocks(turn) if steps.decides else self._outputs:
+            for event in output.events:
+                run.journal.take(event)
+            outputs.append(output)
+        self._ends_of(turn)
+        run.block_came(int(blocks[-1, ring.ARRIVAL]))
+        if len(rows):
+            run.tally.add_rows(rows, np.full(len(rows), np.nan, np.float32))  # a passage's number is no mark's
+            block_of = np.repeat(np.arange(len(blocks)), np.diff(blocks[:, ring.ROWS], prepend=0))
+            ends_ns, unsure_ns = run.connection.known_clock().to_host_ns_many(steps.leave_ticks(len(rows)))
+            stamps = blocks[block_of, : ring.RECORDED + 1]
+            run.account_times(int(rows["index"][0]), np.ones(len(rows), np.int64), ends_ns, unsure_ns, stamps)
 
 
-def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output | None]]:
-    """Let the core of a flow see what a call brought; yield, with its number, each block of which something came."""
+def settled_blocks(turn: Turn) -> Iterator[Output]:
+    """Let the core of a flow see what a call brought; yield what came of each block of which something came."""
     steps, blocks = turn.steps, turn.blocks
-    assert isinstance(steps, FlowSteps)
-    core = steps.core
+    assert isinstance(steps, FlowCore)
+    core = steps
     by_block = core.guard is not None and not core.watches_empty  # it wants to see every block
     behind, row = _blocks_behind(turn), 0
-    empty = {told[0]: told for told in steps.told()}
+    empty = {told[0]: told for told in core.told_empty()}
     marks = _marks_of(turn)
     decided = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
     some = decided | np.isin(behind, list(empty)) | by_block
@@ -164,17 +151,15 @@ def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output | None]]:
     for block, (end_tick, stop, place) in enumerate(columns):
         while marks and marks[-1][0] < place:
             core.remember(marks.pop()[1])
-        if not decided[block] and not by_block:
-            if some[block]:
-                events = steps.watch(empty[int(behind[block])])
-                yield block, Output([], events, end_tick) if events else None
-            core.matcher.settle(int(behind[block]))
-            continue
-        frames = decode_frames(_payload(turn, place - 1)) if by_block else None
         following = int(behind[block])
-        rows = slice(row, stop)
-        yield block, steps.settle(rows, following, end_tick, empty.get(following), frames)
-        row = stop
+        if decided[block] or by_block:
+            frames = decode_frames(_payload(turn, place - 1)) if by_block else None
+            yield core.account(slice(row, stop), following, end_tick, empty.get(following), frames)
+            row = stop
+            continue
+        if some[block] and (events := core.watch(empty[following])):
+            yield Output([], events, end_tick)
+        core.matcher.settle(following)
     while marks:
         core.remember(marks.pop()[1])
 

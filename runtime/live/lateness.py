@@ -6,16 +6,10 @@ Evidence and judgement are timing/evidence.py's; late decisions are counted by t
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
-
-from pans.runtime.core.decision import RowDecisions
 from pans.runtime.core.plan import Plan
 from pans.runtime.link.base import Link
 from pans.runtime.link.connection import Connection
 from pans.runtime.record import Recorder
-from pans.runtime.record.format import TIMING_RUN_DTYPE
-from pans.runtime.timing.clock import ClockModel
 from pans.runtime.timing.evidence import (
     DISK,
     INFERENCE,
@@ -27,13 +21,8 @@ from pans.runtime.timing.evidence import (
     Stamped,
     longest_pause_ns,
 )
-from pans.runtime.timing.ledger import TimingLedger
-from pans.runtime.turn import rings as ring
-from pans.runtime.turn import settling as kernels
 from pans.runtime.wire.messages import Status
 from pans.runtime.wire.tracker import Gap
-
-I64 = npt.NDArray[np.int64]
 
 POLL_S = 0.02
 LEAST_SLACK_NS = 500_000
@@ -90,9 +79,9 @@ class Lateness:
         left_ns, _ = connection.known_clock().to_host_ns(status.tick)
         self.evidence.stamped(Stamped(None, None, left_ns, arrival_ns))
 
-    def late(self, number: int, marks_ns: tuple[int, int, int, int, int], uncertainty_ns: int) -> None:
-        """Take a late decision with its times, as `TimingLedger.judge` did."""
-        self.incidents.late(LateWork(number, marks_ns[0], marks_ns[1], marks_ns[3], uncertainty_ns))
+    def late(self, number: int, begin_ns: int, arrival_ns: int, decided_ns: int, uncertainty_ns: int) -> None:
+        """Take a late decision with its times, as the ledger judged them."""
+        self.incidents.late(LateWork(number, begin_ns, arrival_ns, decided_ns, uncertainty_ns))
 
     def lost(self, gap: Gap, connection: Connection, now_ns: int) -> Attribution:
         """Return the verdict on exposures that never came."""
@@ -116,26 +105,3 @@ class Lateness:
 
     def _wrote(self, begin_ns: int, end_ns: int) -> None:
         self.evidence.worked(DISK, begin_ns, end_ns)
-
-
-class Judged:
-    """What the ledger says of the decisions of each call; all memory is allocated here, before arming."""
-
-    def __init__(self, timing: TimingLedger) -> None:
-        self._timing = timing
-        self._runs: npt.NDArray[np.void] = np.full(ring.MANY, 0, TIMING_RUN_DTYPE)
-        self._marked: I64 = np.full((ring.MANY, kernels.N_MARKED), 0, np.int64)
-        self._sums: I64 = np.full(kernels.N_JUDGED, 0, np.int64)
-        self._histograms = tuple(histogram.numbers for histogram in timing.histograms)
-
-    def take(self, blocks: I64, decided: RowDecisions, clock: ClockModel) -> tuple[npt.NDArray[np.void], I64]:
-        """Judge the decisions of `blocks` (rings.py's steps); return their times, TIMING_RUN_DTYPE (n,), and what stands out."""
-        timing, sums = self._timing, self._sums
-        sums[:] = 0
-        outputs = (self._histograms, sums, self._runs, self._marked)
-        n_runs, n_marked = kernels.judge_blocks(blocks, decided.first, *clock.numbers, timing.deadline_ns, *outputs)
-        if len(decided):
-            found = sums.tolist()
-            longest, blame = found[: kernels.UNCERTAINTY], found[kernels.BLAME :]
-            timing.went_on(len(decided), longest, found[kernels.UNCERTAINTY], found[kernels.LATE], blame)
-        return self._runs[:n_runs], self._marked[:n_marked]

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -25,30 +24,27 @@ from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
-from pans.runtime.errors import DeviceError, LinkError, RecordingError, UsageError
+from pans.runtime.errors import DeviceError, LinkError, RecordingError
 from pans.runtime.instrument.channel_health import DarkMonitor
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.link.base import Link, descriptor_of, link_facts
+from pans.runtime.link.base import Link, link_facts
 from pans.runtime.link.connection import Connection
 from pans.runtime.link.fit import check_device, check_scene
 from pans.runtime.record import Recorder
 from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime
 from pans.runtime.timing.page_faults import ThreadCounts
-from pans.runtime.turn.eligible import excluded
 from pans.runtime.wire.session import ArmTooLate
 
-from .compiled import CompiledTurns
-from .config import COMPILED, PYTHON, RunResult, TurnChoice
+from .config import RunResult
 from .continuous import INTERRUPTED, REFUSED, Stop
+from .receiver import Receiver, StillReceiver, why_fed
 from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
 from .run_options import RunOptions
 
 NS_PER_S = 1_000_000_000
-VIRTUAL = "virtual time: what was read at once is taken at once"
-NO_DESCRIPTOR = "Python reads the link, which has no descriptor"
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,15 +121,19 @@ def running(
 
 
 def _warm_up(run: LiveRun, *, prompt: bool) -> None:
-    """Choose the turn and load what it needs; with `prompt` a watcher acts."""
-    core, link = run.core, run.connection.link
-    core.warm_up()
-    run.turn_choice = choose_turn(run.config.turn, core, link, drives=run.driver is not None)
-    if run.turn_choice.taken == COMPILED:
-        run.compiled = _compiled_turns(run, core, prompt=prompt)
-        run.compiled.prepare()  # before the heap is touched: loading kernels takes memory
-    elif isinstance(core, Core):
-        core.warm_up_steps()
+    """Load what receives; with `prompt` a watcher acts."""
+    run.core.warm_up()
+    run.receiver = receiver_of(run, run.core, prompt=prompt)
+    run.receiver.prepare()  # before the heap is touched: loading kernels takes memory
+
+
+def receiver_of(run: LiveRun, core: LiveCore, *, prompt: bool) -> Receiver:
+    """Return the receiver for `core`."""
+    if isinstance(core, Core):
+        return StillReceiver(run, core, prompt=prompt)
+    from .flow_run import FlowReceiver
+
+    return FlowReceiver(run, core, prompt=prompt)
 
 
 @contextmanager
@@ -144,7 +144,7 @@ def _granted(run: LiveRun) -> Iterator[None]:
         busy_core(None if link.virtual else run.config.core) as awake,
         arm_realtime(run.config.realtime and not link.virtual, [] if reader is None else [reader]) as granted,
     ):
-        run.realtime = granted | awake | {"turn": run.turn_choice.words()}
+        run.realtime = granted | awake | {"turn": "; ".join(filter(None, ("compiled", why_fed(link))))}
         yield
 
 
@@ -167,31 +167,6 @@ def _light_on(
     finally:  # whatever went wrong: light off first
         run.page_faults = counts.since()
         run.stop()
-
-
-def _compiled_turns(run: LiveRun, core: LiveCore, *, prompt: bool) -> CompiledTurns:
-    """Return the compiled turns of `core`; with `prompt` a watcher acts."""
-    if isinstance(core, Core):
-        core.leave_steps()
-        return CompiledTurns(run, core, prompt=prompt)
-    from pans.runtime.flow.core import FlowCore
-
-    from .flow_run import FlowTurns
-
-    assert isinstance(core, FlowCore)  # nothing else is eligible
-    return FlowTurns(run, core, prompt=prompt)
-
-
-def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoice:
-    """Return which turn a run takes, and why; UsageError where "compiled" was asked for and cannot be."""
-    why = "asked for" if wanted == PYTHON else excluded(core, link, drives=drives)
-    if wanted == COMPILED and why:
-        raise UsageError(f"--turn compiled: {why}", remedy="--turn auto takes Python's turn here")
-    if why:
-        return TurnChoice(PYTHON, why)
-    if link.virtual:
-        return TurnChoice(COMPILED, VIRTUAL)
-    return TurnChoice(COMPILED, "" if descriptor_of(link) is not None else NO_DESCRIPTOR)
 
 
 def open_session(
@@ -279,7 +254,6 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         late_cause=dict(run.lateness.incidents.causes),
         lost_cause=dict(run.lateness.incidents.missing),
         events=run.journal.events,
-        turn=run.turn_choice,
         late_slots=int(tallies[LATE_SLOTS]),
         turn_us={} if run.driver is None else run.driver.turns.summary(),
         states_shown=run.core.windows.walks.shown if isinstance(run.core, Core) else np.zeros(0, np.int64),

@@ -12,24 +12,28 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from pans.runtime.core.decision import Output
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.core.decision import DECISION_DTYPE, Output
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.errors import DeviceError, LinkError
-from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
+from pans.runtime.link.connection import ARM_LEAD_NS, Connection
 from pans.runtime.record import Recorder
+from pans.runtime.record.format import TIMING_RUN_DTYPE
 from pans.runtime.record.recorder import repeated_setup
 from pans.runtime.timing.clock_check import future_tick
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.fields import LARGEST_TICK
-from pans.runtime.wire.frame import Messages
+from pans.runtime.wire.frame import Frame
 from pans.runtime.wire.messages import DeviceState, MessageType, Opcode, StateReason, decode_status, pack_body
 from pans.runtime.wire.schema import MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
 from .config import LiveCore as LiveCore
-from .config import TurnChoice
+from .config import Receives
 from .drive import HostDriver, WalkPlace
 from .gates import GateQueue
 from .journal import Journal, Reconciled
@@ -48,11 +52,14 @@ UNHEARD_NS = 2_500 * NS_PER_MS  # without any frame: STATUS alone comes every se
 SILENCE_NS = 5 * NS_PER_S  # without clicks
 
 Watcher = Callable[["LiveRun", Output], None]
+I64 = npt.NDArray[np.int64]
+Rows = npt.NDArray[np.void]
 
 
 class LiveRun(Reconciled):
     """One run in progress: what `run_live` calls in turn, and what a live view may look at."""
 
+    receiver: Receives  # set before the run is armed
     driver: HostDriver | None = None  # of an automaton that the host follows
 
     def __init__(
@@ -92,8 +99,6 @@ class LiveRun(Reconciled):
         self._watch: Watcher | None = None  # of the turn under way
         self._idle = True  # nothing has come in it
         self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
-        self.turn_choice = TurnChoice()
-        self.compiled: Any = None  # where they are taken in the place of Python's
         self._setup: list[bytes] = []  # what each part of the recording must repeat
         self._started_ns = started_ns
         self._fruitless = self._decided = 0
@@ -127,8 +132,7 @@ class LiveRun(Reconciled):
         """Start the exposures a little in the future, at an absolute device tick."""
         n_cycles = self.core.cycles_left(self.config.n_cycles) if self.config.n_cycles else 0
         self.journal.session(self.connection)
-        if self.compiled is not None:
-            self.compiled.prepare()
+        self.receiver.prepare()
         self.taken_here, self.armed = self.connection.delivered, self.connection
         now_ns, start_tick = self._start()
         self.settle(self.core.begin(start_tick, n_cycles))
@@ -182,7 +186,7 @@ class LiveRun(Reconciled):
             session.submit(Opcode.STOP)
             self.stops = True
             while self.now_ns() < give_up_ns and not (session.settled and self._is_dark()):
-                self.take(self.connection.pump(POLL_S) if self.compiled is None else self.compiled.last(POLL_S))
+                self.receiver.last(POLL_S)
         except LinkError as error:
             self.lose_link(error)
         except KeyboardInterrupt:  # a second Ctrl-C: STOP is sent, and the lease does the rest
@@ -198,8 +202,8 @@ class LiveRun(Reconciled):
 
     def take_rest(self) -> None:
         """Decide on and record what has arrived on a connection that is given up: lost is only what never came."""
-        with suppress(LinkError):  # nothing can be sent any more
-            self.take(self.connection.rest())
+        self.receiver.rest()
+        self._broken = None  # nothing can be sent any more
 
     def _is_dark(self) -> bool:
         status = self.connection.session.status
@@ -236,14 +240,14 @@ class LiveRun(Reconciled):
         looked_ns = self.now_ns()
         poll_s = self.lateness.poll_s(looked_ns)
         self._watch, self._idle = watch, True
-        outputs = self.take(self.connection.pump(poll_s)) if self.compiled is None else self.compiled.turn(poll_s)
+        outputs = self.receiver.receive(poll_s)
         idle = self._idle and not outputs
         now_ns = self.now_ns()
         self._act(now_ns)
         if (verdict := self.lateness.settled(self.connection, now_ns, idle=idle)) is not None:
             self.journal.take(verdict)
         self.journal.refusals(self.connection)
-        self.tell(outputs)
+        self.report(outputs)
         if now_ns >= self._probe_due_ns:
             self.connection.session.probe(now_ns)
             self._probe_due_ns = now_ns + PROBE_EVERY_NS
@@ -256,8 +260,8 @@ class LiveRun(Reconciled):
         self._turn_page(now_ns)
         self.ended = self._why_ended(now_ns, looked_ns, idle=idle)
 
-    def tell(self, outputs: list[Output]) -> None:
-        """Show outputs to the watcher of this turn, and forget them."""
+    def report(self, outputs: list[Output]) -> None:
+        """Give outputs to the watcher of this iteration, and forget them."""
         self._idle = self._idle and not outputs
         if self._watch is not None:
             for output in outputs:
@@ -295,44 +299,23 @@ class LiveRun(Reconciled):
             self.connection.session.poll(now_ns)
             self.connection.flush()
 
-    def take(self, arrived: list[Arrived]) -> list[Output]:
-        """Decide on what came for the core and account for what came of it; the core takes nothing from a connection that was not armed."""
-        outputs: list[Output] = []
-        for arrival_ns, what in arrived if self.connection is self.armed else ():
-            if isinstance(what, Messages):
-                self._take_messages(arrival_ns, what, outputs)
-                continue
-            decoded_ns = self.now_ns()
-            output = self.core.step(what)
-            self._drive(arrival_ns)
-            self.taken_here += 1
-            self.lateness.stepped(decoded_ns, self.now_ns())
-            if self.recorder is not None:
-                self.recorder.add_message(arrival_ns, pack_body(what))
-            self.book(output, (arrival_ns, decoded_ns, self.now_ns()), outputs)
-            if what.type == MessageType.STATUS:
-                with suppress(MalformedMessage):  # counted where it was taken
-                    status = decode_status(what.payload)  # the session may know a later one, where the host was held up
-                    self.check_tick(status.tick, arrival_ns)
-                    self.lateness.status_came(self.connection, status, arrival_ns)
-        if self._broken is not None:
-            broken, self._broken = self._broken, None
-            raise broken
-        return outputs
-
-    def _take_messages(self, arrival_ns: int, messages: Messages, outputs: list[Output]) -> None:
-        """Give the core many stream messages at once: it stops at each of which something came, which must not wait for the rest."""
-        place, n = 0, len(messages.spans)
-        while place < n:
-            decoded_ns = self.now_ns()
-            taken, output = self.core.step_messages(messages, place)
-            self._drive(arrival_ns)
-            self.taken_here += taken
-            self.lateness.stepped(decoded_ns, self.now_ns())
-            if self.recorder is not None:
-                self.recorder.add_messages(arrival_ns, messages, place, taken)
-            self.book(output, (arrival_ns, decoded_ns, self.now_ns()), outputs)
-            place += taken
+    def take_frame(self, arrival_ns: int, frame: Frame, outputs: list[Output]) -> None:
+        """Let the core take one message, and account for what comes of it; it takes nothing of a connection that was not armed."""
+        if self.connection is not self.armed:
+            return
+        decoded_ns = self.now_ns()
+        output = self.core.step(frame)
+        self._drive(arrival_ns)
+        self.taken_here += 1
+        self.lateness.stepped(decoded_ns, self.now_ns())
+        if self.recorder is not None:
+            self.recorder.add_message(arrival_ns, pack_body(frame))
+        self.book(output, (arrival_ns, decoded_ns, self.now_ns()), outputs)
+        if frame.type == MessageType.STATUS:
+            with suppress(MalformedMessage):  # counted where it was taken
+                status = decode_status(frame.payload)  # the session may know a later one, where the host was held up
+                self.check_tick(status.tick, arrival_ns)
+                self.lateness.status_came(self.connection, status, arrival_ns)
 
     def _drive(self, arrival_ns: int) -> None:
         """Where the host drives: name the next state before anything else is done with what has come."""
@@ -342,13 +325,23 @@ class LiveRun(Reconciled):
             except LinkError as error:
                 self._broken = error
 
-    def book(self, output: Output, times_ns: tuple[int, int, int], outputs: list[Output], kept: bool = False) -> None:
-        """Account for what a step brought, and when that came, was decoded and decided; `kept`: recorded, and pulses sent."""
-        self._account(output, times_ns, kept)
+    def note_broken(self, error: LinkError) -> None:
+        """Keep why nothing more can be sent until all that has arrived is decided."""
+        self._broken = self._broken or error
+
+    def raise_broken(self) -> None:
+        """Raise why nothing more can be sent, once."""
+        broken, self._broken = self._broken, None
+        if broken is not None:
+            raise broken
+
+    def book(self, output: Output, times_ns: tuple[int, int, int], outputs: list[Output]) -> None:
+        """Account for what a message brought, and when that came, was decoded and decided."""
+        self._account(output, times_ns)
         if output.block_end_tick is not None:
             self.check_tick(output.block_end_tick, times_ns[0])
             self.block_came(times_ns[0])
-        if output.actions and not kept:
+        if output.actions:
             self.pulse()
         outputs.append(output)
 
@@ -366,11 +359,6 @@ class LiveRun(Reconciled):
         self.outage_ns = None
         self.lateness.block_came(arrival_ns)
 
-    def note_late(self, number: int, marks_ns: tuple[int, int, int, int, int], uncertainty_ns: int) -> None:
-        """Note a late decision with its times, as the ledger judged them."""
-        self.journal.note("late", decision=number, latency_us=(marks_ns[3] - marks_ns[0]) / 1000)
-        self.lateness.late(number, marks_ns, uncertainty_ns)
-
     def check_tick(self, tick: int, arrival_ns: int) -> None:
         """Note a tick that lies in the future."""
         wrong = future_tick(self.connection.known_clock(), tick, arrival_ns)
@@ -383,7 +371,7 @@ class LiveRun(Reconciled):
         now_ns = self.now_ns()
         self._account(output, (now_ns, now_ns, now_ns))
 
-    def _account(self, output: Output, times_ns: tuple[int, int, int], kept: bool = False) -> None:
+    def _account(self, output: Output, times_ns: tuple[int, int, int]) -> None:
         """Judge, tally and record one step's output; windows given up at the end of the plan have no exposure to be late for."""
         for event in output.events:
             self.journal.take(event)
@@ -391,28 +379,42 @@ class LiveRun(Reconciled):
                 self.journal.take(self.lateness.lost(event, self.connection, self.now_ns()))
         if not output.decisions:
             return
-        if not kept:
-            self.gates.take(output.actions)
-        end_ns = uncertainty_ns = 0
-        clock = self.connection.known_clock()
-        if output.block_end_tick is not None and not output.passages:
-            end_ns, uncertainty_ns = clock.to_host_ns(output.block_end_tick)
-        for place, decision in enumerate(output.decisions):
-            if output.passages and output.block_end_tick is not None:  # a time of its own, and its number is no mark's
-                end_ns, uncertainty_ns = clock.to_host_ns(output.passages[place].leave_tick)
-            if end_ns - uncertainty_ns > times_ns[0]:
-                end_ns = times_ns[0]  # what has arrived has happened: a tick in the future hides no lateness
-            mark = None if output.passages else self.core.marks.get(decision.object)
-            self.tally.add(decision, float("nan") if mark is None else mark.photons)
-            if self.recorder is not None and not kept:
-                self.recorder.add_decision(decision)
-            if output.block_end_tick is None:
-                continue
-            marks_ns = (end_ns, *times_ns, self.now_ns())
-            if self.timing.judge(marks_ns, uncertainty_ns):
-                self.note_late(decision.number, marks_ns, uncertainty_ns)
-            if self.recorder is not None:
-                self.recorder.add_timing((decision.number, end_ns, times_ns[0], times_ns[2], marks_ns[4]))
+        self.gates.take(output.actions)
+        rows = np.array(output.decisions, DECISION_DTYPE)
+        marks = [None if output.passages else self.core.marks.get(number) for number in rows["object"].tolist()]
+        self.tally.add_rows(rows, np.array([np.nan if mark is None else mark.photons for mark in marks], np.float32))
+        if self.recorder is not None:
+            self.recorder.add_decisions(rows)
+        if output.block_end_tick is None:
+            return
+        counts, end_ticks = np.array([len(rows)]), [output.block_end_tick]
+        if output.passages:  # each has a time of its own
+            counts, end_ticks = np.ones(len(rows), np.int64), [passage.leave_tick for passage in output.passages]
+        ends = np.minimum(np.array(end_ticks, np.uint64), 1 << 62).astype(np.int64)
+        stamps = np.tile(np.array([*times_ns, self.now_ns()]), (len(ends), 1))
+        self.account_times(int(rows["index"][0]), counts, *self.connection.known_clock().to_host_ns_many(ends), stamps)
+
+    def account_times(self, first: int, counts: I64, ends_ns: I64, unsure_ns: I64, stamps_ns: I64) -> None:
+        """Judge and record the times of decisions from number `first` on, of which `counts` each share theirs.
+
+        ends_ns and unsure_ns (n,): when the last exposure ended, and how uncertain that is; stamps_ns (n, 4): arrival, decoded, decided,
+        recorded.
+        """
+        ends_ns = np.where(
+            ends_ns - unsure_ns > stamps_ns[:, 0], stamps_ns[:, 0], ends_ns
+        )  # what has arrived has happened
+        marks_ns = np.column_stack((ends_ns, stamps_ns))
+        late, numbers = self.timing.judge(marks_ns, unsure_ns, counts), first + np.cumsum(counts) - counts
+        if self.recorder is not None:
+            runs = np.zeros(len(counts), TIMING_RUN_DTYPE)
+            runs["index"], runs["count"], runs["device_end_ns"] = numbers, counts, ends_ns
+            runs["arrival_ns"], runs["decided_ns"], runs["recorded_ns"] = marks_ns[:, 1], marks_ns[:, 3], marks_ns[:, 4]
+            self.recorder.add_timing_runs(runs)
+        for at in np.flatnonzero(late).tolist():
+            for number in range(int(numbers[at]), int(numbers[at] + counts[at])):
+                self.journal.note("late", decision=number, latency_us=float(marks_ns[at, 3] - marks_ns[at, 0]) / 1000)
+                begin_ns, arrival_ns, _, decided_ns, _ = marks_ns[at].tolist()
+                self.lateness.late(number, begin_ns, arrival_ns, decided_ns, int(unsure_ns[at]))
 
     def _turn_page(self, now_ns: int) -> None:
         """Go on in the recording's next part when this one is full and no window is open."""

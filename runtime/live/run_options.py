@@ -16,8 +16,6 @@ from pans.runtime.instrument.calibration import MAX_AGE_H
 from pans.runtime.ranges import Range
 from pans.runtime.run_folder import RUNS
 
-from .config import AUTO, TURNS
-
 AUTOMATA = "automata (docs/how-to/automata.md)"
 LIVE_PAGE = "live page (docs/how-to/live-view.md)"
 FLOW = "objects in flow (docs/how-to/flow.md)"
@@ -56,11 +54,6 @@ class RunOptions:
     dark_slots: int = option(1, "dark displays per cycle (default 1)", range=Range(0, 65534, whole=True))
     backend: str = option("auto", "decision back end", choices=backend_names)
     realtime: bool = option(True, "do not ask for SCHED_FIFO and locked memory", flag="--no-realtime")
-    turn: str = option(
-        AUTO,
-        "the loop's turn: one compiled call, or Python's, which decides the same (default: compiled where it can be)",
-        choices=TURNS,
-    )
     core: int | None = option(None, "pin to core N and busy-wait; uses 100 %% of that core", type=int, metavar="N")
     out: Path | None = option(
         None, f"folder for the recording and the summary (default: a new one in {RUNS})", type=Path, metavar="DIR"

@@ -9,27 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.core.decision import (
-    DECISION_DTYPE,
-    NO_LABEL,
-    Decision,
-    DecisionFlag,
-    NumberedDecisions,
-    RowDecisions,
-)
-
-if TYPE_CHECKING:
-    from pans.runtime.core.stream_arrays import MarkArrays
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 
 _ABSTAINED, _AMBIGUOUS = int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
-RUNS_AT_ONCE = 1 << 13  # decisions in a row on one object
-NO_DECISIONS = RowDecisions(np.zeros(0, DECISION_DTYPE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,89 +54,47 @@ class RunTally:
         self._trials: npt.NDArray[np.int64] = np.zeros((64, 2), np.int64)  # by window within the visit: decided, right
         self._objects: dict[int, list[int]] = {}  # object -> [decided, right]
         self._past = [0.0, 0.0, 0.0]  # objects that are summed up: how many, accuracies, their squares
-        self._runs: npt.NDArray[np.int64] = np.zeros((RUNS_AT_ONCE, 3), np.int64)
 
-    def add(self, decision: Decision, photons_per_shot: float) -> None:
-        """Count one decision; `photons_per_shot` is NaN where the instrument does not know it."""
-        self.decisions += 1
-        self.clicks += decision.clicks
-        self.exposures += decision.exposures
-        if not math.isnan(photons_per_shot):
-            self.photons += photons_per_shot * self.shots
-            self.photons_known += 1
-        if decision.flags & _ABSTAINED or decision.label == NO_LABEL:
-            self.abstained += 1
-            self.unsure += bool(decision.flags & _AMBIGUOUS)
-        if decision.truth < 0 or decision.truth >= len(self.confusion):
+    def add_rows(self, rows: npt.NDArray[np.void], photons_per_shot: npt.NDArray[np.float32]) -> None:
+        """Count decisions, rows of DECISION_DTYPE (n,); `photons_per_shot` (n,) is NaN where the instrument does not know it."""
+        labels, truths = rows["label"].astype(np.int64), rows["truth"].astype(np.int64)
+        lit, n_classes = ~np.isnan(photons_per_shot), len(self.confusion)
+        silent = (rows["flags"] & _ABSTAINED != 0) | (labels == NO_LABEL)
+        self.decisions += len(rows)
+        self.clicks += int(rows["clicks"].sum(dtype=np.int64))
+        self.exposures += int(rows["exposures"].sum(dtype=np.int64))
+        self.photons += float(photons_per_shot[lit].sum(dtype=np.float64)) * self.shots
+        self.photons_known += int(lit.sum())
+        self.abstained += int(silent.sum())
+        self.unsure += int((silent & (rows["flags"] & _AMBIGUOUS != 0)).sum())
+        known = (truths >= 0) & (truths < n_classes)
+        if not known.any():
             return
-        right = int(decision.label == decision.truth)
-        self.known += 1
-        self.right += right
-        if decision.label != NO_LABEL:
-            self.confusion[decision.truth, decision.label] += 1
-        trial = decision.shot // self.shots
-        self._make_room(trial)
-        self._trials[trial, 0] += 1
-        self._trials[trial, 1] += right
-        sums = self._object_sums(self._which(decision))
-        sums[0] += 1
-        sums[1] += right
+        labels, truths, right = labels[known], truths[known], (labels == truths)[known]
+        self.known += len(right)
+        self.right += int(right.sum())
+        cells = (truths * n_classes + labels)[labels != NO_LABEL]
+        self.confusion += np.bincount(cells, minlength=n_classes**2).reshape(n_classes, n_classes)
+        trials = rows["shot"][known] // self.shots
+        self._make_room(int(trials.max()))
+        self._trials[:, 0] += np.bincount(trials, minlength=len(self._trials))
+        self._trials[:, 1] += np.bincount(trials[right], minlength=len(self._trials))
+        self._add_objects(rows["object"][known].astype(np.int64), right)
 
-    def warm_up(self, marks: MarkArrays, trials: int, like: RowDecisions = NO_DECISIONS) -> None:
-        """Compile or load what `add_many` needs for decisions of this kind, and make room for `trials` of an object, before arming."""
-        self._make_room(trials - 1)
-        self._runs[:] = 0  # touched
-        self._add_from(like, 0, marks)
-
-    def add_many(self, decisions: RowDecisions, marks: MarkArrays) -> None:
-        """Count many decisions on objects of which `marks` tell; as `add` does for each."""
-        first = 0
-        while first < len(decisions):
-            if isinstance(decisions, NumberedDecisions):
-                count, shot, step = (int(decisions.runs[name][first]) for name in ("count", "shot", "shot_step"))
-                self._make_room((shot + (count - 1) * step) // self.shots)
-            else:
-                self._make_room(int(decisions.rows["shot"][first]) // self.shots)
-            first = self._add_from(decisions, first, marks)
-
-    def _add_from(self, decisions: RowDecisions, first: int, marks: MarkArrays) -> int:
-        """Count decisions from `first` on; return up to where there was room."""
-        from pans.runtime.turn import settling as kernels  # numba is loaded only by who counts many at once
-
-        plan, sums, photons = np.array([self.shots, self.distinct]), np.zeros(kernels.N_SUMS, np.int64), np.zeros(1)
-        photons[0] = self.photons
-        tables = (self.confusion, self._trials, self._runs)
-        rest = (first, marks.objects, marks.photons, plan, sums, photons, tables)
-        if isinstance(decisions, NumberedDecisions):
-            stop, n_runs = kernels.add_numbered((decisions.verdicts, decisions.numbers, decisions.runs), *rest)
-        else:
-            stop, n_runs = kernels.add_rows(decisions.rows, *rest)
-        self._take_sums(stop - first, sums.tolist(), float(photons[0]))
-        for number, decided, right in self._runs[:n_runs].tolist():
-            mine = self._object_sums(number)
-            mine[0] += decided
-            mine[1] += right
-        return int(stop)
-
-    def _take_sums(self, decisions: int, sums: list[int], photons: float) -> None:
-        clicks, exposures, photons_known, abstained, unsure, known, right = sums
-        self.decisions += decisions
-        self.clicks += clicks
-        self.exposures += exposures
-        self.photons, self.photons_known = photons, self.photons_known + photons_known
-        self.abstained += abstained
-        self.unsure += unsure
-        self.known += known
-        self.right += right
+    def _add_objects(self, numbers: npt.NDArray[np.int64], right: npt.NDArray[np.bool_]) -> None:
+        """Count decisions on objects; one that is shown again keeps its number."""
+        which = numbers % self.distinct if self.distinct else numbers
+        begins = np.flatnonzero(np.diff(which, prepend=which[0] - 1))
+        decided, well = np.diff(begins, append=len(which)), np.add.reduceat(right.astype(np.int64), begins)
+        for index, n_decided, n_right in zip(which[begins].tolist(), decided.tolist(), well.tolist()):
+            sums = self._object_sums(index)
+            sums[0] += n_decided
+            sums[1] += n_right
 
     def _make_room(self, trial: int) -> None:
         """Make the sums of trials long enough for one more, twice as long each time; a visit has at most 2^24 exposures."""
         while trial >= len(self._trials):
             self._trials = np.concatenate([self._trials, np.zeros_like(self._trials)])
-
-    def _which(self, decision: Decision) -> int:
-        """Return which object a decision is about: one that is shown again keeps its number."""
-        return decision.object % self.distinct if self.distinct else decision.object
 
     def _object_sums(self, index: int) -> list[int]:
         sums = self._objects.get(index)

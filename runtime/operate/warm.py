@@ -60,35 +60,17 @@ def run_once(name: str, words: Sequence[str], out: Path) -> dict[str, Any]:
 
 def load_ahead() -> None:
     """Load what a run needs besides, while its port opens: nothing of it has to be loaded between there and ARM."""
+    import numpy as np
+
     from pans.runtime.record.recorder import load_kernels
+    from pans.runtime.turn.kernels import unpack_blocks
     from pans.runtime.wire.bulk import BulkDecoder
 
     load_kernels()
     BulkDecoder().warm_up()
-    compile_settling()
+    unpack_blocks(np.zeros(8, np.uint8), np.zeros((0, 4), np.int64), np.zeros(1, np.uint16), np.zeros(1, np.uint8))
     for name in LATER:
         import_module(f"pans.runtime.{name}")
-
-
-def compile_settling() -> None:
-    """What is done with what a call of the compiled turn has brought."""
-    import numpy as np
-
-    from pans.runtime.core.stream_arrays import MarkArrays
-    from pans.runtime.live.tally import RunTally
-    from pans.runtime.record.format import TIMING_RUN_DTYPE
-    from pans.runtime.timing.ledger import TimingLedger
-    from pans.runtime.turn import rings, settling
-    from pans.runtime.turn.kernels import unpack_blocks
-
-    whole, real = np.zeros(2, np.int64), np.zeros(2)
-    RunTally(2, 1).warm_up(MarkArrays(whole, np.zeros(2, np.int16), np.zeros(2, np.float32)), 1)
-    histograms = tuple(histogram.numbers for histogram in TimingLedger(1).histograms)
-    judged, marked = np.zeros(settling.N_JUDGED, np.int64), np.zeros((1, settling.N_MARKED), np.int64)
-    lines = (whole, real), (whole, real)
-    blocks, runs = np.zeros((0, rings.N_STEP), np.int64), np.zeros(1, TIMING_RUN_DTYPE)
-    settling.judge_blocks(blocks, 0, *lines, 1, histograms, judged, runs, marked)
-    unpack_blocks(np.zeros(8, np.uint8), np.zeros((0, 4), np.int64), np.zeros(1, np.uint16), np.zeros(1, np.uint8))
 
 
 def cache_folder() -> Path:

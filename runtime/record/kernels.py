@@ -38,38 +38,6 @@ def encode_rows(rows, state, keys, slots, runs, verdicts, lengths, codes):  # ty
     return _find_runs(rows, state, runs), _find_codes(rows, state, keys, slots, verdicts, lengths, codes)
 
 
-@outer
-def encode_numbered(numbered, first, stop, places, state, keys, slots, runs, verdicts, lengths, codes):  # type: ignore[no-untyped-def]
-    """As `encode_rows`, of NumberedDecisions (its verdicts, numbers and runs) from place `first` up to `stop`.
-
-    places uint16 are the numbers under which the log knows the verdicts, LONG_VERDICT where it does not yet.
-    """
-    table, numbers, stretches = numbered
-    n_runs = _join_stretches(stretches, first, stop, state, runs)
-    n_new, at_first, highest = np.int64(0), _U(first), np.uint16(0)
-    for i in range(at_first, _U(stop)):
-        code = places[numbers[i]]
-        codes[i - at_first] = code
-        highest = max(highest, code)
-    if highest != _LONG:
-        return n_runs, n_new
-    for i in range(at_first, _U(stop)):
-        number = numbers[i]
-        known = _U(places[number])
-        if known == _LONG:
-            one = table[number]
-            key = _key_of(one["clicks"], one["label"], one["probability_bits"], one["flags"], 0, one["counts_crc"])
-            at, known = _look_for(key, state[SLOT_MASK], keys, slots)
-            if known == _LONG:
-                known = _learn(key, at, state, keys, slots)
-                _keep(one, verdicts[n_new])
-                lengths[n_new] = 0
-                n_new += 1
-            places[number] = known
-        codes[i - at_first] = known
-    return n_runs, n_new
-
-
 @inner
 def _find_runs(rows, state, runs):  # type: ignore[no-untyped-def]
     """Tell the runs that rows are made of; return how many were written."""
@@ -100,25 +68,6 @@ def _find_runs(rows, state, runs):  # type: ignore[no-untyped-def]
             _U(indices[i]), (_U(ticks[i]), _U(exposures[i]), _U(shots[i])), _NO_STEPS, _ONE, whose, state, runs
         )
         i += _ONE
-    return _close(state, runs)
-
-
-@inner
-def _join_stretches(stretches, first, stop, state, runs):  # type: ignore[no-untyped-def]
-    """Tell the runs that decisions from place `first` up to `stop` of `stretches`, runs of a core, are made of; as `_find_runs`."""
-    state[N_RUNS], state[PART] = _ZERO, _ZERO
-    at = np.int64(0)
-    while at < stop:
-        one = stretches[at]
-        end = at + np.int64(one["count"])
-        left_out, steps = _U(max(first - at, 0)), (_U(one["tick_step"]), _U(one["exposure_step"]), _U(one["shot_step"]))
-        if end > first:
-            tick, exposure = _U(one["tick"]) + left_out * steps[0], _U(one["exposure_index"]) + left_out * steps[1]
-            begins = tick, exposure, _U(one["shot"]) + left_out * steps[2]
-            whose = _U(one["object"]), _U(one["truth"]) & _TRUTH_MASK
-            count = _U(min(end, stop) - max(at, first))
-            _add_stretch(_U(one["index"]) + left_out, begins, steps, count, whose, state, runs)
-        at = end
     return _close(state, runs)
 
 

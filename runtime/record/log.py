@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.core.decision import DECISION_DTYPE, NumberedDecisions
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.decision import RUN_DTYPE as RUN_DTYPE
 from pans.runtime.core.decision import VERDICT_DTYPE as VERDICT_DTYPE
 from pans.runtime.core.decision import VERDICT_FIELDS as VERDICT_FIELDS
@@ -56,7 +56,7 @@ class LogEncoder:
     def __init__(self) -> None:
         from . import kernels  # numba: only who writes or replays decisions needs it
 
-        self._encode, self._encode_numbered = kernels.encode_rows, kernels.encode_numbered
+        self._encode = kernels.encode_rows
         self._hash = _LogHash()
         self._state = np.zeros(kernels.N_STATE, np.uint64)
         self._state[kernels.SLOT_MASK] = _FIRST_SLOTS - 1
@@ -71,26 +71,16 @@ class LogEncoder:
         # what a kernel continues, and what it fills
         known, verdicts = (self._state, self._keys, self._slots), self._verdicts.view(_VERDICT_BITS)
         self._arrays = *known, self._runs, verdicts, self._exposures, self._codes
-        self._table: NDArray[np.void] | None = None  # of numbered decisions, and under which numbers it is known
-        self._places = np.zeros(0, np.uint16)
         self._take(np.zeros(0, DECISION_DTYPE))  # compiles the kernel, or loads it
 
     def block(self, rows: NDArray[np.void]) -> bytes:
         """Take the next rows, DECISION_DTYPE (n,), n at most BLOCK_ROWS, and return the payload that holds them."""
         return _payload(self._take(rows))
 
-    def blocks(self, decisions: NDArray[np.void] | NumberedDecisions) -> Iterator[bytes]:
-        """Take the next decisions, rows or numbered, any number of them, and yield the payloads that hold them."""
-        for first in range(0, len(decisions), BLOCK_ROWS):
-            stop = min(first + BLOCK_ROWS, len(decisions))
-            if isinstance(decisions, NumberedDecisions):
-                yield _payload(self._take_numbered(decisions, first, stop))
-            else:
-                yield self.block(decisions[first:stop])
-
-    def prepare(self, decisions: NumberedDecisions) -> None:
-        """Compile or load what `blocks` needs for decisions by the same verdicts, and allocate its memory."""
-        self._take_numbered(decisions, 0, 0)
+    def blocks(self, rows: NDArray[np.void]) -> Iterator[bytes]:
+        """Take the next rows, any number of them, and yield the payloads that hold them."""
+        for first in range(0, len(rows), BLOCK_ROWS):
+            yield self.block(rows[first : first + BLOCK_ROWS])
 
     def update(self, rows: NDArray[np.void]) -> None:
         """Take the next rows, DECISION_DTYPE (n,), for their hash alone."""
@@ -104,13 +94,6 @@ class LogEncoder:
     def _take(self, rows: NDArray[np.void]) -> _Parts:
         bits = np.ascontiguousarray(rows, DECISION_DTYPE).view(_ROW_BITS)
         return self._made(len(rows), *self._encode(bits, *self._arrays))
-
-    def _take_numbered(self, decisions: NumberedDecisions, first: int, stop: int) -> _Parts:
-        if self._table is not decisions.verdicts:
-            self._table = decisions.verdicts
-            self._places = np.full(len(decisions.verdicts), LONG_VERDICT, np.uint16)
-        numbered = decisions.verdicts.view(_VERDICT_BITS), decisions.numbers, decisions.runs
-        return self._made(stop - first, *self._encode_numbered(numbered, first, stop, self._places, *self._arrays))
 
     def _made(self, n_rows: int, n_runs: int, n_verdicts: int) -> _Parts:
         """Return the parts of the block that a kernel has made, and add them to the hash."""

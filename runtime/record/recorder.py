@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.container import MIB, canonical_json
-from pans.runtime.core.decision import DECISION_DTYPE, NumberedDecisions
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import PansError, RecordingError, UsageError
@@ -293,14 +293,10 @@ class Recorder:
         if self._decisions.add(record):
             self._write_up_to(self._decisions)
 
-    def prepare(self, decisions: NumberedDecisions) -> None:
-        """Be ready for many decisions by the same verdicts, before arming."""
-        self.open_file.log.prepare(decisions)
-
-    def add_decisions(self, many: NDArray[np.void] | NumberedDecisions) -> None:
-        """Keep many decisions, rows DECISION_DTYPE (n,) or numbered; more than a buffer holds go out at once."""
+    def add_decisions(self, many: NDArray[np.void]) -> None:
+        """Keep many decisions, rows DECISION_DTYPE (n,); more than a buffer holds go out at once."""
         if len(many) < self._decisions.room():
-            self._decisions.add_many(many.rows if isinstance(many, NumberedDecisions) else many)
+            self._decisions.add_many(many)
             return
         n, blocks = self._decisions.used + len(many), self._blocks_of(*self._first)
         for payload in self.open_file.log.blocks(many):

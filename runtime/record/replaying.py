@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.dark_guard import recorded_guard
 from pans.runtime.core.decision import DECISION_DTYPE, Decision, DecisionFlag
 from pans.runtime.core.follower import Follower, Place
@@ -27,6 +26,7 @@ from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import recorded_flow_core, replayed_figures
 from pans.runtime.flow.matching import PassageFigures
 from pans.runtime.ranges import Range
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 
@@ -130,7 +130,7 @@ class _Log:
         self._encoder = LogEncoder()
         self.take([])
 
-    def take(self, decisions: list[Any] | NDArray[np.void]) -> None:
+    def take(self, decisions: Sequence[Any] | NDArray[np.void]) -> None:
         rows = np.asarray(decisions, DECISION_DTYPE)
         here = self._n_recorded - self.decisions  # rows up to the last recorded one
         if 0 <= here <= len(rows) and not self.sha256_as_far:
@@ -140,7 +140,7 @@ class _Log:
         else:
             self._encoder.update(rows)
         self.decisions += len(rows)
-        if self._pictures is not None and isinstance(decisions, list):
+        if self._pictures is not None and not isinstance(decisions, np.ndarray):
             self._pictures.note(decisions)
 
     def sha256(self) -> str:
@@ -160,10 +160,13 @@ def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures,
 
 def _replayed(recording: Recording, bundle: Bundle, pictures: ClickLog | None) -> tuple[Core | FlowCore, _Log]:
     """Drive a core through `recording`; return it and the log of its decisions."""
-    core, steps, sent = _rebuilt(recording, bundle, pictures)
+    core, sent = _rebuilt(recording, bundle, pictures)
     log = _Log(recording.n_decisions, pictures)
     arms = list(sent.arms.items())
-    found = _decisions(core, arms, recording) if steps is None else _bulk_decisions(steps, arms, recording)
+    if pictures is None and isinstance(core, Core) and core.takes:
+        found = _by_kernel(core, arms, recording)
+    else:
+        found = _by_core(core, arms, recording)
     for decisions in found:
         log.take(decisions)
     went_on = "part_ended" in recording.summary  # in the next part
@@ -173,10 +176,8 @@ def _replayed(recording: Recording, bundle: Bundle, pictures: ClickLog | None) -
     return core, log
 
 
-def _rebuilt(
-    recording: Recording, bundle: Bundle, pictures: ClickLog | None
-) -> tuple[Core | FlowCore, BulkSteps | None, Sent]:
-    """Return the core of the run, its compiled steps where they give all that is asked for, and what the device was sent.
+def _rebuilt(recording: Recording, bundle: Bundle, pictures: ClickLog | None) -> tuple[Core | FlowCore, Sent]:
+    """Return the core of the run, and what the device was sent.
 
     DamagedFileError if the header or the commands do not tell.
     """
@@ -191,11 +192,7 @@ def _rebuilt(
         if pictures is not None:
             decider = pictures.over(decider)
         core = _core(config, plan, decider, bundle, shots, next(iter(sent.arms.values())).n_cycles)
-        steps = None
-        if pictures is None and isinstance(core, Core) and not core.counts_photons:
-            in_bulk = core.guard is None or core.guard.policy == "warn"
-            steps = BulkSteps(core, core.windows, plan, decider, shots) if in_bulk else None
-        return core, steps, sent
+        return core, sent
     except _NOT_REBUILT as error:
         raise DamagedFileError(
             f"{recording.path}: the run cannot be rebuilt: {error or type(error).__name__}"
@@ -210,7 +207,7 @@ def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
     try:
         if never_armed(recording):
             return []
-        _, _, sent = _rebuilt(recording, bundle, None)
+        _, sent = _rebuilt(recording, bundle, None)
         place = place_of(recording)
         if place is not None:
             Place.of(place)
@@ -258,12 +255,12 @@ class _Streams:
             decisions += begun
         return decisions
 
-    def begin_rest(self) -> Iterator[list[Any]]:
+    def begin_rest(self) -> Iterator[Sequence[Any]]:
         """Begin the streams that gave no message at all, and yield the decisions."""
         while (begun := self._begin_next()) is not None:
             yield begun
 
-    def _begin_next(self) -> list[Any] | None:
+    def _begin_next(self) -> Sequence[Any] | None:
         self.session, arm = next(self._following, (0, None))
         if arm is None:
             return None
@@ -274,7 +271,7 @@ class _Streams:
         return output.decisions
 
 
-def _decisions(core: Follower, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[list[Any]]:
+def _by_core(core: Follower, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[Sequence[Any]]:
     """Drive `core` as the live loop did, message by message."""
     streams = _Streams(core, arms, recording)
     for _, body in recording.messages():
@@ -285,25 +282,17 @@ def _decisions(core: Follower, arms: list[tuple[int, Arm]], recording: Recording
     yield from streams.begin_rest()
 
 
-def _bulk_decisions(
-    steps: BulkSteps, arms: list[tuple[int, Arm]], recording: Recording
-) -> Iterator[list[Any] | NDArray[np.void]]:
-    """Drive the core of `steps` as the live loop did, many messages at once; rows are valid until the next ones."""
-    streams = _Streams(steps.core, arms, recording)
+def _by_kernel(
+    core: Core, arms: list[tuple[int, Arm]], recording: Recording
+) -> Iterator[Sequence[Any] | NDArray[np.void]]:
+    """Drive `core` as the live loop did, many messages in one call of the kernel; rows are valid until the next ones."""
+    streams, streamed = _Streams(core, arms, recording), StreamCore.of(core, 0)
     for messages in recording.iter_messages():
-        place = 0
-        while place < len(messages.spans):
-            place, rows, odd = steps.take(messages, place)
-            yield rows
-            if not odd:
-                continue
-            frame = messages.frame(place)
-            if frame.session != streams.session:
-                steps.hand_over()  # what the stream before leaves open has its truth
-                yield streams.begin_up_to(frame.session)
-                steps.begin(frame.session)
-            else:
-                place += 1
-                yield steps.step(frame).decisions
-    steps.hand_over()
+        for batch in streamed.replay(messages):
+            yield batch.rows
+            for frame in batch.others:
+                if frame.session != streams.session:
+                    yield streams.begin_up_to(frame.session)
+                    streamed.follow(frame.session)
+                    yield core.step(frame).decisions
     yield from streams.begin_rest()

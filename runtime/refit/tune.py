@@ -36,7 +36,6 @@ from pans.runtime.imaging import Imaging, seen
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import open_link
 from pans.runtime.live import LiveRun, Observers, RunOptions, RunResult, run_live
-from pans.runtime.live.config import PYTHON
 from pans.runtime.live.continuous import Stop
 from pans.runtime.outputs import write_file
 from pans.runtime.record.replaying import ClickLog
@@ -397,7 +396,6 @@ class Bench:
                 deadline_us=timing.decision_deadline_us,
                 lease_ms=timing.lease_ms,
                 realtime=False,
-                turn=PYTHON,
             )
             watching = Observers(look, stop=self.stop, acts=False)
             result = run_live(link, self.profile, bundle, plan, core, config, None, None, watching)

@@ -35,10 +35,7 @@ MAX_RATE_ERROR = (
 )
 LARGEST_NS = 1 << 62  # 146 years: a tick that claims more is no time, and must still fit the recording's int64
 
-# reference tick and host time, ns per tick and uncertainty per tick, where anchors lie and their bounds
-ClockNumbers = tuple[
-    tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]], tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]
-]
+I64 = npt.NDArray[np.int64]
 CLOCK_DTYPE = np.dtype([("host_ns", "<i8"), ("tick", "<u8"), ("round_trip_ns", "<i8")])
 
 
@@ -91,7 +88,6 @@ class ClockModel:
         self.fit: ClockFit | None = None
         self._kept = 0  # since the last jump
         self._strange = 0
-        self._numbers: tuple[ClockFit, ClockNumbers] | None = None
         self._unrecorded: deque[tuple[int, int, int]] = deque(maxlen=MAX_UNRECORDED)
 
     def add_probe(self, sent_ns: int, rx_tick: int, tx_tick: int, received_ns: int) -> ClockStep | None:
@@ -127,16 +123,15 @@ class ClockModel:
         host_ns = fit.reference_host_ns + round(elapsed * fit.ns_per_tick)
         return max(-LARGEST_NS, min(host_ns, LARGEST_NS)), min(int(uncertainty) + 1, LARGEST_NS)
 
-    @property
-    def numbers(self) -> ClockNumbers:
-        """What compiled code makes host times and their uncertainties of, as `to_host_ns` does."""
+    def to_host_ns_many(self, ticks: I64) -> tuple[I64, I64]:
+        """Return the host times of `ticks` and their uncertainties, int64 (n,) ns, as `to_host_ns` does."""
         fit = self._ready()
-        if self._numbers is None or self._numbers[0] is not fit:
-            line = (fit.ns_per_tick, fit.ns_per_tick * fit.rate_uncertainty)
-            places = (np.array([at for at, _ in fit.anchors], np.int64), np.array([bound for _, bound in fit.anchors]))
-            numbers = ((np.array([fit.reference_tick, fit.reference_host_ns]), np.array(line)), places)
-            self._numbers = (fit, numbers)
-        return self._numbers[1]
+        elapsed = ticks - fit.reference_tick
+        away = np.clip(np.rint(elapsed * fit.ns_per_tick), -LARGEST_NS, LARGEST_NS).astype(np.int64)
+        rate = fit.ns_per_tick * fit.rate_uncertainty
+        bounds = [bound + np.abs(elapsed - at) * rate for at, bound in fit.anchors]
+        unsure = np.minimum(np.minimum.reduce(bounds), LARGEST_NS - 1).astype(np.int64) + 1
+        return np.clip(fit.reference_host_ns + away, -LARGEST_NS, LARGEST_NS), unsure
 
     def to_tick(self, host_ns: int) -> int:
         """Return the device tick at a host time (for commands with absolute ticks)."""

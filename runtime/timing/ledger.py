@@ -16,7 +16,6 @@ from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,9 +23,10 @@ from numpy.typing import NDArray
 
 from .page_faults import held_heap
 
+I64 = NDArray[np.int64]
+
 SUB_BITS = 5  # 32 steps per octave: a quantile is at most 3.2 % above the true value
 N_BUCKETS = 64 << SUB_BITS
-FEW = 16  # durations that are counted one by one in the time of an array's ways
 SWITCH_INTERVAL_S = 0.0005
 FIFO_PRIORITY = 10
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
@@ -37,7 +37,7 @@ class LatencyHistogram:
 
     def __init__(self) -> None:
         self.counts = array("q", bytes(8 * N_BUCKETS))
-        self.numbers = np.frombuffer(self.counts, np.int64)  # the same, for compiled code
+        self.numbers = np.frombuffer(self.counts, np.int64)  # the same, as an array
         self.total = 0
         self.max_ns = 0
 
@@ -50,21 +50,15 @@ class LatencyHistogram:
         if value > self.max_ns:
             self.max_ns = value
 
-    def add_many(self, durations_ns: NDArray[np.int64]) -> None:
-        """Count many durations below 2^53 ns, int64 (n,), as `add` does each."""
-        if len(durations_ns) <= FEW:
-            for duration_ns in durations_ns.tolist():
-                self.add(duration_ns)
+    def add_many(self, durations_ns: I64, counts: I64 | int = 1) -> None:
+        """Count durations below 2^53 ns, int64 (n,), each `counts` times, as `add` does one."""
+        if not len(durations_ns):
             return
         values = np.maximum(durations_ns, 0)
         shift = np.maximum(np.frexp(values.astype(np.float64))[1] - SUB_BITS - 1, 0)
-        np.add.at(self.numbers, (shift << SUB_BITS) + (values >> shift), 1)
-        self.went_on(len(values), int(values.max()))
-
-    def went_on(self, more: int, longest_ns: int) -> None:
-        """Take over `more` durations that compiled code has counted in `numbers`."""
-        self.total += more
-        self.max_ns = max(self.max_ns, longest_ns)
+        np.add.at(self.numbers, (shift << SUB_BITS) + (values >> shift), counts)
+        self.total += int(np.sum(np.broadcast_to(counts, values.shape)))
+        self.max_ns = max(self.max_ns, int(values.max()))
 
     def quantile_ns(self, q: float) -> int:
         """Return the upper edge of the bucket that holds quantile `q` (never above the exact maximum); 0 without data."""
@@ -108,37 +102,21 @@ class TimingLedger:
     blame: dict[str, int] = field(default_factory=dict)
     worst_uncertainty_ns: int = 0
 
-    def judge(self, marks_ns: tuple[int, int, int, int, int], uncertainty_ns: int) -> bool:
-        """Take the times of (device end, arrival, decoded, decided, recorded); return True when the decision is late."""
-        steps = [later - earlier for earlier, later in pairwise(marks_ns)]
-        for name, step in zip(STAGES, steps):
-            self.stages[name].add(step)
-        latency = marks_ns[3] - marks_ns[0]
-        self.total.add(latency)
-        self.worst_uncertainty_ns = max(self.worst_uncertainty_ns, uncertainty_ns)
-        if latency - uncertainty_ns <= self.deadline_ns:
-            return False
-        self.late += 1
-        slowest = max(range(3), key=lambda stage: steps[stage])
-        self.blame[STAGES[slowest]] = self.blame.get(STAGES[slowest], 0) + 1
-        return True
+    def judge(self, marks_ns: I64, uncertainty_ns: I64, counts: I64) -> NDArray[np.bool_]:
+        """Count decisions and return which are late, bool (n,); `counts` of them share each row.
 
-    @property
-    def histograms(self) -> tuple[LatencyHistogram, ...]:
-        """The stages in their order, and the total."""
-        return (*self.stages.values(), self.total)
-
-    def went_on(
-        self, decisions: int, longest_ns: Sequence[int], uncertainty_ns: int, late: int, blame: Sequence[int]
-    ) -> None:
-        """Take over what compiled code has judged as `judge` would: the longest of `histograms`, the late ones by slowest stage."""
-        for histogram, longest in zip(self.histograms, longest_ns):
-            histogram.went_on(decisions, longest)
-        self.worst_uncertainty_ns = max(self.worst_uncertainty_ns, uncertainty_ns)
-        self.late += late
-        for name, count in zip(STAGES, blame):
-            if count:
-                self.blame[name] = self.blame.get(name, 0) + count
+        marks_ns (n, 5): device end, arrival, decoded, decided, recorded; uncertainty_ns (n,): of the device end.
+        """
+        steps = np.diff(marks_ns, axis=1)
+        latency = marks_ns[:, 3] - marks_ns[:, 0]
+        for histogram, durations in zip((*self.stages.values(), self.total), (*steps.T, latency)):
+            histogram.add_many(durations, counts)
+        self.worst_uncertainty_ns = max(self.worst_uncertainty_ns, int(uncertainty_ns.max(initial=0)))
+        late: NDArray[np.bool_] = latency - uncertainty_ns > self.deadline_ns
+        self.late += int(counts[late].sum())
+        for slowest, count in zip(steps[late, :3].argmax(axis=1).tolist(), counts[late].tolist()):
+            self.blame[STAGES[slowest]] = self.blame.get(STAGES[slowest], 0) + count
+        return late
 
 
 class _Heap:

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core import stream_kernels as core_kernels
-from pans.runtime.core.follower import Follower
 from pans.runtime.wire.bulk import CHUNK_BYTES, BulkDecoder
+from pans.runtime.wire.frame import Frame, Messages, unpack_body
 from pans.runtime.wire.messages import Mark, MessageType, decode_mark
 from pans.runtime.wire.schema import HEADER
 
@@ -22,6 +22,7 @@ from . import rings as ring
 from .rings import I64, U8, Decoder, Drive, Rings, make_rings, no_drive
 
 NO_END = 1 << 62
+Bytes = bytes | bytearray | memoryview | U8
 
 
 class Limits(NamedTuple):
@@ -50,17 +51,18 @@ class Counts(NamedTuple):
 
 
 class Steps(Protocol):
-    """The compiled steps of a core (core.bulk_steps.BulkSteps, flow.steps.FlowSteps): they lend its state to kernels and take it back.
+    """The compiled steps of a core (core.bulk_steps.BulkSteps, flow.core.FlowCore): they lend its state to kernels and take it back.
 
     `walk` is a tuple of arrays of its own class, for which kinds.py has the kernels; its `state` begins with the columns of
-    core/stream_kernels.py, its `rows` are decisions. `block_rows` are most of one block; `decides`: kernels give each label at once.
+    core/stream_kernels.py, its `rows` are decisions. `block_rows` are most of one block. `takes`: messages may be
+    taken now; `decides`: the kernel gives each label at once.
     """
 
     @property
-    def core(self) -> Follower: ...
+    def walk(self) -> Any: ...
 
     @property
-    def walk(self) -> Any: ...
+    def takes(self) -> bool: ...
 
     @property
     def decides(self) -> bool: ...
@@ -72,7 +74,7 @@ class Steps(Protocol):
 
     def store(self) -> None: ...
 
-    def labelled(self, n: int) -> npt.NDArray[np.void]: ...
+    def rows(self, n: int) -> npt.NDArray[np.void]: ...
 
 
 NO_LIMITS = Limits()
@@ -129,31 +131,33 @@ class Turn:
             control[ring.FD] = fd
         control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
         control[ring.FLOOR_NS] = limits.floor_ns
-        control[ring.OPEN] = steps.core.tracker.open
+        control[ring.OPEN] = steps.takes
         steps.load()
 
-    def feed(self, chunks: Sequence[tuple[int, bytes]]) -> int:
+    def feed(self, chunks: Sequence[tuple[int, Bytes]]) -> int:
         """Take what was read elsewhere: one read or more, each with the time at which it came.
 
         Returns why it ended; `feed_on` goes on behind what ended it, until ALL_TAKEN.
         """
         times_ns, datas = zip(*chunks)
         if max(map(len, datas)) > CHUNK_BYTES:
-            return self.feed([(at_ns, piece) for at_ns, data in chunks for piece in self.decoder.pieces(data)])
+            return self.feed([(at_ns, piece) for at_ns, data in chunks for piece in self.decoder.pieces(bytes(data))])
         reads = np.empty((len(datas), 2), np.int64)
         reads[:, 0], reads[:, 1] = tuple(map(len, datas)), times_ns
         self._fed = np.frombuffer(bytearray().join(datas), np.uint8), reads  # put together once, and writable
         self.control[ring.NEXT_READ : ring.READ_AT + 1] = 0
+        self.control[ring.FD] = -1  # what is sent, the caller sends
         return self.feed_on()
 
     def feed_on(self) -> int:
         """Go on with what `feed` was given."""
         return self._call(self._fed, -1, NO_LIMITS)
 
-    def decoded(self, n_bodies: int, arrival_ns: int) -> int:
-        """Take the bodies that the decoder has found in what it was given last."""
-        self.control[ring.PLACE : ring.ARRIVAL_NS + 1] = (0, n_bodies, arrival_ns)
-        return self.run()
+    def hold(self, messages: Messages) -> None:
+        """Take bodies of a recording, by `run`, until all are taken."""
+        buffer = messages.buffer if messages.buffer.flags.writeable else messages.buffer.copy()
+        self._decoder = Decoder(buffer, messages.spans, self._decoder.tally)
+        self.control[ring.PLACE : ring.ARRIVAL_NS + 1] = (0, len(messages.spans), 0)
 
     def stop(self) -> None:
         """End a call that is under way in another thread, and those that follow, at once."""
@@ -166,25 +170,17 @@ class Turn:
         """When the bytes were read that were decoded last."""
         return int(self.control[ring.ARRIVAL_NS])
 
-    @property
-    def left(self) -> I64:
-        """The spans of the decoder's bodies that have not been taken, int64 (n, 2)."""
-        place, n = self.control[ring.PLACE : ring.N_BODIES + 1].tolist()
-        return self._decoder.bodies[place:n]
-
-    def skip(self, bodies: int = 1) -> None:
-        """Count bodies that the caller has taken."""
-        self.control[ring.PLACE] += bodies
+    def take_odd(self) -> Frame:
+        """Return the message that ended the call as a frame; the next call begins behind it."""
+        decoder, place = self._decoder, int(self.control[ring.PLACE])
+        first, stop = decoder.bodies[place].tolist()
+        self.control[ring.PLACE] += 1
+        return unpack_body(decoder.buffer[first:stop].tobytes())
 
     @property
     def rows(self) -> npt.NDArray[np.void]:
         """The decisions of the call, DECISION_DTYPE (n,), in order."""
-        return self.steps.labelled(self._n_rows)
-
-    @property
-    def place(self) -> slice:
-        """Where `rows` stand in the walk's, and what the walk has beside them."""
-        return slice(0, self._n_rows)
+        return self.steps.rows(self._n_rows)
 
     @property
     def blocks(self) -> I64:

@@ -201,7 +201,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
         decoded_ns = now_ns(scratch)
         took = take_message(walk, buffer, _U(start), _U(stop))
         if took >= core.TOOK_MARK:
-            stream.note_heard(walk.heard, walk.state, load4(buffer, _U(stop)))  # the frame's own
+            stream.hear(buffer, _U(start), _U(stop), walk.heard, walk.state)
         if took >= core.TOOK_BLOCK:
             control[ring.URGENT] |= took - core.TOOK_BLOCK
             decided_ns = now_ns(scratch)

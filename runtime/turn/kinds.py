@@ -15,8 +15,8 @@ from numba import types
 from numba.extending import intrinsic
 
 from pans.runtime.core import stream_kernels as core
-from pans.runtime.core.stream_arrays import FrameWalkArrays, WalkArrays
-from pans.runtime.flow.arrays import FlowWalk
+from pans.runtime.core.stream_arrays import FrameWalkArrays, IdleArrays, WalkArrays
+from pans.runtime.flow.kernels import FlowWalk
 from pans.runtime.wire.inner import inner
 
 from .shows import send_show
@@ -33,12 +33,14 @@ def taking(kind: Any) -> tuple[Any, tuple[str, ...]]:
     Without names it wants the whole walk before the message.
     """
     if kind is FlowWalk:
-        from pans.runtime.flow.deciding import take_message as take_flow
+        from pans.runtime.flow.kernels import take_message as take_flow
 
         return take_flow, ()
+    if kind is IdleArrays:
+        return core.take_nothing, ()
     if kind is FrameWalkArrays:
         return core.take_frames, WalkArrays._fields[:-1]  # who calls it notes what was heard
-    return core.take_clicks, WalkArrays._fields[:-2]  # exposures of one detector are not numbered
+    return core.take_clicks, WalkArrays._fields[:-1]
 
 
 def answering(kind: Any) -> tuple[Any, tuple[str, ...]]:

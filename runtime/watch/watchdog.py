@@ -104,8 +104,7 @@ class Watchdog:
         connection = run.connection
 
         def speak() -> None:
-            next_id = 0 if run.compiled is None else run.compiled.leave_off()
-            connection.link.write(connection.session.stop_frames(next_id))
+            connection.link.write(connection.session.stop_frames(run.receiver.next_id()))
 
         _within(STEP_S, speak)
 

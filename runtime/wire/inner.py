@@ -108,7 +108,17 @@ def _for_these_sources(kernel: Any) -> Any:
     """Return `kernel`, whose cache holds what was compiled from these files; without compilation it is a function of Python."""
     file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
     if file is not None:
+        load_index = file._load_index
+
+        def load_index_again() -> Any:
+            """Load the index, which an earlier release may have written with classes that are gone."""
+            try:
+                return load_index()
+            except (AttributeError, ImportError):
+                return {}
+
         file._source_stamp = (file._source_stamp, digest_of(Path(__file__).parents[1]))
+        file._load_index = load_index_again
     return kernel
 
 

@@ -1,4 +1,4 @@
-"""The streaming core and the plain one over the same bytes, and the faults that a link may add to them."""
+"""The kernel and the core alone over the same bytes, and the faults that a link may add to them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.still import Core
 from pans.runtime.turn.engine import Limits
 from pans.runtime.turn.streaming import StreamCore
-from pans.runtime.turn.system import offered
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import ClickBlock, DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
@@ -48,7 +47,7 @@ def by_stream(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> tuple
 
 
 def by_descriptor(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> tuple[np.ndarray, list[Any], StreamCore]:
-    """As `by_stream`, but the compiled turn waits for and reads the bytes itself, one piece at a read."""
+    """As `by_stream`, but the kernel waits for and reads the bytes itself, one piece at a read."""
     streamed = StreamCore(plan, decider, shots, 0, SESSION)
     rows, events = [np.zeros(0, DECISION_DTYPE)], []
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -65,8 +64,7 @@ def by_descriptor(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> t
 def compare(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> np.ndarray:
     expected, expected_events, core, decoder = by_core(plan, decider, shots, pieces)
     fed = by_stream(plan, decider, shots, pieces)
-    read = [by_descriptor(plan, decider, shots, pieces)] if not offered() else []
-    for rows, events, streamed in [fed, *read]:
+    for rows, events, streamed in (fed, by_descriptor(plan, decider, shots, pieces)):
         same(rows, events, streamed, expected, expected_events, core, decoder)
     return fed[0]
 

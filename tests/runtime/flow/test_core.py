@@ -281,8 +281,8 @@ def test_bars_in_a_gap_abstain() -> None:
 
 def test_alignment_does_not_drift_over_a_million_bars() -> None:
     core = make(kind="tape", bars_per_s=20_000.0 / 1.0001, first_bar=31.0 / 50.005)
-    middle = core._origin + 10**6 * core._pitch  # type: ignore[attr-defined]
-    assert core._window_of(middle) == round(15 + 25.0025 * 10**6)  # type: ignore[attr-defined]
+    middle = core._origin + 10**6 * core._nominal_pitch
+    assert core.window_of(middle) == round(15 + 25.0025 * 10**6)
 
 
 def moving_tape(edges_at: F64, bars: F64, n: int, seed: int, light: float = 8.0) -> NDArray[np.uint16]:
@@ -314,7 +314,7 @@ def test_a_tape_of_another_speed_is_followed(off: float) -> None:
         if track:
             assert np.abs(beside[len(beside) // 2 :]).max() < 0.1
             assert np.abs(beside).max() < 0.4
-            assert core.bars_per_s == pytest.approx(20_000.0 / (1 - off), rel=0.004)  # type: ignore[attr-defined]
+            assert core.bars_per_s == pytest.approx(20_000.0 / (1 - off), rel=0.004)
         elif off:
             assert np.abs(beside).max() > 2.0
 

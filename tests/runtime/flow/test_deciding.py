@@ -1,35 +1,28 @@
-"""The compiled decisions of a flow: over any stream those of the core that takes its messages one by one."""
+"""The decisions of the kernel on a flow: over any stream those of the core that takes its messages one by one."""
 
 from __future__ import annotations
 
-import socket
-import time
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from flows import NOTHING, SESSION, by_one, frame, make, plan_of, scene, state_of, strange, stream
+from flows import NOTHING, PERIOD_TICKS, SESSION, by_one, frame, make, plan_of, scene, state_of, strange, stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pans.runtime.core.dark_guard import DarkGuard
-from pans.runtime.core.decision import Output, joined
-from pans.runtime.core.plan import Plan
+from pans.runtime.core.decision import DecisionFlag, Output, joined
 from pans.runtime.decide.table import TableDecider
+from pans.runtime.flow import kernels
 from pans.runtime.flow.core import FlowCore
-from pans.runtime.flow.steps import FlowSteps
 from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.instrument.dead_channels import DeadChannelTest
 from pans.runtime.live.flow_run import settled_blocks
-from pans.runtime.live.loop import choose_turn
 from pans.runtime.turn import rings as ring
-from pans.runtime.turn import system
 from pans.runtime.turn.engine import Turn
 from pans.runtime.wire.bulk import BulkDecoder
-from pans.runtime.wire.messages import MessageType
+from pans.runtime.wire.messages import MessageType, encode_frame
 
-pytestmark = pytest.mark.skipif(bool(system.offered()), reason="no compiled turn here")
 TAPE = {"kind": "tape", "bars_per_s": 20_000.0}
 FOLLOWED = {"kind": "tape", "bars_per_s": 20_500.0, "track": 3}
 
@@ -44,23 +37,20 @@ def table(shots: int) -> TableDecider:
 TABLES = {shots: table(shots) for shots in (1, 2)}
 
 
-def by_turn(core: FlowCore, plan: Plan, data: bytes, cuts: list[int]) -> Output:
-    """The compiled turn, what it leaves to Python by `step`."""
-    steps, decoder = FlowSteps(core, plan), BulkDecoder()
-    steps.begin(SESSION)
-    turn, output = Turn(steps, decoder), NOTHING
+def by_turn(core: FlowCore, data: bytes, cuts: list[int]) -> Output:
+    """The kernel, and what it leaves to the core by `step`."""
+    turn, output = Turn(core.steps(SESSION), BulkDecoder()), NOTHING
     for first, stop in zip([0, *cuts], [*cuts, len(data)]):
         ended = turn.feed([(1, data[first:stop])])
         while True:
-            for _, came in settled_blocks(turn) if turn.counts.steps else ():
-                output = output if came is None else joined(output, came)
+            for came in settled_blocks(turn) if turn.counts.steps else ():
+                output = joined(output, came)
             for mark in turn.marks() if not turn.counts.steps else ():
                 core.remember(mark)
             if ended == ring.ALL_TAKEN:
                 break
             if ended == ring.ODD:
-                frame = decoder.frame(*turn.left[0].tolist())
-                turn.skip()
+                frame = turn.take_odd()
                 output = output if frame.session != SESSION else joined(output, core.step(frame))
             ended = turn.feed_on()
     return joined(output, core.end())
@@ -76,7 +66,7 @@ def guarded(core: FlowCore, block: int, dark: bool) -> FlowCore:
 
 @settings(max_examples=25, deadline=None)
 @given(st.data())
-def test_each_decision_is_python_s(data: st.DataObject) -> None:
+def test_each_decision_is_the_core_s(data: st.DataObject) -> None:
     starts = np.cumsum(data.draw(st.lists(st.integers(45, 150), min_size=3, max_size=7))).tolist()
     words = scene(*((first, 30 + first % 70, first % 4) for first in starts), n=1000)
     rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
@@ -97,14 +87,10 @@ def test_each_decision_is_python_s(data: st.DataObject) -> None:
     one, other = (make(block, dark, shots=shots, decider=TABLES[shots], **changes) for _ in range(2))
     if data.draw(st.booleans()):
         one, other = guarded(one, block, dark), guarded(other, block, dark)
-    wanted, found = by_one(one, wire_bytes), by_turn(other, plan_of(block, dark), wire_bytes, cuts)
+    wanted, found = by_one(one, wire_bytes), by_turn(other, wire_bytes, cuts)
     assert found._replace(block_end_tick=None) == wanted._replace(block_end_tick=None)
     assert state_of(other) == state_of(one)
-    if changes.get("kind") == "tape":
-        assert (other.__dict__["_middle"], other.__dict__["_pitch"]) == (
-            one.__dict__["_middle"],
-            one.__dict__["_pitch"],
-        )
+    assert other.walk.state[kernels.MIDDLE :].tolist() == one.walk.state[kernels.MIDDLE :].tolist()
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -113,25 +99,49 @@ def test_the_guard_finds_the_same_at_the_same_exposures(dark: bool) -> None:
     words = ((rng.random((30_000, 10)) < 0.02) @ (1 << np.arange(10))).astype(np.uint16)
     data = b"".join(stream(words, 50))
     one, other = (guarded(make(50, dark, decider=TABLES[1]), 50, dark) for _ in range(2))
-    found = by_turn(other, plan_of(50, dark), data, list(range(5000, len(data), 5000)))
+    found = by_turn(other, data, list(range(5000, len(data), 5000)))
     assert found.events == by_one(one, data).events
     assert len(found.events) > 1, "a rate of twenty times the expected one was not seen"
     assert state_of(other) == state_of(one)
 
 
-def test_pulses_at_real_pace_are_python_s_unless_asked_otherwise() -> None:
-    gated = make(decider=TABLES[1], gate_classes=("a",))
-    with socket.socket() as port:
-        link: Any = SimpleNamespace(virtual=False, fileno=port.fileno, now_ns=time.perf_counter_ns)
-        assert choose_turn("auto", gated, link, drives=False).taken == "compiled"
-        assert choose_turn("compiled", gated, link, drives=False).taken == "compiled"
-        assert choose_turn("auto", make(decider=TABLES[1]), link, drives=False).taken == "compiled"
+@pytest.mark.parametrize("kind", ["lost", "twice", "another session", "short", "drops", "period"])
+@pytest.mark.parametrize("place", [3, 8])  # a mark, a block
+def test_each_oddity_changes_nothing_between_the_two(kind: str, place: int) -> None:
+    messages = stream(scene((100, 60, 0), (300, 60, 1)), 20)
+    assert (frame(messages[place]).type == MessageType.MARK) == (place == 3)
+    if (kind, place) == ("period", 3):  # a mark has none
+        return
+    messages[place : place + 1] = strange(kind, messages[place])
+    one, other = (make(decider=TABLES[1]) for _ in range(2))
+    wanted, found = by_one(one, b"".join(messages)), by_turn(other, b"".join(messages), [400])
+    assert found._replace(block_end_tick=None) == wanted._replace(block_end_tick=None)
+    assert state_of(other) == state_of(one)
 
 
-def test_what_has_no_compiled_turn_says_why() -> None:
-    assert make(decider=TABLES[1]).excluded == ""
-    assert "no table" in make().excluded
-    assert "side by side" in make(decider=TABLES[1], pool=2).excluded
-    other = make(decider=TABLES[1])
-    other.guard = DarkGuard(plan_of(20), ChannelWatch(10, np.full(10, 1e-3)), "abstain")
-    assert "--on-dark" in other.excluded
+def test_a_block_that_ends_when_the_plan_does_not_is_seen() -> None:
+    messages = stream(scene((100, 60, 0)), 20)
+    last = frame(messages[-1])
+    late = (1000 + 980 * PERIOD_TICKS + 3).to_bytes(8, "little")
+    messages[-1] = encode_frame(last.type, last.payload[:8] + late + last.payload[16:], SESSION)
+    core = make(decider=TABLES[1])
+    by_turn(core, b"".join(messages), [])
+    assert core.jitter_ticks == 3
+
+
+@pytest.mark.parametrize("policy", ["warn", "abstain"])
+@pytest.mark.parametrize("pool", [1, 2])
+@pytest.mark.parametrize("backend", ["table", "other"])
+def test_other_back_ends_pools_and_policies_decide_outside_the_kernel(policy: str, pool: int, backend: str) -> None:
+    rng = np.random.default_rng(3)
+    words = scene(*((first, 60, first % 4) for first in range(60, 3800, 130)), n=4000)
+    words[19::20] |= ((rng.random(200) < 0.5) * 512).astype(np.uint16)
+    data = b"".join(stream(words, 20))
+    one, other = (make(dark=True, pool=pool, decider=TABLES[1] if backend == "table" else None) for _ in range(2))
+    for core in (one, other):
+        core.guard = DarkGuard(plan_of(20, dark=True), ChannelWatch(10, np.full(10, 1e-3)), policy)
+    assert other.decides == (backend == "table" and policy == "warn" and pool == 1)
+    wanted, found = by_one(one, data), by_turn(other, data, list(range(3000, len(data), 3000)))
+    assert found._replace(block_end_tick=None) == wanted._replace(block_end_tick=None)
+    assert state_of(other) == state_of(one)
+    assert any(row.flags & DecisionFlag.DARK_ALARM for row in found.decisions) == (policy == "abstain")

@@ -10,6 +10,7 @@ import pytest
 from small_files import small_calibration
 
 from pans.firmware_sim.testing import small_setup
+from pans.runtime.core.decision import Decision
 from pans.runtime.instrument.calibration import load_calibration
 from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.live.dark_run import DarkRun
@@ -35,7 +36,7 @@ def test_a_state_of_the_detector_is_no_change_of_light(present: list[str]) -> No
     dark: Any = DarkRun(small_setup()[0], None, "warn", [])
     dark.light = MagicMock()
     dark.light.take.return_value = []
-    run, output = MagicMock(), MagicMock(decisions=[MagicMock(flags=0, clicks=4)])
+    run, output = MagicMock(), MagicMock(decisions=[Decision(0, 0, 0, 0, 0, 4, 1, 1, 0, 0.9, 0)])
     run.core.guard.health.present = present
     dark.look(run, output)
     assert dark.light.take.called == (not present)

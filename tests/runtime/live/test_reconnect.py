@@ -24,7 +24,6 @@ from pans.runtime.link.base import open_link
 from pans.runtime.live import Observers, Recovery, RunOptions, run_live
 from pans.runtime.live.reconnect import MOST_FRUITLESS
 from pans.runtime.record import Recorder, read_recording, replay
-from pans.runtime.turn.system import offered
 from pans.runtime.wire.messages import (
     AckStatus,
     CommandMessage,
@@ -99,15 +98,14 @@ def test_the_frames_of_attempts_that_failed_are_counted(mode: str) -> None:
     assert result.decoder["frames"] == frames.total()
 
 
-@pytest.mark.parametrize("turn", ["python", "auto"])
-def test_what_comes_before_arm_is_no_part_of_the_run(tmp_path: Path, turn: str) -> None:
+def test_what_comes_before_arm_is_no_part_of_the_run(tmp_path: Path) -> None:
     """The link breaks within the last object: the connection that is found again is told to stop, and never armed."""
     profile, bundle, plan = small_setup()
     clock = DeviceClock(profile.clock.tick_hz)
     device = Instrument(profile, load_scene("uniform"), seed=1, power_on_tick=clock.tick_at(START_NS))
     first = VirtualLink(device, clock, "sim:stop")
     core = Core(plan, make_decider(bundle, backend="table"), 1, plan.cycles_per_object)
-    config = RunOptions(n_cycles=plan.cycles_per_object, deadline_us=1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=plan.cycles_per_object, deadline_us=1e9, realtime=False)
 
     def broken(run: Any, output: Any) -> None:
         if output.block_end_tick is not None and not run.reconnects:
@@ -147,12 +145,12 @@ class SlowArm:
         return self
 
 
-def recorded_run(path: Path, link: Any, mode: str, turn: str, url: str = "") -> tuple[Any, Any, Any]:
+def recorded_run(path: Path, link: Any, mode: str, url: str = "") -> tuple[Any, Any, Any]:
     """A run of FEW cycles over `link`, with the usual way back: its result, its recording and a replay."""
     profile, bundle, plan = small_setup(mode)
     backend = "table" if bundle.automaton is None else "automaton"
     core = Core(plan, make_decider(bundle, shots=1, backend=backend), 1, FEW)
-    config = RunOptions(n_cycles=FEW, deadline_us=1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=FEW, deadline_us=1e9, realtime=False)
     facts = {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": backend, "drive": plan.drive, "confidence": 0.0}
     with Recorder(path, {"config": facts}) as recorder:
         result = run_live(link, profile, bundle, plan, core, config, recorder, Recovery.of(link, url, 60.0))
@@ -168,14 +166,11 @@ def small_link(mode: str) -> VirtualLink:
     return VirtualLink(Instrument(profile, scene, seed=1, power_on_tick=clock.tick_at(START_NS)), clock, "sim:small")
 
 
-@pytest.mark.parametrize(
-    ("mode", "turn"),
-    [("sequential", "python"), ("sequential", "compiled"), ("parallel", "compiled"), ("host-driven", "python")],
-)
-def test_an_arm_that_comes_too_late_is_sent_again_with_a_longer_lead(tmp_path: Path, mode: str, turn: str) -> None:
+@pytest.mark.parametrize("mode", ["sequential", "parallel", "host-driven"])
+def test_an_arm_that_comes_too_late_is_sent_again_with_a_longer_lead(tmp_path: Path, mode: str) -> None:
     link = SlowArm(small_link(mode), 0.25)
-    result, recording, again = recorded_run(tmp_path / "run.pansrec", link, mode, turn)
-    assert (result.ended, result.reconnects, result.turn.taken, link.sent) == ("completed", 0, turn, 3)
+    result, recording, again = recorded_run(tmp_path / "run.pansrec", link, mode)
+    assert (result.ended, result.reconnects, link.sent) == ("completed", 0, 3)
     assert (result.contradictions, result.stream["lost_exposures"], result.tally.abstained) == ({}, 0, 0)
     events = list(recording.events())
     assert [event["lead_ms"] for event in events if event["kind"] == "armed_too_late"] == [200, 400]
@@ -196,20 +191,18 @@ class Strict(Instrument):
         super()._execute(command)
 
 
-@pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
 @pytest.mark.parametrize("mode", ["sequential", "parallel", "device-driven", "host-driven"])
-def test_a_call_that_goes_on_arms_again_too(tmp_path: Path, mode: str) -> None:
-    """At real pace, where a thread of its own reads the descriptor."""
+def test_an_arm_is_sent_again_at_real_pace(tmp_path: Path, mode: str) -> None:
     profile, _, _ = small_setup(mode)
     clock = DeviceClock(profile.clock.tick_hz)
     device = Strict(profile, load_scene("uniform"), seed=1, power_on_tick=clock.tick_at(time.perf_counter_ns()))
     port, stopped = open_port("tcp:127.0.0.1:0"), threading.Event()
     thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
     thread.start()
-    result, recording, again = recorded_run(tmp_path / "run.pansrec", open_link(port.url), mode, "compiled", port.url)
+    result, recording, again = recorded_run(tmp_path / "run.pansrec", open_link(port.url), mode, port.url)
     stopped.set()
     thread.join(10)
-    assert (result.ended, result.turn.taken, again.as_recorded) == ("completed", "compiled", True)
+    assert (result.ended, again.as_recorded) == ("completed", True)
     late = [event["lead_ms"] for event in recording.events() if event["kind"] == "armed_too_late"]
     assert late[:2] == [200, 400]
     assert (result.contradictions, result.stream["lost_exposures"]) == ({}, 0)
@@ -217,7 +210,7 @@ def test_a_call_that_goes_on_arms_again_too(tmp_path: Path, mode: str) -> None:
 
 def test_a_host_that_is_always_too_late_ends_with_the_refusal(tmp_path: Path) -> None:
     link = SlowArm(small_link("sequential"), 5.0)
-    result, _, _ = recorded_run(tmp_path / "run.pansrec", link, "sequential", "auto")
+    result, _, _ = recorded_run(tmp_path / "run.pansrec", link, "sequential")
     assert result.ended.startswith("the device refused") or "TOO_LATE" in result.ended
     assert (result.tally.decisions, result.reconnects, link.sent) == (0, 1, 7)  # the last one in a new session
 
@@ -246,10 +239,9 @@ class NewEpochs:
         return self
 
 
-@pytest.mark.parametrize("turn", ["python", "compiled"])
-def test_a_device_that_always_restarts_is_given_up(tmp_path: Path, turn: str) -> None:
+def test_a_device_that_always_restarts_is_given_up(tmp_path: Path) -> None:
     link = NewEpochs(small_link("sequential"), 2)  # a mark and a block, of an object that takes many
-    result, recording, again = recorded_run(tmp_path / "run.pansrec", link, "sequential", turn)
+    result, recording, again = recorded_run(tmp_path / "run.pansrec", link, "sequential")
     assert (result.link_lost, result.reconnects, link.opened) == (True, MOST_FRUITLESS, MOST_FRUITLESS + 1)
     assert f"lost {MOST_FRUITLESS + 1} times in a row without one whole decision" in result.ended
     assert "restarted" in result.ended
@@ -259,7 +251,7 @@ def test_a_device_that_always_restarts_is_given_up(tmp_path: Path, turn: str) ->
 
 def test_a_device_that_restarts_between_decisions_is_not_given_up(tmp_path: Path) -> None:
     link = NewEpochs(small_link("sequential"), 60)
-    result, _, again = recorded_run(tmp_path / "run.pansrec", link, "sequential", "python")
+    result, _, again = recorded_run(tmp_path / "run.pansrec", link, "sequential")
     assert not result.link_lost
     assert result.reconnects > 2 * MOST_FRUITLESS
     assert again.as_recorded

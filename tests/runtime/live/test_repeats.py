@@ -21,11 +21,9 @@ from pans.runtime import SHIPPED
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.link.base import open_link
 from pans.runtime.live import Observers, RunOptions, RunResult, run_live
-from pans.runtime.live.config import COMPILED, PYTHON
 from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import Recorder, Recording, read_recording, replay
 from pans.runtime.report.summary import contradictions_of, find_faults
-from pans.runtime.turn.system import offered
 from pans.runtime.wire.framing import FrameDecoder, encode_frame
 from pans.runtime.wire.messages import MessageType
 from pans.runtime.wire.session import STREAM_TYPES
@@ -92,15 +90,13 @@ class Repeating(Instrument):
         return self.repeats.spoil(super().step(tick, data))
 
 
-def session(
-    path: Path, mode: str, turn: str, how: int, seed: int, often: float
-) -> tuple[RunResult, Recording, Repeats]:
+def session(path: Path, mode: str, how: int, seed: int, often: float) -> tuple[RunResult, Recording, Repeats]:
     one, (result, repeats) = fault_grid.Case.of(mode, FRAMES), (None, Repeats(how, seed, often))
     clock = DeviceClock(one.profile.clock.tick_hz)
     device = Repeating(one.profile, one.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
     device.repeats = repeats
     flow = FlowRun(one.core, None) if isinstance(one.core, FlowCore) else None
-    config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False)
     header = one.recorded()
     observers = Observers(prepared=lambda run: None if flow is None else flow.prepared(run))
     with Recorder(path, {"config": header}, overwrite=True) as recorder:
@@ -125,15 +121,13 @@ def wrong_verdicts(folder: Path, sessions: int, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("pans.runtime.link.connection.secrets", SimpleNamespace(randbelow=random.Random(1).randrange))
     modes = fault_grid.MODES
     for number in range(sessions):
-        mode, turn = modes[number % len(modes)], (PYTHON, COMPILED)[number // len(modes) % 2]
-        if turn == COMPILED and (mode.startswith("host") or mode.endswith(("counts", "detectors"))):
-            turn = PYTHON  # there is no compiled turn of these in virtual time
+        mode = modes[number % len(modes)]
         dice = random.Random(number)
         how, often = dice.randrange(1, len(HOW)), dice.choice((0.01, 0.1, 1.0))
-        result, recording, repeats = session(folder / "run.pansrec", mode, turn, how, number, often)
-        clean, undisturbed, _ = session(folder / "clean.pansrec", mode, turn, CLEAN, number, 0.0)
+        result, recording, repeats = session(folder / "run.pansrec", mode, how, number, often)
+        clean, undisturbed, _ = session(folder / "clean.pansrec", mode, CLEAN, number, 0.0)
         kinds[how if repeats.changed or how == EQUAL else EQUAL] += 1
-        assert (result.turn.taken, result.ended) == (turn, "completed")
+        assert result.ended == "completed"
         faults = [words for words in find_faults(result, 0, aborts_are_faults=False) if "contradict" in words]
         same = recording.decisions().tobytes() == undisturbed.decisions().tobytes()
         told = contradictions_of(result)
@@ -141,11 +135,10 @@ def wrong_verdicts(folder: Path, sessions: int, monkeypatch: pytest.MonkeyPatch)
         labels = same or (repeats.changed and how in (CHANGED_FIRST, MIXED))
         counted = repeats.changed or result.stream["repeated"] <= repeats.equal
         if not (verdict and labels and counted):
-            wrong.append(f"{number}: {mode}, {turn}, {HOW[how]}, {repeats.changed} changed: {told}, same {same}")
+            wrong.append(f"{number}: {mode}, {HOW[how]}, {repeats.changed} changed: {told}, same {same}")
     return wrong, kinds
 
 
-@pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
 def test_no_session_is_judged_wrongly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong, kinds = wrong_verdicts(tmp_path, 12, monkeypatch)  # one of each mode
     assert wrong == []
@@ -153,20 +146,15 @@ def test_no_session_is_judged_wrongly(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
 def test_no_session_of_many_is_judged_wrongly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong, kinds = wrong_verdicts(tmp_path, 200, monkeypatch)
     assert wrong == []
     assert min(kinds[1:]) > 20
 
 
-@pytest.mark.parametrize(
-    "turn", [PYTHON, pytest.param(COMPILED, marks=pytest.mark.skipif(bool(offered()), reason="none here"))]
-)
 @pytest.mark.parametrize(("how", "code"), [(EQUAL, 0), (CHANGED_FIRST, 4), (CHANGED_LATER, 4)])
 @pytest.mark.parametrize("parts", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_exit_code_and_each_file_tell(
-    turn: str,
     how: int,
     code: int,
     parts: bool,
@@ -178,9 +166,8 @@ def test_the_exit_code_and_each_file_tell(
     repeats, step = Repeats(how, 1, 0.2), Instrument.step
     monkeypatch.setattr(Instrument, "step", lambda device, tick, data: repeats.spoil(step(device, tick, data)))
     device = "sim:dmd-spad?scene=fashion200&seed=1&pace=fast"
-    words = ("--decisions", 400, "--turn", turn, "--out", tmp_path / "run", *(("--rotate-mb", 0.02) if parts else ()))
+    words = ("--decisions", 400, "--out", tmp_path / "run", *(("--rotate-mb", 0.02) if parts else ()))
     told = json_of(capsys, "run", SHIPPED / "fashion-adaptive.pans", "--device", device, *words, code=code)
-    assert told["realtime"]["turn"].startswith(turn)
     n = told["stream"]["repeats_differing"]
     assert (told["verdict"], n > 0) == ("PASS" if code == 0 else "FAIL", code != 0)
     assert told["stream"]["repeated"] > 10
@@ -199,10 +186,8 @@ def test_the_exit_code_and_each_file_tell(
     assert len(found) > 3 or not parts
 
 
-@pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
 @pytest.mark.parametrize("how", [EQUAL, CHANGED_FIRST, CHANGED_LATER])
-def test_a_call_that_goes_on_compares_too(how: int, tmp_path: Path) -> None:
-    """At real pace, in a thread that reads a descriptor."""
+def test_repeats_are_compared_at_real_pace(how: int, tmp_path: Path) -> None:
     one, repeats = fault_grid.Case.of("device-driven", 2000), Repeats(how, 1, 0.05)
     clock = DeviceClock(one.profile.clock.tick_hz)
     device = Repeating(one.profile, one.scene, seed=1, power_on_tick=clock.tick_at(time.perf_counter_ns()))
@@ -210,14 +195,14 @@ def test_a_call_that_goes_on_compares_too(how: int, tmp_path: Path) -> None:
     port, stopped = open_port("tcp:127.0.0.1:0"), threading.Event()
     thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
     thread.start()
-    config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=COMPILED)
+    config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False)
     with Recorder(tmp_path / "run.pansrec", {"config": one.recorded()}) as recorder:
         result = run_live(open_link(port.url), one.profile, one.bundle, one.plan, one.core, config, recorder)
         recorder.close({})
     stopped.set()
     thread.join(10)
     again = replay(read_recording(tmp_path / "run.pansrec"), one.bundle)
-    assert (result.ended, result.turn.taken, again.as_recorded) == ("completed", COMPILED, True)
+    assert (result.ended, again.as_recorded) == ("completed", True)
     assert (repeats.changed > 10, repeats.equal > 10) == (how != EQUAL, how == EQUAL)
     assert bool(contradictions_of(result)) == (how != EQUAL)
     assert again.contradictions.get("repeat", 0) == result.stream["repeats_differing"]

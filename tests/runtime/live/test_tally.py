@@ -6,11 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numbered_rows import made, some_verdicts
 
-from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag, RowDecisions
-from pans.runtime.core.stream_arrays import MarkArrays
-from pans.runtime.core.stream_kernels import MARK_SLOTS
+from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag
 from pans.runtime.live.tally import RunTally
 
 NAN = float("nan")
@@ -20,12 +17,16 @@ def decision(obj: int, trial: int, label: int, truth: int, clicks: int = 4, flag
     return Decision(0, 0, 0, obj, trial, clicks, label, truth, flags, 0.9, 0)
 
 
+def add(tally: RunTally, one: Decision, photons: float) -> None:
+    tally.add_rows(np.array([one], DECISION_DTYPE), np.array([photons], np.float32))
+
+
 def test_spreads_over_trials_and_objects_are_different_things() -> None:
     right = np.array([[1, 1, 0], [1, 0, 0], [1, 1, 1], [0, 0, 0]])  # objects x trials
     tally = RunTally(2, 1)
     for obj, row in enumerate(right):
         for trial, value in enumerate(row):
-            tally.add(decision(obj, trial, 1 if value else 0, 1), 6.0)
+            add(tally, decision(obj, trial, 1 if value else 0, 1), 6.0)
     summary = tally.figures()
     assert summary.accuracy == pytest.approx(right.mean())
     assert summary.accuracy_std_trials == pytest.approx(right.mean(axis=0).std(ddof=1))
@@ -37,8 +38,8 @@ def test_spreads_over_trials_and_objects_are_different_things() -> None:
 
 def test_an_abstention_is_not_right_and_stands_in_no_column() -> None:
     tally = RunTally(2, 1)
-    tally.add(decision(0, 0, 1, 1), NAN)
-    tally.add(decision(0, 1, NO_LABEL, 1, flags=int(DecisionFlag.ABSTAINED | DecisionFlag.GAP)), NAN)
+    add(tally, decision(0, 0, 1, 1), NAN)
+    add(tally, decision(0, 1, NO_LABEL, 1, flags=int(DecisionFlag.ABSTAINED | DecisionFlag.GAP)), NAN)
     assert tally.accuracy == 0.5
     assert tally.abstained == 1
     assert tally.confusion.sum() == 1
@@ -47,7 +48,7 @@ def test_an_abstention_is_not_right_and_stands_in_no_column() -> None:
 
 def test_without_truth_there_is_no_accuracy() -> None:
     tally = RunTally(2, 2)
-    tally.add(decision(0, 0, 1, -1), 3.0)
+    add(tally, decision(0, 0, 1, -1), 3.0)
     summary = tally.figures()
     assert summary.accuracy is None
     assert summary.accuracy_std_trials is None
@@ -63,7 +64,7 @@ def test_any_number_of_objects_fits_and_changes_no_figure(monkeypatch: pytest.Mo
         tally = RunTally(2, 1)
         for obj, row in enumerate(right):
             for trial, value in enumerate(row):
-                tally.add(decision(obj, trial, 1 if value else 0, 1), 6.0)
+                add(tally, decision(obj, trial, 1 if value else 0, 1), 6.0)
         assert len(tally._objects) <= most
         summaries.append(tally.figures())
     whole, summed = summaries
@@ -77,16 +78,13 @@ def test_an_object_that_is_shown_again_is_the_same_object() -> None:
     right = rng.random((4, 10)) < 0.7  # four showings of each of ten objects
     tally = RunTally(2, 1, distinct=10)
     for number, value in enumerate(right.ravel()):
-        tally.add(decision(number, 0, int(value), 1), 1.0)
+        add(tally, decision(number, 0, int(value), 1), 1.0)
     summary = tally.figures()
     assert (summary.objects, summary.decisions) == (10, 40)
     assert summary.accuracy_stderr_objects == pytest.approx(right.mean(axis=0).std(ddof=1) / np.sqrt(10))
 
 
-def test_decisions_in_rows_count_as_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "pans.runtime.live.tally.RUNS_AT_ONCE", 16
-    )  # more objects than that, and more trials than there is room for
+def test_many_rows_count_as_one_by_one() -> None:
     rng = np.random.default_rng(3)
     n, shots = 3000, 3
     rows = np.zeros(n, DECISION_DTYPE)
@@ -98,47 +96,19 @@ def test_decisions_in_rows_count_as_one_by_one(monkeypatch: pytest.MonkeyPatch) 
     rows["flags"] = rng.choice(
         [0, int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED)], n
     )
-    photons = rng.random(MARK_SLOTS).astype(np.float32)
-    photons[::7] = np.nan
-    objects = np.where(np.arange(MARK_SLOTS) % 5 > 0, np.arange(MARK_SLOTS), -1)
+    photons = np.where(rng.random(n) < 0.2, np.nan, rng.random(n)).astype(np.float32)
     one, many = RunTally(4, shots, distinct=50), RunTally(4, shots, distinct=50)
-    many.warm_up(MarkArrays(objects, np.zeros(MARK_SLOTS, np.int16), photons), 2)
-    for row in rows.tolist():
-        known = objects[row[3]] == row[3]
-        one.add(Decision(*row), float(photons[row[3]]) if known else NAN)
-    for part in np.split(rows, [700, 701, 2000]):
-        many.add_many(RowDecisions(part), MarkArrays(objects, np.zeros(MARK_SLOTS, np.int16), photons))
-    assert many.figures() == one.figures()
+    for row, light in zip(rows, photons):
+        one.add_rows(row[None], light[None])
+    for part, light in zip(np.split(rows, [700, 701, 2000]), np.split(photons, [700, 701, 2000])):
+        many.add_rows(part, light)
+    assert many.figures() == replace(one.figures(), photons_mean=pytest.approx(one.figures().photons_mean, rel=1e-12))
     assert many.confusion.tolist() == one.confusion.tolist()
     assert (many.unsure, many.exposures, many.known, many.right) == (one.unsure, one.exposures, one.known, one.right)
 
 
-def test_numbered_decisions_count_as_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pans.runtime.live.tally.RUNS_AT_ONCE", 16)
-    rng, shots = np.random.default_rng(4), 2
-    verdicts = some_verdicts(rng, 40, 4)
-    photons = rng.random(MARK_SLOTS).astype(np.float32)
-    photons[::7] = np.nan
-    marks = MarkArrays(
-        np.where(np.arange(MARK_SLOTS) % 5 > 0, np.arange(MARK_SLOTS), -1), np.zeros(0, np.int16), photons
-    )
-    one, many = RunTally(4, shots, distinct=50), RunTally(4, shots, distinct=50)
-    index = 0
-    for _ in range(3):
-        runs = []
-        for number in np.sort(rng.integers(0, 90, 60)).tolist():
-            count, shot = int(rng.integers(1, 300)), int(rng.integers(0, 50)) * shots
-            runs.append((index, 0, 0, number, shot, count, 1, 1, shots, number % 6 - 1, 0))
-            index += count
-        n = sum(run[5] for run in runs)
-        decided = made(verdicts, rng.integers(0, 40, n).astype(np.uint32), runs)
-        if not many.decisions:
-            many.warm_up(marks, 2, decided)
-            many = RunTally(4, shots, distinct=50)
-        many.add_many(decided, marks)
-        for row in decided.rows.tolist():
-            one.add(Decision(*row), float(photons[row[3]]) if marks.objects[row[3]] == row[3] else NAN)
-    assert many.figures() == one.figures()
-    assert many.confusion.tolist() == one.confusion.tolist()
-    assert 0 < many.unsure < many.abstained
-    assert (many.unsure, many.exposures, many.known, many.right) == (one.unsure, one.exposures, one.known, one.right)
+def test_an_ambiguous_decision_counts_as_abstained_and_as_unsure() -> None:
+    tally = RunTally(2, 1)
+    add(tally, decision(0, 0, NO_LABEL, 1, flags=int(DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED)), 1.0)
+    add(tally, decision(0, 1, NO_LABEL, 1, flags=int(DecisionFlag.GAP | DecisionFlag.ABSTAINED)), 1.0)
+    assert (tally.figures().abstained, tally.unsure, tally.accuracy) == (2, 1, 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import struct
 import zlib
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numbered_rows import made, some_verdicts
 
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError
@@ -138,58 +136,6 @@ def test_more_verdicts_than_have_numbers() -> None:
     assert b"".join(reader.rows(block, "a log").tobytes() for block in blocks) == rows.tobytes()
     assert encoder.hexdigest() == reader.hexdigest() == decision_log_sha256(rows)
     assert len({row.tobytes() for row in rows["counts_crc"]}) > LONG_VERDICT
-
-
-@settings(deadline=None, max_examples=100)
-@given(data=st.data(), cuts=st.lists(st.integers(0, 80), max_size=3), n_verdicts=st.sampled_from([1, 5, 40]))
-def test_numbered_decisions_make_the_log_of_their_rows(data: st.DataObject, cuts: list[int], n_verdicts: int) -> None:
-    """Runs that go on with the one before or not, that are cut by blocks, and rows among them, by the same verdicts or others."""
-    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
-    runs: list[tuple[Any, ...]] = []
-    for _ in range(data.draw(st.integers(1, 6))):
-        count, goes_on = data.draw(st.integers(1, 12)), data.draw(st.booleans()) and bool(runs)
-        steps = (
-            runs[-1][6:9] if goes_on else tuple(data.draw(st.sampled_from([0, 1, 100, 2**32 - 1])) for _ in range(3))
-        )
-        place = [data.draw(edges) for _ in range(3)]
-        shot, whose = data.draw(st.sampled_from([0, 5, 2**24])), (data.draw(small), data.draw(st.integers(-1, 1)))
-        if goes_on:
-            *place, number, shot, many = runs[-1][:6]
-            place = [(at + many * step) % 2**64 for at, step in zip(place, (1, *steps))]
-            shot, whose = (shot + many * steps[2]) % 2**32, (number, runs[-1][9])
-        steps = (*steps[:2], steps[2] % 2**8)
-        runs.append((*place, whose[0], shot, count, *steps, whose[1], 0))
-    n = sum(run[5] for run in runs)
-    numbered = made(some_verdicts(rng, n_verdicts, 3), rng.integers(0, n_verdicts, n).astype(np.uint32), runs)
-    one, many_at_once = LogEncoder(), LogEncoder()
-    one.block(numbered.rows[:3])
-    many_at_once.block(numbered.rows[:3])
-    for first, stop in itertools.pairwise([0, *sorted(min(cut, n) for cut in cuts), n]):
-        parts = many_at_once._take_numbered(numbered, first, stop)
-        assert record_log._payload(parts) == one.block(numbered.rows[first:stop])
-    assert many_at_once.hexdigest() == one.hexdigest()
-
-
-def test_numbered_decisions_fill_many_blocks(tmp_path: Path) -> None:
-    rng, n = np.random.default_rng(2), 3 * record_log.BLOCK_ROWS
-    runs = [(7 + at, 100 * at, at, at // 9000, at % 9000, 1000, 100, 1, 1, 4, 0) for at in range(0, n - 152, 1000)]
-    runs.append((7 + n - 152, 5, 5, 9, 0, 152, 100, 1, 1, -1, 0))
-    numbered = made(some_verdicts(rng, 1024, 10), rng.integers(0, 1024, n).astype(np.uint32), runs)
-    rows = numbered.rows.copy()
-    for name, many in (("rows", rows), ("numbered", numbered)):
-        with Recorder(tmp_path / name, {"created_utc": "now"}) as recorder:
-            recorder.prepare(numbered)
-            recorder.add_decision(tuple(rows[0].item()))
-            recorder.add_decisions(many)
-            recorder.add_decisions(many)
-            recorder.close({})
-    assert (tmp_path / "numbered").read_bytes() == (tmp_path / "rows").read_bytes()
-    found = read_recording(tmp_path / "numbered")
-    assert found.decisions().tobytes() == rows[:1].tobytes() + 2 * rows.tobytes()
-    assert [numbered[-1], numbered[3], *numbered[5:8], *numbered[8:2:-3]] == [
-        tuple(rows[at].item()) for at in (-1, 3, 5, 6, 7, 8, 5)
-    ]
-    assert (numbered.first, len(numbered), numbered[4:2]) == (7, n, [])
 
 
 def block(runs: list[tuple[Any, ...]], verdicts: int, codes: list[int]) -> bytes:

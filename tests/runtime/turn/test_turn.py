@@ -1,4 +1,4 @@
-"""The compiled turn: the same decisions, recording and figures as Python's turn; how it ends, and what it leaves to Python.
+"""The kernel in whole runs and by itself: how a call ends, and what it leaves to Python.
 
 Streams with faults go through it in tests/runtime/core (tests/oracles/streams.py), whole runs with faults in the fault grid.
 """
@@ -30,22 +30,19 @@ from tree import ROOT
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import UsageError
 from pans.runtime.link.base import open_link
 from pans.runtime.link.connection import Connection
 from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_live
-from pans.runtime.live.compiled import CompiledTurns
 from pans.runtime.live.drive import HostDriver, WalkPlace
-from pans.runtime.live.loop import NO_OBSERVERS, choose_turn
+from pans.runtime.live.loop import NO_OBSERVERS
 from pans.runtime.record import Recorder, read_recording, replay
-from pans.runtime.turn import kernels, shows, system
+from pans.runtime.turn import kernels, shows
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn.engine import Limits, Turn
 from pans.runtime.turn.streaming import StreamCore
@@ -55,7 +52,6 @@ from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, Ack, Opcode, decode_command, encode_ack, pack_body
 from pans.runtime.wire.session import HostSession
 
-pytestmark = pytest.mark.skipif(bool(system.offered()), reason="no compiled turn here")
 LONG_NS = 10_000_000_000
 OBJECTS = 12
 
@@ -79,10 +75,10 @@ class Served:
         self._thread.join(10)
 
 
-def recorded(setup: Any, link: Any, path: Path, turn: str, observers: Any = NO_OBSERVERS) -> tuple[RunResult, Any]:
+def recorded(setup: Any, link: Any, path: Path, observers: Any = NO_OBSERVERS) -> tuple[RunResult, Any]:
     backend = "table" if setup.bundle.automaton is None else "automaton"
     decider = make_decider(setup.bundle, shots=1, backend=backend)
-    config = RunOptions(n_cycles=OBJECTS * setup.plan.cycles_per_object, deadline_us=1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=OBJECTS * setup.plan.cycles_per_object, deadline_us=1e9, realtime=False)
     core = Core(setup.plan, decider, 1, config.n_cycles)
     driven = {"drive": setup.plan.drive, "confidence": 0.0}
     facts = {"config": {"shots": 1, "tick_hz": setup.profile.clock.tick_hz, "backend": backend, **driven}}
@@ -100,9 +96,10 @@ def test_a_run_at_real_pace(mode: str, listen: str, tmp_path: Path) -> None:
     setup = Served(mode, "tcp:127.0.0.1:0" if listen == "usb" else listen)
     if listen == "usb":
         setup.url = f"simusb:{setup.url.removeprefix('serial:')}"
-    result, recording = recorded(setup, open_link(setup.url), tmp_path / "a.pansrec", "compiled")
+    result, recording = recorded(setup, open_link(setup.url), tmp_path / "a.pansrec")
     setup.close()
-    assert (result.ended, result.turn.taken, bool(result.turn.why)) == ("completed", "compiled", listen == "usb")
+    assert result.ended == "completed"
+    assert ("no descriptor" in result.realtime["turn"]) == (listen == "usb")
     assert result.tally.decisions == OBJECTS * setup.plan.shots_per_cycle * setup.plan.cycles_per_object
     assert not result.contradictions  # every frame is an answer or was taken
     again = replay(recording, setup.bundle)
@@ -130,7 +127,7 @@ def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest
 
         monkeypatch.setattr(owner, name, noted)
     setup = Served("sequential", "tcp:127.0.0.1:0")
-    recorded(setup, open_link(setup.url), tmp_path / "a.pansrec", "compiled")
+    recorded(setup, open_link(setup.url), tmp_path / "a.pansrec")
     setup.close()
     armed = told.index("run")
     assert told[armed:].count("probe") > 0
@@ -140,21 +137,24 @@ def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("acts", [True, False])
-@pytest.mark.parametrize("mode", ["sequential", "parallel"])
-def test_virtual_runs_are_those_of_the_python_turn(mode: str, acts: bool, tmp_path: Path) -> None:
-    """A watcher that acts is told read by read, and nothing differs; else many reads are settled with one state of the clock model."""
+@pytest.mark.parametrize("mode", ["sequential", "parallel", "device-driven", "host-driven"])
+def test_a_core_alone_leaves_the_same(mode: str, acts: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In virtual time, with the kernel and without: decisions, messages and figures; of a watcher that acts also all times."""
     profile, bundle, plan = small_setup(mode)
     found = []
-    for turn in ("python", "compiled"):
+    for alone in (True, False):
+        if alone:
+            monkeypatch.setattr(Core, "takes", False)
+        else:
+            monkeypatch.undo()
         images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
         scene = scene_from_arrays("turn", images, np.arange(6) % 3, ("a", "b", "c"))
         clock = DeviceClock(profile.clock.tick_hz)
         device = Instrument(profile, scene, seed=3, power_on_tick=clock.tick_at(START_NS))
         setup = SimpleNamespace(profile=profile, bundle=bundle, plan=plan)
         observers = Observers(lambda run, output: None, acts=acts)
-        result, recording = recorded(setup, VirtualLink(device, clock, "sim:turn"), tmp_path / turn, turn, observers)
-        assert result.turn.taken == turn
-        found.append((result, recording))
+        link = VirtualLink(device, clock, "sim:turn")
+        found.append(recorded(setup, link, tmp_path / str(alone), observers))
     (ours, ours_recorded), (theirs, theirs_recorded) = found
     assert ours.tally.figures() == theirs.tally.figures()
     np.testing.assert_array_equal(ours.tally.confusion, theirs.tally.confusion)
@@ -249,8 +249,7 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
     core = Core(setup.plan, make_decider(setup.bundle, backend="automaton"), 1, 0)
     core.warm_up()
     core.begin(0, 0)
-    steps = core.bulk_steps(SESSION)
-    assert steps is not None
+    steps = core.steps(SESSION)
     drive = HostDriver(core, WalkPlace(setup.plan, setup.plan.automaton)).arrays(SESSION)
     turn = Turn(steps, BulkDecoder(), drive)
     ours, theirs = socket.socketpair()
@@ -269,34 +268,6 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
         command = decode_command(frame.payload)
         assert (frame.session, command.command_id, command.opcode) == (SESSION, 5, Opcode.SHOW)
         assert unpack_show(command.body)[:2] == (int(setup.plan.slot_pattern[0] == DARK_PATTERN), 0)
-
-
-def test_a_connection_that_was_never_armed_is_stopped_by_python() -> None:
-    """A run that is ended while it reconnects: the turns still hold the link before, whose descriptor may be another file's by now."""
-    asked: list[float] = []
-    connection = SimpleNamespace(pump=lambda poll_s: asked.append(poll_s) or [], known_clock=lambda: None)
-    run = SimpleNamespace(connection=connection, timing=SimpleNamespace(histograms=()))
-    core = SimpleNamespace(guard=None)
-    turns = CompiledTurns(run, core, prompt=False)  # type: ignore[arg-type]
-    assert turns.last(0.5) == []
-    assert asked == [0.5]
-
-
-def test_which_turn_is_taken_and_why() -> None:
-    _, bundle, plan = small_setup("host-driven")
-    core = Core(plan, make_decider(bundle, backend="automaton"), 1, 0)
-    core.warm_up()
-    link = open_sim("sim:ideal?scene=uniform&pace=fast")
-    assert choose_turn("python", core, link, drives=False).words() == "python: asked for"
-    assert choose_turn("auto", core, link, drives=False).taken == "compiled"
-    assert "the host names each state" in choose_turn("auto", core, link, drives=True).words()
-    with pytest.raises(UsageError, match="--turn compiled: in virtual time"):
-        choose_turn("compiled", core, link, drives=True)
-    plain = SimpleNamespace(virtual=False, now_ns=time.perf_counter_ns)
-    read = choose_turn("auto", core, plain, drives=True)  # type: ignore[arg-type]
-    assert read.words() == "compiled: Python reads the link, which has no descriptor"
-    other = SimpleNamespace(virtual=False, fileno=lambda: 0, now_ns=lambda: 7)
-    assert "clock of its own" in choose_turn("auto", core, other, drives=True).why  # type: ignore[arg-type]
 
 
 def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:

@@ -1,4 +1,4 @@
-"""The streaming core against the plain one: the same bytes give the same rows, counts and events, whatever happens to them."""
+"""Streams of frames through the kernel against the core alone: the same rows, counts and events, whatever happens to them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from plans import parallel
 from streams import SESSION, compare, spoilt
 
+from pans.runtime.core import bulk_steps
 from pans.runtime.core.bulk_steps import count_crc_tables
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdicts
-from pans.runtime.turn import streaming
 from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
@@ -68,7 +68,7 @@ def test_a_clean_stream(n_features: int, shots: int, n_windows: int, backend: st
     assert (rows["label"] < 4).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_any_faults_any_cuts(data: st.DataObject) -> None:
     n_features, shots, n_windows, backend = data.draw(st.sampled_from(CASES[:3]))
@@ -79,8 +79,8 @@ def test_any_faults_any_cuts(data: st.DataObject) -> None:
 
 
 @pytest.mark.uncompiled
-def test_more_rows_than_a_batch_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streaming, "ROWS_PER_BATCH", 5)
+def test_more_rows_than_a_call_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bulk_steps, "ROWS_PER_CALL", 5)
     plan, decider = parallel(10, 8), decider_for(10, 1, "table")
     clean = frames(plan, 10, 5, np.random.default_rng(4), 3)
     assert len(compare(plan, decider, 1, [b"".join(clean)])) == 40
@@ -121,7 +121,7 @@ def test_blocks_beyond_the_plan_and_photons() -> None:
         *["contradiction"] * 2,
     ]
     assert {frame.type for _, _, others in batches for frame in others} == {MessageType.STATUS}
-    photons = streamed.photons_of(np.array([0, 1, 5]))
+    photons = streamed.core.steps(SESSION).photons_of(np.array([0, 1, 5]))
     assert photons[:2].tolist() == [2.5, 2.5]
     assert np.isnan(photons[2])
 

@@ -1,4 +1,4 @@
-"""Sequential streams through the compiled steps against the plain core: the same rows, fixed patterns or walks, whatever happens."""
+"""Sequential streams through the kernel against the core alone: the same rows, fixed patterns or walks, whatever happens."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from plans import parallel, pattern_major, shot_major, walk_plan, walked
 from streams import SESSION, click_frames, compare, spoilt
 
+from pans.runtime.core import bulk_steps
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdict, Verdicts
-from pans.runtime.turn import streaming
 from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock
@@ -95,7 +95,7 @@ def test_a_clean_stream(case: int) -> None:
     assert rows["exposures"].any() == (plan.automaton is not None)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_any_faults_any_cuts(data: st.DataObject) -> None:
     plan, decider, shots = data.draw(st.sampled_from(CASES))()
@@ -106,8 +106,8 @@ def test_any_faults_any_cuts(data: st.DataObject) -> None:
 
 
 @pytest.mark.uncompiled
-def test_more_rows_than_a_batch_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streaming, "ROWS_PER_BATCH", 5)
+def test_more_rows_than_a_call_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bulk_steps, "ROWS_PER_CALL", 5)
     rng = np.random.default_rng(4)
     for plan, decider, shots in (CASES[2](), CASES[7]()):
         clean = click_frames(plan, sent_exposures(plan, rng, 0.0), rng, 16)

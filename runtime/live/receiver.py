@@ -1,0 +1,363 @@
+"""Receives the bytes of a run: calls the kernel (turn/), then settles what came in the call, once its commands have left.
+
+`Receiver.receive` returns the outputs of what came: decisions in rows, events, the tick at which the last exposure ended. The kernel takes
+what is ordinary; any other message is given to `LiveRun.take_frame`, which continues the same state.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.core.bulk_steps import BulkSteps
+from pans.runtime.core.decision import Output, RowDecisions
+from pans.runtime.core.still import Core
+from pans.runtime.errors import LinkError
+from pans.runtime.link.base import Link, descriptor_of
+from pans.runtime.link.connection import Connection
+from pans.runtime.link.reader import count_delimiters
+from pans.runtime.record.format import Kind
+from pans.runtime.timing.clock import STEP_MARGIN_NS
+from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
+from pans.runtime.turn import rings as ring
+from pans.runtime.turn.engine import Limits, Turn
+from pans.runtime.turn.kernels import QUIET_NS, unpack_blocks
+from pans.runtime.turn.system import offered
+from pans.runtime.wire.messages import MessageType, Opcode, decode_ack, decode_frames
+from pans.runtime.wire.schema import HEADER
+from pans.runtime.wire.session import STREAM_TYPES, Refusal
+
+if TYPE_CHECKING:
+    from .run import LiveCore, LiveRun
+
+I64 = npt.NDArray[np.int64]
+
+GATHERED_BYTES = 1 << 18
+EAGER_NS = 200_000  # as link/reader.py: an answer that was asked for is waited for awake
+LEAST_NS = 100_000
+CALL_NS = 20_000_000  # a call returns at least so often: signals, the watchdog's heartbeat, other threads' wishes
+
+
+def why_fed(link: Link) -> str:
+    """Return why the kernel cannot read `link` by itself, so that it is given the bytes; "" where it can."""
+    if link.virtual:
+        return "virtual time: what was read at once is taken at once"
+    if descriptor_of(link) is None:
+        return "Python reads the link, which has no descriptor"
+    return offered() or ("" if has_host_clock(link) else "the link stamps with a clock of its own")
+
+
+def has_host_clock(link: Link) -> bool:
+    """Whether `link` has the clock that the kernel reads."""
+    before_ns, there_ns = time.perf_counter_ns(), link.now_ns()
+    return not link.virtual and before_ns <= there_ns <= time.perf_counter_ns() and not offered()
+
+
+class Receiver:
+    """The kernel's calls of `run`, across reconnections: `prepare` before each ARM, then `receive` again and again.
+
+    With `prompt`, a call ends behind the first bytes that gave a decision, for a watcher that acts.
+    """
+
+    def __init__(self, run: LiveRun, core: LiveCore, *, prompt: bool) -> None:
+        self._run, self._core, self._prompt = run, core, prompt
+        self._turn: Turn | None = None
+        self._attached: Connection | None = None
+        self._fd: int | None = None
+        self._stamps_itself = True  # whether the kernel's times are the link's
+        self._asked = False  # what Python sent of a call is about to be answered
+        self._gives_up = False  # nothing is sent any more
+
+    def next_id(self) -> int:
+        """Let a call that is under way end, from any thread; return the id that follows those of the commands that it has sent."""
+        if self._turn is None:
+            return 0
+        self._turn.stop()
+        return int(self._turn.control[ring.NEXT_ID])
+
+    def prepare(self) -> None:
+        """Attach the kernel to the run's present connection, once; kernels are compiled or loaded."""
+        run = self._run
+        if self._attached is run.connection:
+            return
+        self._attached = run.connection
+        nonce, bulk = run.connection.session.nonce, run.connection.decoder.bulk
+        assert bulk is not None
+        drive = None if run.driver is None else run.driver.arrays(nonce)
+        self._turn = Turn(self._core.steps(nonce), bulk, drive)
+        self._turn.warm_up()
+        self._warm_up(self._turn)
+        link = run.connection.link
+        self._fd = None if why_fed(link) else descriptor_of(link)
+        self._stamps_itself = has_host_clock(link)
+
+    def _warm_up(self, turn: Turn) -> None:
+        """Compile or load what settles a call."""
+
+    def receive(self, poll_s: float) -> list[Output]:
+        """Wait for bytes, decide on them and answer until something is due; return what came of it."""
+        run, outputs = self._run, list[Output]()
+        connection, turn = run.connection, self._turn
+        assert turn is not None
+        if self._fd is not None and connection.reader.lend():
+            try:
+                asked = connection.send_due()
+                self._load(turn)
+                ended = self._sent(turn, turn.run(self._fd, self._limits(eager=asked)))
+            finally:
+                connection.reader.take_back()
+            self._settle(turn, outputs)
+            if turn.counts.notes or turn.counts.arrivals:
+                self._note(turn)
+            self._continue(turn, ended, outputs, turn.run)
+            if ended == ring.GONE:
+                self._ask_why(turn)
+        elif chunks := self._gathered(poll_s):
+            self._feed(turn, chunks, outputs)
+        connection.take_pongs()
+        run.raise_broken()
+        if not outputs:
+            connection.raise_failure()
+        return outputs
+
+    def last(self, poll_s: float) -> None:
+        """Receive while the device stops: no state is named any more."""
+        if self._attached is self._run.connection:
+            self.receive(poll_s)
+        else:  # a new one, broken off before it was armed
+            self._run.connection.pump(poll_s)
+
+    def rest(self) -> None:
+        """Take what has arrived on a connection that is given up; nothing is sent."""
+        run, turn = self._run, self._turn
+        if turn is None or self._attached is not run.connection or run.connection is not run.armed:
+            run.connection.rest()
+            return
+        if chunks := run.connection.reader.rest():
+            self._gives_up = True
+            self._feed(turn, chunks, [])
+            self._gives_up = False
+
+    # -- before a call -------------------------------------------------------------------------------------------------
+
+    def _limits(self, *, eager: bool) -> Limits:
+        run = self._run
+        now_ns = run.now_ns()
+        budget = 1 if self._prompt else max(run.messages_granted, 1)
+        due_ns = min(now_ns + CALL_NS - (QUIET_NS if run.driver is not None else 0), max(run.due_ns, now_ns + LEAST_NS))
+        patience_ns = run.lateness.patience_ns
+        return Limits(due_ns, patience_ns, EAGER_NS if eager else 0, budget, run.lateness.evidence.floor_ns)
+
+    def _load(self, turn: Turn) -> None:
+        """Put what Python knows of the stream, the session and the driver where the kernel looks for it."""
+        run, control, driver = self._run, turn.control, self._run.driver
+        next_id, oldest_id, oldest_ns, waiting = run.connection.session.window
+        drives = driver is not None and not run.stops and not run.is_broken and not self._gives_up
+        control[ring.DRIVES : ring.WAITING + 1] = (drives, waiting)
+        control[ring.BLOCK_NS : ring.OLDEST_NS + 1] = (run.lateness.block_ns, next_id, oldest_id, oldest_ns)
+        if driver is not None:
+            control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1] = driver.sent
+        self._core.steps(run.connection.session.nonce)
+
+    def _gathered(self, poll_s: float) -> Sequence[tuple[int, bytes]]:
+        """Return what Python has read; of parallel frames in virtual time many reads, where nobody acts on the first."""
+        run = self._run
+        connection, link = run.connection, run.connection.link
+        chunks, self._asked = connection.chunks(poll_s, asked=self._asked), False
+        gathers = isinstance(self._core, Core) and self._core.windows.parallel and self._core.takes
+        if not (link.virtual and gathers and chunks) or self._prompt:
+            return chunks
+        left = run.messages_granted - count_delimiters(chunks[0].data)
+        return [*chunks, *connection.reader.ahead(poll_s, left, GATHERED_BYTES, run.due_ns)]
+
+    # -- after a call --------------------------------------------------------------------------------------------------
+
+    def _feed(self, turn: Turn, chunks: Sequence[tuple[int, bytes]], outputs: list[Output]) -> None:
+        """Take what Python has read."""
+        self._load(turn)
+        ended = self._sent(turn, turn.feed(chunks))
+        self._settle(turn, outputs)
+        if not self._run.connection.link.virtual:
+            self._note(turn)
+        self._continue(turn, ended, outputs, turn.feed_on)
+
+    def _continue(self, turn: Turn, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
+        """Deal with what ended a call until nothing that was read is left; no more is read."""
+        while ended in (ring.ODD, ring.FULL, ring.BROKEN):
+            if ended == ring.ODD:
+                self._take_odd(turn, outputs)
+            self._load(turn)
+            self._run.report(outputs)  # before the rings are filled anew
+            ended = self._sent(turn, again())
+            self._settle(turn, outputs)
+
+    def _take_odd(self, turn: Turn, outputs: list[Output]) -> None:
+        """Let Python take one message that is not ordinary."""
+        run, arrival_ns = self._run, turn.arrival_ns
+        connection, frame = run.connection, turn.take_odd()
+        if frame.type in STREAM_TYPES and frame.session == connection.session.nonce:
+            connection.session.heard_ns = arrival_ns
+            connection.delivered += 1
+            run.take_frame(arrival_ns, frame, outputs)
+        elif connection.sort(frame, arrival_ns):
+            run.take_frame(arrival_ns, frame, outputs)
+
+    def _sent(self, turn: Turn, ended: int) -> int:
+        """Send what is left of a command that the kernel could not send whole, all of it without a descriptor; return `ended`."""
+        if ended == ring.BROKEN:
+            last, unsent = turn.shows[-1], turn.counts.unsent
+            try:
+                self._run.connection.link.write(turn.bytes_of(last)[-unsent:])
+                last[ring.TIME], self._asked = self._run.now_ns(), True
+                if turn.control[ring.OLDEST_ID] == turn.control[ring.NEXT_ID] - 1:
+                    turn.control[ring.OLDEST_NS] = last[ring.TIME]
+            except LinkError as error:
+                self._run.note_broken(error)
+        return ended
+
+    def _ask_why(self, turn: Turn) -> None:
+        """The descriptor says that the other end is gone: the link says it in its words."""
+        link, errno = self._run.connection.link, turn.counts.errno
+        try:
+            self._run.connection.reader.wait(0.0)
+            raise LinkError(f"{link.name} went away: {os.strerror(errno) if errno else 'closed by the other end'}")
+        except LinkError as error:
+            self._run.note_broken(error)
+
+    def _note(self, turn: Turn) -> None:
+        """Give what a call has waited for, and long decisions, to the evidence of what makes work late, in the order of time."""
+        evidence, blocks = self._run.lateness.evidence, turn.blocks
+        worked = blocks[blocks[:, ring.DECIDED] - blocks[:, ring.DECODED] >= evidence.floor_ns]
+        spans = [(ended, began, -1) for began, ended in worked[:, ring.DECODED : ring.DECIDED + 1].tolist()]
+        spans += [(ended, began, asked) for began, asked, ended, _ in turn.notes.tolist()]
+        for ended, began, asked in sorted(spans) if len(worked) else spans:
+            if asked < 0:
+                evidence.worked(INFERENCE, began, ended)
+            else:
+                evidence.waited(began, (asked - began) / NS_PER_S, ended)
+        evidence.arrived(*turn.arrivals.tolist())
+
+    def _settle(self, turn: Turn, outputs: list[Output]) -> None:
+        """Account for what a call took and sent: session, driver, marks, recording, decisions."""
+        run, counts = self._run, turn.counts
+        if not counts.kept:
+            return
+        connection = run.connection
+        connection.session.heard_ns = counts.heard_ns or connection.session.heard_ns
+        connection.delivered += counts.messages
+        connection.answers += counts.answers
+        run.taken_here += counts.messages
+        if turn.control[ring.DRIVES] and (counts.shows or counts.answers):
+            self._settle_commands(turn)
+        self._stamp(turn)
+        if counts.messages > counts.steps:
+            self._settle_marks(turn)
+        self._record(turn)
+        if counts.steps:
+            self._settle_blocks(turn, outputs)
+
+    def _stamp(self, turn: Turn) -> None:
+        """Set the times of the blocks where the kernel has another clock than the link; in virtual time none passes in between."""
+        if not self._stamps_itself:
+            blocks, link = turn.blocks, self._run.connection.link
+            blocks[:, ring.DECODED : ring.RECORDED + 1] = (
+                blocks[:, ring.ARRIVAL, None] if link.virtual else link.now_ns()
+            )
+
+    def _record(self, turn: Turn) -> None:
+        """Record what a call took and sent."""
+        recorder, counts = self._run.recorder, turn.counts
+        if recorder is not None:
+            recorder.add_stamped(Kind.MESSAGES, turn.kept, turn.messages)
+            if counts.answers:
+                recorder.add_stamped(Kind.ANSWERS, turn.kept, turn.answers)
+            if counts.shows:
+                recorder.add_stamped(Kind.COMMANDS, turn.kept, turn.shows)
+
+    def _settle_marks(self, turn: Turn) -> None:
+        """Let the core know of the marks of a call."""
+        for mark in turn.marks():
+            self._core.remember(mark)
+
+    def _settle_commands(self, turn: Turn) -> None:
+        """Bring the session and the driver to where the kernel has them."""
+        run, control, shows = self._run, turn.control, turn.shows
+        first = int(control[ring.NEXT_ID]) - len(shows)
+        open_since = max(int(control[ring.OLDEST_ID]), first)
+        sent = [(number, turn.bytes_of(shows[number - first])) for number in range(open_since, first + len(shows))]
+        session = run.connection.session
+        session.continue_from(int(control[ring.OLDEST_ID]), int(control[ring.OLDEST_NS]), sent, Opcode.SHOW)
+        session.next_id = first + len(shows)
+        for span in turn.answers[turn.answers[:, ring.WHAT] == ring.REFUSAL]:
+            ack = decode_ack(turn.bytes_of(span)[HEADER.size :])
+            session.refusals.append(Refusal(ack.refused_id, ack.status, ack.text, Opcode.SHOW))
+        if run.driver is not None:
+            exposure, state = control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1].tolist()
+            run.driver.account((exposure, state), shows[:, ring.TIME] - shows[:, ring.WHAT])
+
+    def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
+        """Account for the blocks of a call and their decisions."""
+        raise NotImplementedError
+
+    def _ends_of(self, turn: Turn) -> tuple[I64, I64]:
+        """Return when each block ended on the host's clock and how uncertain that is; what lies in the future is noted."""
+        run, blocks = self._run, turn.blocks
+        ends_ns, unsure_ns = run.connection.known_clock().to_host_ns_many(blocks[:, ring.END_TICK])
+        for at in np.flatnonzero(ends_ns - unsure_ns - STEP_MARGIN_NS > blocks[:, ring.ARRIVAL]).tolist():
+            run.check_tick(int(blocks[at, ring.END_TICK]), int(blocks[at, ring.ARRIVAL]))
+        return ends_ns, unsure_ns
+
+
+class StillReceiver(Receiver):
+    """The receiver of a run with objects that stand still."""
+
+    def __init__(self, run: LiveRun, core: Core, *, prompt: bool) -> None:
+        super().__init__(run, core, prompt=prompt)
+        self._still = core
+        self._stamps, self._bits = np.ones(0, np.uint16), np.ones(0, np.uint8)
+        if core.guard is not None and not core.windows.parallel:
+            exposures = ring.KEPT_BYTES // 2  # two bytes each
+            self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
+
+    def _warm_up(self, turn: Turn) -> None:
+        unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits)
+        if self._run.recorder is not None:
+            self._run.recorder.add_stamped(Kind.MESSAGES, turn.kept, turn.messages)
+
+    def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
+        run, blocks, steps = self._run, turn.blocks, turn.steps
+        assert isinstance(steps, BulkSteps)
+        rows = turn.rows  # a back end that is not the kernel's decides here
+        if not steps.decides and not run.connection.link.virtual:
+            blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
+        events = self._watch(turn, rows)
+        for event in events:
+            run.journal.take(event)
+        ends_ns, unsure_ns = self._ends_of(turn)
+        if len(rows):
+            run.tally.add_rows(rows, steps.photons_of(rows["object"]))
+            if run.recorder is not None:
+                run.recorder.add_decisions(rows)
+            counts = np.diff(blocks[:, ring.ROWS], prepend=0)
+            some = counts > 0
+            stamps = blocks[some, : ring.RECORDED + 1]
+            run.account_times(int(rows["index"][0]), counts[some], ends_ns[some], unsure_ns[some], stamps)
+        run.block_came(int(blocks[-1, ring.ARRIVAL]))
+        outputs.append(Output(RowDecisions(rows), events, self._still.last_tick))
+
+    def _watch(self, turn: Turn, rows: npt.NDArray[np.void]) -> list[Any]:
+        """Let the guard of the dark counts see the exposures of a call."""
+        core = self._still
+        if core.guard is None:
+            return []
+        if core.windows.parallel:
+            spans = turn.messages[turn.messages[:, ring.WHAT] == int(MessageType.FRAMES)]
+            blocks = (decode_frames(turn.bytes_of(span)[HEADER.size :]) for span in spans)
+            return [event for block in blocks for event in core.watch_frames(block)]
+        n = int(unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits))
+        return core.watch_blocks(self._stamps[:n], self._bits[:n], core.tracker.next_exposure - n, rows)
