@@ -1,9 +1,8 @@
 """The calibration file: what was measured on one instrument, when and how; beside the profile, never a rewrite of it.
 
-Owns the file (strict JSON with a checksum over all of it, as registrations have it too), its checks, and what a run takes from it:
-the brightness of the projector, the dark rates and their intervals. Never measures (estimate.py) and never watches (cusum.py,
-light_level.py). `load_calibration` returns a `Calibration` whose every figure is possible, or raises DamagedFileError;
-`find_objections` says why a run must not use one."""
+The file is strict JSON with a checksum over all of it, as registrations have it too. `load_calibration` returns a `Calibration` whose
+every figure is possible, or raises DamagedFileError; `find_objections` raises where a run must not use it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from pans.runtime.container import canonical_json, other_kind, parse_json_object, read_file
 from pans.runtime.errors import ConfigError, DamagedFileError
 from pans.runtime.outputs import write_file
-from pans.runtime.ranges import Range, number_text
+from pans.runtime.ranges import Range, demand, number_text
 
 from .click_law import ClickLaw, log_no_click
 from .profile import Profile
@@ -41,10 +40,10 @@ _NUMBERS = {
     "exposure_us": Range(1e-3, 1e9),
     "peak_photoelectrons_hz": Range(0, 1e18),
 }
-_INTERVALS = {  # whose ends have the range of that number, and whether both ends must be there
-    "photons_per_level_ci": ("photons_per_level", False),
-    "dark_ci": ("dark_per_exposure", False),
-    "peak_photoelectrons_hz_ci": ("peak_photoelectrons_hz", False),
+_INTERVALS = {  # whose ends have the range of that number; the upper one may be null
+    "photons_per_level_ci": "photons_per_level",
+    "dark_ci": "dark_per_exposure",
+    "peak_photoelectrons_hz_ci": "peak_photoelectrons_hz",
 }
 
 
@@ -202,53 +201,48 @@ def now_utc() -> datetime:
 def _check(values: Mapping[str, Any]) -> None:
     for key, allowed in _NUMBERS.items():
         allowed.checked(values[key], key)
-    for key, (of, bounded) in _INTERVALS.items():
-        _check_interval(values[key], _NUMBERS[of], bounded, key)
+    for key, of in _INTERVALS.items():
+        _check_interval(values[key], _NUMBERS[of], False, key)
     made = values["made_utc"]
-    _demand(isinstance(made, str), f"made_utc is {number_text(made)}, allowed: a date and time")
-    _demand(datetime.fromisoformat(made).utcoffset() is not None, f"made_utc {made[:40]!a} has no time zone")
+    demand(isinstance(made, str), f"made_utc is {number_text(made)}, allowed: a date and time")
+    demand(datetime.fromisoformat(made).utcoffset() is not None, f"made_utc {made[:40]!a} has no time zone")
     rows = values["channels"]
     fits = isinstance(rows, list) and 0 < len(rows) <= CHANNELS_MAX
-    _demand(fits, f"channels is no list of 1 to {CHANNELS_MAX}, allowed: one row for each channel")
+    demand(fits, f"channels is no list of 1 to {CHANNELS_MAX}, allowed: one row for each channel")
     for number, row in enumerate(rows):
-        _demand(isinstance(row, dict), f"channel {number} is {number_text(row)}, allowed: an object")
+        demand(isinstance(row, dict), f"channel {number} is {number_text(row)}, allowed: an object")
         _check_channel(row, f"channel {number}")
     silent = values.get("silent_channels", [])
-    _demand(isinstance(silent, list), f"silent_channels is {number_text(silent)}, allowed: a list of channels")
+    demand(isinstance(silent, list), f"silent_channels is {number_text(silent)}, allowed: a list of channels")
     for channel in silent:
         Range(0, len(rows) - 1, whole=True).checked(channel, "silent_channels")
-    for key, part in (("name", "profile"), ("sha256", "profile")):
-        _demand(isinstance(values[part], dict), f"{part} holds no facts")
-        _demand(isinstance(values[part][key], str), f"{part}.{key} is no text")
-    _demand(isinstance(values["device"], dict), "device holds no facts")
+    for part in ("profile", "device"):
+        demand(isinstance(values[part], dict), f"{part} holds no facts")
+    for key in ("name", "sha256"):
+        demand(isinstance(values["profile"][key], str), f"profile.{key} is no text")
     serial = values["device"].get("serial")
-    _demand(serial is None or isinstance(serial, str), f"device.serial is {number_text(serial)}, allowed: text")
+    demand(serial is None or isinstance(serial, str), f"device.serial is {number_text(serial)}, allowed: text")
 
 
 def _check_channel(row: Mapping[str, Any], what: str) -> None:
     for key in ("dark_clicks", "dark_exposures"):
         COUNTS.checked(row[key], f"{what}: {key}")
     clicks, exposures = row["dark_clicks"], row["dark_exposures"]
-    _demand(clicks <= exposures, f"{what}: {clicks} dark clicks in {exposures} exposures, allowed: at most one in each")
+    demand(clicks <= exposures, f"{what}: {clicks} dark clicks in {exposures} exposures, allowed: at most one in each")
     CHANCE.checked(row["dark_per_exposure"], f"{what}: dark_per_exposure")
     _check_interval(row["dark_ci"], CHANCE, True, f"{what}: dark_ci")
     low, high = row["dark_ci"]
     fine = low <= row["dark_per_exposure"] <= high
-    _demand(fine, f"{what}: dark rate {row['dark_per_exposure']} not within {low} to {high}")
+    demand(fine, f"{what}: dark rate {row['dark_per_exposure']} not within {low} to {high}")
 
 
 def _check_interval(value: Any, allowed: Range, bounded: bool, what: str) -> None:
     """Check [low, high], both in the range; high may be null where `bounded` is false."""
     pair = isinstance(value, list) and len(value) == 2
-    _demand(pair, f"{what} is {number_text(value)}, allowed: low and high, or null where nothing bounds it")
+    demand(pair, f"{what} is {number_text(value)}, allowed: low and high, or null where nothing bounds it")
     low, high = value
     allowed.checked(low, f"{what}, low")
     if high is None and not bounded:
         return
     allowed.checked(high, f"{what}, high")
-    _demand(low <= high, f"{what} goes from {low} to {high}, allowed: low before high")
-
-
-def _demand(holds: bool, message: str) -> None:
-    if not holds:
-        raise ValueError(message)
+    demand(low <= high, f"{what} goes from {low} to {high}, allowed: low before high")

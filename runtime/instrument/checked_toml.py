@@ -1,7 +1,7 @@
-"""TOML files whose faults are told with file:line:col: where a key stands, what it may hold, and the words in which a wrong one is refused.
+"""TOML files whose faults are reported with file:line:col: where a key stands, what it may hold, what to write instead.
 
-Owns the positions of keys, the parser's own complaints as a ConfigError, and the kinds of values; never reads a file and knows no file's
-own keys (profile_schema.py and the simulator's scenes do). `read_toml` returns the parsed tables and the positions of their keys.
+`read_toml` takes text and returns the parsed tables and the positions of their keys, or raises ConfigError. A `Key` is the rule of one
+value. profile_schema.py and the simulator's scenes say which keys there are.
 """
 
 from __future__ import annotations
@@ -159,22 +159,16 @@ class Key:
 
     def fits(self, value: Any) -> bool:
         """Whether the type is right: a boolean is no number, a whole number is one."""
-        if self.kind == "text":
-            return isinstance(value, str)
-        if self.kind == "names":
-            return isinstance(value, list) and all(isinstance(one, str) for one in value)
-        if self.kind == "numbers":
-            return isinstance(value, list) and all(_is_number(one) for one in value)
-        return isinstance(value, int) and not isinstance(value, bool) if self.kind == "whole" else _is_number(value)
+        is_one = {"text": _is_text, "names": _is_text, "whole": _is_whole}.get(self.kind, _is_number)
+        return isinstance(value, list) and all(map(is_one, value)) if self.kind in _LISTS else is_one(value)
 
     def within(self, value: Any) -> bool:
         """Whether a value of the right type is an allowed one; nan is in no range."""
-        if self.kind == "text":
+        return all(map(self._holds, value)) if self.kind in _LISTS else self._holds(value)
+
+    def _holds(self, value: Any) -> bool:
+        if isinstance(value, str):
             return value in self.choices if self.choices else bool(value.strip())
-        if self.kind == "names":
-            return all(one.strip() for one in value)
-        if self.kind == "numbers":
-            return all(self.low <= one <= self.high for one in value)
         if value == math.inf:
             return self.infinite
         return bool(self.low < value <= self.high or (value == self.low and not self.above))
@@ -194,8 +188,19 @@ class Key:
         return f"{noun} {limits}{', or inf' if self.infinite else ''}"
 
 
+_LISTS = ("names", "numbers")
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, float) or _is_whole(value)
 
 
 def found(value: Any) -> str:
@@ -213,12 +218,13 @@ def found(value: Any) -> str:
 
 def type_remedy(value: Any, kind: str) -> str:
     """What to write instead of a value of the wrong type."""
-    if kind == "text":
-        return "write the value in double quotes"
-    if kind == "names":
-        return 'for example ["null"]'
-    if kind == "numbers":
-        return "write plain numbers in brackets, for example [0.01, 0.002]"
+    examples = {
+        "text": "write the value in double quotes",
+        "names": 'for example ["null"]',
+        "numbers": "write plain numbers in brackets, for example [0.01, 0.002]",
+    }
+    if kind in examples:
+        return examples[kind]
     if isinstance(value, str):
         return "write the number without quotes"
     if kind == "whole" and isinstance(value, float) and value.is_integer():

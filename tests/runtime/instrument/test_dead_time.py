@@ -10,7 +10,7 @@ import pytest
 from naive_dead_time import share_of_clicks
 
 from pans.runtime.instrument import dead_time as law_module
-from pans.runtime.instrument.click_law import ClickLaw, both_chances, click_law, click_probability
+from pans.runtime.instrument.click_law import ClickLaw, both_chances, click_law, click_probability, dead_time_of
 from pans.runtime.instrument.dead_time import DeadTime, counted_mean, counted_slope
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light
 from pans.runtime.instrument.profile import load_profile
@@ -156,6 +156,18 @@ def test_a_profile_says_what_its_detector_does() -> None:
     longest = replace(free, detector=replace(free.detector, dead_time_ns=1000 * (2.3 + led.exposure.readout_us)))
     assert click_law(longest, 2.2999).dead_time.dead == pytest.approx(1 + led.exposure.readout_us / 2.2999)
     assert click_law(load_profile("dmd-spad"), 50.0).dead_time == DeadTime()  # 24 ns: below a permille
+
+
+@pytest.mark.parametrize(("share", "counts"), [(0.9e-3, False), (1.1e-3, True), (0.4, True)])
+def test_dead_time_counts_from_a_permille_on_and_where_it_outlasts_the_pause(share: float, counts: bool) -> None:
+    led = load_profile("microled-spad")
+    detector = replace(led.detector, dead_time_ns=share * 1e5, between_exposures="free-running")
+    free = replace(led, detector=detector, exposure=replace(led.exposure, readout_us=10.0))
+    found = dead_time_of(free, 100.0)
+    assert (found.dead, found.pause) == (pytest.approx((share, 0.1)) if counts else (0.0, 0.0))
+    assert found.free_running == counts
+    gated = dead_time_of(replace(free, detector=replace(detector, between_exposures="gated")), 100.0)
+    assert gated.reach == pytest.approx(max(0.0, share - 0.1))
 
 
 def test_torch_has_the_same_numbers_and_their_derivative() -> None:

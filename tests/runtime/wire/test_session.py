@@ -137,6 +137,33 @@ def test_an_acknowledgement_restarts_the_clock_of_the_next_command() -> None:
     assert ids(sent(session)) == [2]
 
 
+def test_an_acknowledgement_of_a_command_that_was_never_sent_is_counted_and_ignored() -> None:
+    session = opened()
+    for _ in range(10):
+        session.submit(Opcode.STOP)
+    session.poll(0)  # 9 and 10 wait for room
+    session.take_output()
+    for last_id in (9, 10, 11):
+        deliver(session, wire.encode_ack(Ack(last_id, 0, 0, ""), NONCE))
+    assert (session.counters.implausible, session.in_flight, session.answered) == (3, 10, 0)
+    deliver(session, wire.encode_ack(Ack(8, 0, 0, ""), NONCE))
+    assert (session.counters.implausible, session.in_flight, session.answered) == (3, 2, 8)
+
+
+def test_stop_follows_the_commands_that_the_device_may_lack() -> None:
+    session = opened()
+    for _ in range(11):
+        session.submit(Opcode.RESET)
+    session.poll(0)
+    session.take_output()
+    deliver(session, wire.encode_ack(Ack(2, 0, 0, ""), NONCE))
+    frames = FrameDecoder().feed(session.stop_frames())
+    assert ids(frames) == list(range(3, 13))  # unacknowledged, then waiting, then STOP
+    assert [wire.decode_command(frame.payload).opcode for frame in frames] == 9 * [Opcode.RESET] + [Opcode.STOP]
+    assert ids(FrameDecoder().feed(session.stop_frames(next_id=20)))[-1] == 20
+    assert (session.next_id, session.in_flight, session.take_output()) == (12, 9, b"")
+
+
 def test_a_refusal_is_raised_once_with_the_devices_words() -> None:
     session = opened()
     session.submit(Opcode.LOAD_PLAN)

@@ -55,6 +55,38 @@ def test_a_lost_mark_is_a_lost_message_but_no_gap() -> None:
     assert tracker.accept(mark(3))[0] == Mark(3, 3, 1, 0, 0, 0.0)
 
 
+def test_marks_taken_elsewhere_do_not_hide_a_loss() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 4))
+    tracker.accept(mark(2))  # message 1, with four exposures, is lost
+    tracker.advance((4, 4), messages=1, exposures=0)  # a mark that the kernel took
+    assert tracker.accept(clicks(4, 8, 4))[1] == Gap(4, 4, 1, 0)
+    tracker.accept(mark(6))
+    tracker.advance((8, 16), messages=1, exposures=4)  # exposures follow without a gap: what was lost held none
+    assert tracker.accept(clicks(8, 20, 4, drops=4))[1] == Gap(16, 4, 0, 4)
+    assert (tracker.counters.exposures, tracker.counters.unexplained_drops) == (16, 0)
+
+
+@pytest.mark.parametrize(
+    ("end", "drops", "gap", "unexplained"),
+    [(4, 0, None, 0), (10, 3, Gap(4, 6, 0, 3), 0), (10, 6, Gap(4, 6, 0, 6), 0), (6, 5, Gap(4, 2, 0, 2), 1)],
+)
+def test_what_is_missing_at_the_end_is_dropped_or_lost(end: int, drops: int, gap: Gap | None, unexplained: int) -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 4))
+    assert tracker.finish(end, drops) == gap
+    dropped = 0 if gap is None else gap.dropped_by_device
+    assert (tracker.counters.device_drops, tracker.counters.unexplained_drops) == (dropped, unexplained)
+    assert not tracker.open
+
+
+def test_an_end_that_cannot_be_is_no_gap() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 4))
+    assert tracker.finish(3, 0) is None
+    assert (tracker.counters.unexplained_drops, tracker.next_exposure) == (1, 4)
+
+
 def test_repeated_and_overtaken_messages_are_dropped() -> None:
     tracker = StreamTracker()
     for frame in (clicks(0, 0, 4), clicks(2, 8, 4)):
@@ -194,8 +226,7 @@ def test_every_exposure_arrives_once_or_is_lost_once(fates: list[str], size: int
     assert tracker.counters.exposures == len(arrived)
 
 
-@pytest.mark.parametrize("n_features", [3])
-def test_frame_blocks_count_as_exposures(n_features: int) -> None:
+def test_frame_blocks_count_as_exposures() -> None:
     tracker = StreamTracker()
     words = np.ones((6, 1), np.uint8)
     frame = FrameDecoder().feed(wire.encode_frames(wire.FrameBlock(0, 0, 0, 2, 1, 0, words), 1))[0]
