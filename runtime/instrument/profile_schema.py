@@ -52,61 +52,39 @@ class Projector:
     pattern_rate_max_hz: Annotated[float, above(0, 1e9, "patterns per second at most")]
     # 65535 patterns are 0..0xFFFE: 0xFFFF is the dark pattern
     pattern_memory: Annotated[int, whole(1, 65535, "patterns that the instrument stores")]
-    peak_photoelectrons_hz: Annotated[
-        float, above(0, 1e15, "photoelectrons per second of a full pixel, object clear: `pans calibrate` measures it")
-    ]
-    automaton_states: Annotated[
-        int, whole(0, MAX_STATES, "states of an automaton that the device follows by itself; 0: none")
-    ] = 0
-    dwell_steps: Annotated[
-        int, whole(1, 65535, "steps into which the device divides the light of an exposure; 1: it is on all the time")
-    ] = 1
+    peak_photoelectrons_hz: Annotated[float, above(0, 1e15, "photoelectrons/s of a full pixel, object clear")]
+    automaton_states: Annotated[int, whole(0, MAX_STATES, "states of an automaton the device can follow")] = 0
+    dwell_steps: Annotated[int, whole(1, 65535, "steps of the light within an exposure")] = 1
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectModulator:
     """The modulator that displays test images as objects."""
 
-    contrast: Annotated[
-        float, above(1, 1e12, "brightest over darkest transmission; inf: perfectly black", infinite=True)
-    ]
+    contrast: Annotated[float, above(1, 1e12, "brightest over darkest transmission", infinite=True)]
     levels: Annotated[int, whole(2, 65536, "levels of the object's modulator")]
-    black_transmission: Annotated[
-        float | None, number(0, 0.99, "what black lets through where it was measured, in place of 1/contrast")
-    ] = None
+    black_transmission: Annotated[float | None, number(0, 0.99, "measured, in place of 1/contrast")] = None
 
 
 @dataclass(frozen=True, slots=True)
 class Optics:
     """Where the object stands on the pattern grid and how sharp it is, with the tolerance of each figure."""
 
-    psf_px: Annotated[float, number(0, 1000, "blur of a point: standard deviation of a Gaussian, in object pixels")] = (
-        0.0
-    )
+    psf_px: Annotated[float, number(0, 1000, "blur: sigma of a Gaussian, in object pixels")] = 0.0
     psf_tolerance_px: Annotated[float, number(0, 1000, "by how much the blur may differ, to either side")] = 0.0
-    right_px: Annotated[
-        float, number(-1e4, 1e4, "how far the object stands to the right on the pattern grid, in object pixels")
-    ] = 0.0
+    right_px: Annotated[float, number(-1e4, 1e4, "object to the right on the grid, in its pixels")] = 0.0
     down_px: Annotated[float, number(-1e4, 1e4, "how far it stands below")] = 0.0
     shift_tolerance_px: Annotated[float, number(0, 1000, "by how much either may differ, to either side")] = 0.0
-    rotation_deg: Annotated[
-        float, number(-360, 360, "how far the object is turned counter-clockwise about the middle of the grid")
-    ] = 0.0
+    rotation_deg: Annotated[float, number(-360, 360, "object turned counter-clockwise")] = 0.0
     rotation_tolerance_deg: Annotated[float, number(0, 360, "by how much the rotation may differ, to either side")] = (
         0.0
     )
     scale: Annotated[float, number(0.1, 10, "magnification of the object on the pattern grid")] = 1.0
     scale_tolerance: Annotated[float, number(0, 0.9, "by how much the magnification may differ, to either side")] = 0.0
     dark_pixel: Annotated[float, number(0, 0.99, "light of a dark projector pixel over that of a full one")] = 0.0
-    gain_tolerance: Annotated[
-        float, number(0, 0.99, "by which part all light may differ from peak_photoelectrons_hz, to either side")
-    ] = 0.0
-    flat_field_file: Annotated[
-        str | None, text("a .npz with `flat` (rows, columns) of mean 1: light of every pattern pixel over the mean")
-    ] = None
-    source_fluctuation: Annotated[
-        float, number(0, MAX_FLUCTUATION, "relative standard deviation of the light from exposure to exposure")
-    ] = 0.0
+    gain_tolerance: Annotated[float, number(0, 0.99, "relative, of all light, to either side")] = 0.0
+    flat_field_file: Annotated[str | None, text("a .npz with `flat` (rows, columns) of mean 1")] = None
+    source_fluctuation: Annotated[float, number(0, MAX_FLUCTUATION, "relative sigma from exposure to exposure")] = 0.0
     source_drift_percent_per_hour: Annotated[float, number(-100, 100, "slow change of the light")] = 0.0
 
     def tolerance(self) -> Tolerance:
@@ -131,13 +109,9 @@ class Detector:
     """The detector; an effect that a profile leaves out is absent."""
 
     kind: Annotated[str, text("for people: SPAD, SNSPD, PMT, qCMOS, ...")]
-    channels: Annotated[
-        int, whole(1, 4096, "detectors that click independently: 1 if sequential, one per pattern if parallel")
-    ]
+    channels: Annotated[int, whole(1, 4096, "detectors: 1 if sequential, one per pattern if parallel")]
     efficiency: Annotated[float, above(0, 1, "photoelectrons per photon")]
-    dark_rate_hz: Annotated[
-        float, number(0, 1e9, "dark photoelectrons per second and channel: `pans calibrate` measures it")
-    ]
+    dark_rate_hz: Annotated[float, number(0, 1e9, "dark photoelectrons/s and channel")]
     # beyond 3 e- of noise a single photon is not visible at all
     read_noise_e: Annotated[float, number(0, 3, "Gaussian noise of a readout; 0 for detectors that count events")] = 0.0
     threshold_e: Annotated[float, above(0, 10, "a readout of at least this is a click")] = 0.5
@@ -149,31 +123,18 @@ class Detector:
     between_exposures: Annotated[
         str, text("gated: off between exposures; free-running: on, and blinded by what it detects", GATED, FREE_RUNNING)
     ] = GATED
-    afterpulse_probability: Annotated[
-        float, number(0, 1, "that a click causes another: in the next exposure, or later with afterpulse_time_us")
-    ] = 0.0
-    afterpulse_time_us: Annotated[
-        float | None, above(0, 1e9, "time constant with which traps release what causes afterpulses")
-    ] = None
+    afterpulse_probability: Annotated[float, number(0, 1, "that a click causes another")] = 0.0
+    afterpulse_time_us: Annotated[float | None, above(0, 1e9, "time constant of the traps")] = None
     crosstalk_probability: Annotated[float, number(0, 1, "that a click causes one in a neighbouring channel")] = 0.0
     crosstalk_further: Annotated[
         tuple[float, ...], Key("numbers", 0, 1, meaning="the same of the second neighbour, the third and so on")
     ] = ()
-    telegraph_share: Annotated[
-        float, number(0, 1, "share of the pixels whose reading jumps between two levels; needs the next two")
-    ] = 0.0
+    telegraph_share: Annotated[float, number(0, 1, "share of pixels with two levels")] = 0.0
     telegraph_offset_e: Annotated[float, number(-10, 10, "by how much the reading is higher in the second level")] = 0.0
     telegraph_time_s: Annotated[float, number(1e-4, 1e9, "mean time in either level")] = 0.0
-    threshold_drift_e_per_hour: Annotated[
-        float, number(-100, 100, "by how much the reading sinks in an hour, which is as if the threshold rose")
-    ] = 0.0
-    timing_jitter_ns: Annotated[
-        float,
-        number(0, 1e9, "standard deviation of the detection time: some photons fall into a neighbouring exposure"),
-    ] = 0.0
-    photon_number_max: Annotated[
-        int, whole(1, 15, "largest photon number that a readout can state; 1: a click or none")
-    ] = 1
+    threshold_drift_e_per_hour: Annotated[float, number(-100, 100, "by how much readings sink")] = 0.0
+    timing_jitter_ns: Annotated[float, number(0, 1e9, "sigma of the detection time")] = 0.0
+    photon_number_max: Annotated[int, whole(1, 15, "largest number of a readout; 1: a click or none")] = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +143,7 @@ class Exposure:
 
     min_us: Annotated[float, above(0, 1e9, "shortest exposure; at least 10 ticks of the clock")]
     max_us: Annotated[float, above(0, 1e9, "longest exposure")]
-    readout_us: Annotated[
-        float, number(0, 1e9, "time after an exposure before the next may start: readout, settling of mirrors")
-    ]
+    readout_us: Annotated[float, number(0, 1e9, "pause before the next exposure may start")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,15 +157,9 @@ class Clock:
 class Timing:
     """What a run promises."""
 
-    decision_deadline_us: Annotated[
-        float, above(0, 1e9, "a decision later than this after the last exposure is flagged and triggers nothing")
-    ]
-    lease_ms: Annotated[
-        int, whole(1, 3_600_000, "the device goes dark when the host is silent for this long; above the deadline")
-    ]
-    device_turn_us: Annotated[
-        float, number(0, 1e9, "device-driven automata: from an exposure to the next pattern; 0: the readout is longer")
-    ] = 0.0
+    decision_deadline_us: Annotated[float, above(0, 1e9, "later decisions are flagged and trigger nothing")]
+    lease_ms: Annotated[int, whole(1, 3_600_000, "the device goes dark when the host is silent for so long")]
+    device_turn_us: Annotated[float, number(0, 1e9, "device-driven: from an exposure to the next pattern")] = 0.0
     host_turn_us: Annotated[float, number(0, 1e9, "host-driven automata: the same, both ways of the link included")] = (
         1000.0
     )
