@@ -412,8 +412,8 @@ _TITLES = {
 }
 _HEAD = """\
 # Hardware profile of an instrument, begun from the shipped profile {base}.
-# Go through the keys, put in your figures, and check the file: pans profile check FILE
-# Each key has its allowed values in brackets; docs/reference/profiles.md explains them. `pans profile show NAME` shows a shipped profile with its sources.
+# Go through the keys (docs/reference/profiles.md explains them), put in your figures, and check the file: pans profile check FILE
+# Each key has its allowed values in brackets. `pans profile show NAME` shows a shipped profile with its sources.
 """
 
 
