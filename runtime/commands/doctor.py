@@ -380,10 +380,6 @@ def settings_of(found: Rehearsal) -> list[dict[str, Any]]:
             {"helps": "--core keeps one core out of them; for all: idle=poll or processor.max_cstate=1 at boot",
              "refused": "to try it, run this as root: the file /dev/cpu_dma_latency is root's"},
         ),
-        _compared(
-            "timer slack", "50 us unless set", found, ("ordinary", "exact timers"), 0.5,
-            {"helps": "nothing: SCHED_FIFO has exact timers" if found.fifo else "allow SCHED_FIFO"},
-        ),
     ]  # fmt: skip
     isolated = isolated_cores()
     others = next((row for row in found.cores if row["core"] == found.host), {})

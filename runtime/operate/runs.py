@@ -51,7 +51,6 @@ class Run:
     simulated: bool
     locked: bool
     files: tuple[Path, ...] = field(repr=False)
-    foreign: tuple[Path, ...] = field(repr=False)
 
     def as_json(self) -> dict[str, Any]:
         """Return the facts, JSON-able."""
@@ -103,7 +102,6 @@ def run_of(folder: Path) -> Run | None:
         simulated=bool(header.get("simulated") or summary.get("simulated")),
         locked=is_locked,
         files=tuple(files),
-        foreign=tuple(path for path in entries if path not in files),
     )
 
 

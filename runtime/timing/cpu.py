@@ -1,4 +1,4 @@
-"""A core that never falls asleep, and conditions that a process may ask for: priority, core, idle states, timers.
+"""A core that never falls asleep, and conditions that a process may ask for: priority, core, idle states.
 
 A core that halts between two blocks wakes with cold caches and, in a virtual machine, after somebody else's turn
 (docs/explanation/timing.md). A spinning thread of idle priority in the same process keeps it awake: whatever has something to do goes
@@ -8,7 +8,6 @@ to the calling thread, and undoes what it asked for.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import platform
 import struct
@@ -28,7 +27,6 @@ from pans.runtime.errors import UsageError
 GRANTED = "granted"
 LOOK_EVERY_S = 0.0005  # whether the spinner spins
 ENDED, SPINS = 0, 1  # places in the state of a spin
-PR_SET_TIMERSLACK, PR_GET_TIMERSLACK = 29, 30  # linux/prctl.h
 DMA_LATENCY = Path("/dev/cpu_dma_latency")
 
 
@@ -149,20 +147,6 @@ def shallow_idle(device: Path = DMA_LATENCY) -> Iterator[str]:
     finally:
         for one in file:
             os.close(one)
-
-
-@contextmanager
-def timer_slack(slack_ns: int) -> Iterator[str]:
-    """By how much the kernel may delay this thread's timers to fire several at once (usually 50 us; none under SCHED_FIFO)."""
-    if sys.platform != "linux":
-        yield "not asked for on this system"
-        return
-    prctl = ctypes.CDLL(None, use_errno=True).prctl
-    before = prctl(PR_GET_TIMERSLACK, 0, 0, 0, 0)
-    try:
-        yield GRANTED if prctl(PR_SET_TIMERSLACK, slack_ns, 0, 0, 0) == 0 else "refused"
-    finally:
-        prctl(PR_SET_TIMERSLACK, max(before, 1), 0, 0, 0)
 
 
 # -- a core kept awake -------------------------------------------------------------------------------------------------

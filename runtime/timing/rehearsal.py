@@ -27,7 +27,6 @@ from .cpu import (
     isolated_cores,
     shallow_idle,
     steal_ms,
-    timer_slack,
     usable_cores,
 )
 from .ledger import FIFO_PRIORITY
@@ -47,7 +46,6 @@ class Arm:
     bound: bool = False
     awake: bool = False
     shallow: bool = False
-    slack_ns: int = 0
 
 
 @dataclass(slots=True)
@@ -85,7 +83,6 @@ def arms_of(granted: bool) -> tuple[Arm, ...]:
         *fifo_arms,
         Arm("kept awake", fifo=granted, bound=True, awake=True),
         Arm("shallow idle states", fifo=granted, bound=True, shallow=True),
-        Arm("exact timers", slack_ns=1),
     )
 
 
@@ -129,8 +126,6 @@ def _one_turn(arm: Arm, turns: Turns, seconds: float, host: int | None) -> None:
             asked["sched_fifo"] = stack.enter_context(fifo(FIFO_PRIORITY))
         if arm.shallow:
             asked["cpu_dma_latency"] = stack.enter_context(shallow_idle())
-        if arm.slack_ns:
-            asked["timer_slack"] = stack.enter_context(timer_slack(arm.slack_ns))
         turns.asked = asked
         if not any(str(answer).startswith("refused") for answer in asked.values()):
             turns.rounds_ns.append(sleeps(seconds))

@@ -90,7 +90,7 @@ def test_a_run_that_goes_on_stays(root: Path, capsys: pytest.CaptureFixture[str]
 
 def made(name: str, days: float, size: int, *, is_locked: bool = False) -> Run:
     started = NOW - timedelta(days=days)
-    return Run(Path(name), started, "b", "PASS", 1, None, size, True, is_locked, (), ())
+    return Run(Path(name), started, "b", "PASS", 1, None, size, True, is_locked, ())
 
 
 def test_all_conditions_hold_and_the_newest_are_kept() -> None:

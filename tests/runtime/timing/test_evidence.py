@@ -339,7 +339,7 @@ def test_a_starved_thread_is_stood_in_for() -> None:
 )
 def test_whole_runs_in_virtual_time_blame_what_was_done_to_them(faults: str, causes: set[str], tmp_path: Path) -> None:
     profile, bundle, plan = small_setup("sequential")
-    config = RunOptions(n_cycles=8000, deadline_us=10_000.0, realtime=False)
+    config = RunOptions(n_cycles=3000, deadline_us=10_000.0, realtime=False)
     core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
     path = tmp_path / "run.pansrec"
     with Recorder(path, {}) as recorder:

