@@ -63,7 +63,7 @@ def _run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say(f"interrupted; finished rows and the row in work are in {cache}\n  to resume: the same command")
         return EXIT_INTERRUPTED
-    text = "\n\n".join(page.whole(one.rows, one.pictures) for page, one in zip(pages, made))
+    text = "\n\n".join(page.whole(one.rows, page.drawn(one).pictures) for page, one in zip(pages, made))
     emit(args, {"rows": [row for one in made for row in one.rows], "simulated": True}, text)
     return EXIT_FINE
 

@@ -11,7 +11,6 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, evaluate_exactly,
 from pans.trainer.options import Options, plain_options
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
-from . import plots
 from .page import (
     FIRST_OBJECTS,
     Asked,
@@ -41,7 +39,8 @@ from .printed import ACTIVE, DIRECT, SHOTS, ActiveRow, recipe
 
 PROFILE = "ideal"
 PARTS = {"first_200": FIRST_OBJECTS, "all": None}
-TRIALS = {FIRST_OBJECTS: 100, 10_000: 10}  # where the outcomes are too many to enumerate
+TRIALS, TRIALS_OF_ALL = 100, 10  # of the first 200 and of all, where the outcomes are too many to enumerate
+EXACT_WORK_MAX = 1 << 25  # objects times outcomes
 # Trained once more, to see how far a seed moves a row. Never chosen from. Far from 0, 1, ...: those are the restarts of seed 0.
 OTHER_SEEDS = {("fashion-mnist", 10): (1000,), ("mnist", 9): (1000,)}
 
@@ -100,22 +99,25 @@ def make_row(asked: Asked, row: ActiveRow, seed: int = 0) -> Row:
     return figures
 
 
+def judged(bundle: Bundle, objects: Objects, *, shots: int = 1, eta: float = 1.0, dark: float | None = None) -> Row:
+    """Return the figures of `bundle` on `objects`: exact where all outcomes can be enumerated, else of sampled trials."""
+    light = light_of(bundle, load_profile(PROFILE), objects.images, eta=eta, dark=dark)
+    if enumerable(bundle, len(objects), shots):
+        return row_of(evaluate_exactly(bundle, light, objects.labels, shots=shots))
+    trials = TRIALS if len(objects) == FIRST_OBJECTS else TRIALS_OF_ALL
+    return row_of(evaluate_sampled(bundle, light, objects.labels, shots=shots, trials=trials, seed=1))
+
+
+def enumerable(bundle: Bundle, objects: int, shots: int = 1) -> bool:
+    """Return whether all outcomes of that many objects are enumerated."""
+    outcomes = (shots + 1) ** bundle.n_features
+    return outcomes <= EXACT_OUTCOMES_MAX and outcomes * objects <= EXACT_WORK_MAX
+
+
 def measure_row(bundle: Bundle, task: Task) -> Row:
     """Return accuracy, clicks, photons and illumination at every number of shots, of the first 200 and of all test images."""
-    profile = load_profile(PROFILE)
-    found: Row = {}
-    for part, count in PARTS.items():
-        objects: Objects = task.test.first(count)
-        light = light_of(bundle, profile, objects.images)
-        for shots in SHOTS:
-            outcomes = (shots + 1) ** bundle.n_features
-            if outcomes <= EXACT_OUTCOMES_MAX and outcomes * len(objects) <= EXACT_OUTCOMES_MAX << 5:
-                measured = evaluate_exactly(bundle, light, objects.labels, shots=shots)
-            else:
-                trials = TRIALS.get(len(objects), TRIALS[10_000])
-                measured = evaluate_sampled(bundle, light, objects.labels, shots=shots, trials=trials, seed=1)
-            found.setdefault(part, {})[str(shots)] = row_of(measured)
-    return found
+    parts = {part: task.test.first(count) for part, count in PARTS.items()}
+    return {part: {str(k): judged(bundle, objects, shots=k) for k in SHOTS} for part, objects in parts.items()}
 
 
 def shot_figures(figures: Row, shots: int = 1) -> Row:
@@ -143,7 +145,7 @@ def active_page(asked: Asked) -> Made:
             rows += row_beside(name, row, found)
     order = ("shots", "direct", "seeds")
     rows.sort(key=lambda each: order.index(each["table"]))
-    return Made(rows, {"": partial(plots.accuracy_against_photons, name=name, rows=rows)} if rows else {})
+    return Made(rows)
 
 
 def row_beside(name: str, row: ActiveRow, trained: Rows) -> Rows:

@@ -15,9 +15,8 @@ from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.tasks.registry import load_task
 
-from . import plots
 from .active import finished_row, shot_figures
-from .page import FIRST_OBJECTS, Asked, Draw, Made, Row, Rows, against, flat, interpolated, kept
+from .page import FIRST_OBJECTS, Asked, Made, Row, Rows, against, by_epoch, flat, interpolated, kept
 from .printed import ACTIVE, DIRECT
 
 TASK = "fashion-mnist"
@@ -26,7 +25,7 @@ POSTERIOR_LEVELS = LEVELS[:7]  # at more it is a nearest neighbour
 SENSING_LEVELS = (5.0, 100.0)
 NETWORK_LEVELS = (100.0, 1e3, 1e4)  # a training each
 E2E_FEATURES = (3, 4, 6, 8, 10, 16, 24, 32, 64)  # the paper's
-PANS, ENVELOPE = plots.PANS, plots.ENVELOPE
+PANS, ENVELOPE = "PANS", "end-to-end, envelope"
 
 FEATURES = (4, 16, 32, 64, 128, 256, 784)  # of the page `compressive`
 SENSINGS = (  # patterns, convolutions, epochs, d_f
@@ -133,7 +132,7 @@ def fig_2e_page(asked: Asked) -> Made:
                     )
         pans.append(mine)
     rows = [*pans, *curves, *best]
-    return Made(rows, {"": partial(plots.paradigms, rows=rows)})
+    return Made(rows)
 
 
 def _levels_between(measured: Rows) -> Rows:
@@ -149,15 +148,15 @@ def end_to_end_page(asked: Asked) -> Made:
     """Return the envelope, and the rows of every number of patterns."""
     rows = end_to_end_rows(asked)
     best = envelope(rows)
-    return Made(best + rows, {"": partial(plots.end_to_end, rows=rows + best)})
+    return Made(best + rows)
 
 
 # ---- compressive sensing ----
 
 
 def compressive_page(asked: Asked) -> Made:
-    """Return one row per patterns, classifier, number of patterns and photons, after the trainings on clean measurements."""
-    trainings, cells = [], []
+    """Return one row per patterns, classifier, number of patterns and photons, and the epochs of the trainings on clean measurements."""
+    cells, trainings = [], []
     for family, convolutions, epochs, features in SENSINGS:
         if not asked.wants(features):
             continue
@@ -167,30 +166,14 @@ def compressive_page(asked: Asked) -> Made:
         make = partial(sensed, asked.data_dir, features, family, convolutions, epochs)
         found = kept(path, made_with, make, collect=asked.collect)
         asked.report(f"compressive, {family}, d_f = {features}: {'not measured yet' if found is None else 'measured'}")
-        if found is None:
-            continue
-        facts: Row = {
-            "family": family,
-            "classifier": "convolutions" if convolutions else "one hidden layer",
-            "features": features,
-        }
-        course = found["epochs"]
-        last = {"first_loss": course["loss"][0], "last_loss": course["loss"][-1], "minutes": found["cpu_seconds"] / 60}
-        last |= {"training": course["training"][-1], "held_out": course["held_out"][-1]}
-        trainings.append({"table": "trainings"} | facts | last | {"epochs": course})
-        asked_for = [
-            {"photons_asked": cell["photons_asked"]} | flat(cell, cell["first_200"]) for cell in found["cells"]
-        ]
-        cells += [{"table": "cells"} | facts | cell for cell in asked_for]
-    plain = [row for row in trainings if (row["family"], row["classifier"]) == ("binary", "one hidden layer")]
-    pictures: dict[str, Draw] = {}
-    if plain:
-        mapped = [cell for cell in cells if (cell["family"], cell["classifier"]) == ("binary", "one hidden layer")]
-        pictures = {
-            "": partial(plots.sensing_map, rows=mapped),
-            "-training": partial(plots.sensing_training, rows=plain),
-        }
-    return Made(trainings + cells, pictures)
+        if found is not None:
+            classifier = "convolutions" if convolutions else "one hidden layer"
+            facts: Row = {"family": family, "classifier": classifier, "features": features}
+            trainings += by_epoch(found["epochs"], **facts)
+            for cell in found["cells"]:
+                light = {"table": "cells", "photons_asked": cell["photons_asked"]}
+                cells.append(light | facts | flat(cell, cell["first_200"]))
+    return Made(cells + trainings)
 
 
 def sensed(data_dir: str | None, features: int, family: str, convolutions: bool, epochs: int) -> Row:

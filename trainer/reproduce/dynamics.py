@@ -18,7 +18,7 @@ from pans.trainer.train.history import follow
 
 from . import plots
 from .active import PROFILE
-from .page import Asked, Draw, Made, Row, Rows, against, kept
+from .page import Asked, Made, Row, Rows, against, by_epoch, kept
 from .passive import measure
 from .printed import ACTIVE, recipe
 
@@ -68,31 +68,25 @@ def _keep_patterns(path: Path, patterns: dict[int, NDArray[np.float32]]) -> None
 
 
 def alpha_page(asked: Asked) -> Made:
-    """Return one row per training, beside that without alpha; one picture per number of patterns, and one of the paper's schedule."""
+    """Return one row per training, beside that without alpha, and their epochs."""
     rows: Rows = []
-    pictures: dict[str, Draw] = {}
+    epochs: Rows = []
     for schedule, cells in CELLS.items():
-        done = []
+        done: Rows = []
         for features, alpha in cells:
             found = training(asked, features, alpha, schedule) if asked.wants(features) else None
             if found is not None:
-                facts = {"table": "alpha", "features": features, "alpha": alpha, "schedule": schedule}
-                epochs = found["epochs"]
-                facts |= {"of_epochs": len(epochs["training"]), "training": epochs["training"][-1], "epochs": epochs}
-                done.append(
-                    facts
-                    | {"grows": growth(epochs["illumination"]), "minutes": found["cpu_seconds"] / 60}
-                    | found["final"]
-                )
+                facts: Row = {"features": features, "alpha": alpha, "schedule": schedule}
+                epochs += by_epoch(found["epochs"], **facts)
+                course = {key: found["epochs"][key] for key in ("training", "illumination")}
+                facts |= {"table": "alpha", "of_epochs": len(course["training"]), "training": course["training"][-1]}
+                done.append(facts | {"grows": growth(course["illumination"])} | found["final"])
         for row in done:
             other = next((each for each in done if (each["features"], each["alpha"]) == (row["features"], 0)), row)
             if other is not row:
                 row |= against(row["value"], other["value"], row["error_objects"], other["error_objects"])
-        for features in dict.fromkeys(row["features"] for row in done):
-            ending = f"-{features}" if schedule == SHORT else "-paper"
-            pictures[ending] = partial(plots.courses, rows=[row for row in done if row["features"] == features])
         rows += done
-    return Made(rows, pictures)
+    return Made(rows + epochs)
 
 
 def growth(light: list[float]) -> float:
@@ -108,7 +102,8 @@ def evolution_page(asked: Asked) -> Made:
     with np.load(asked.cache / f"alpha-{SHOWN[0]}-{SHOWN[1]:g}.npz", allow_pickle=False) as archive:
         normal = {int(after): shown / shown.mean() for after, shown in zip(archive["after"], archive["patterns"])}
     rows = [stage_row(row["epochs"], after, shown) for after, shown in normal.items()]
-    return Made(rows, {"": partial(plots.stages, patterns=normal, peaks=row["epochs"]["peak"])})
+    lines = {f"epoch {after}\nto {shown.max():.0f}": shown / shown.shape[1] for after, shown in normal.items()}
+    return Made(rows, {"": partial(plots.patterns, lines=lines, title="patterns over their common mean")})
 
 
 def stage_row(epochs: Row, after: int, normal: NDArray[np.floating]) -> Row:

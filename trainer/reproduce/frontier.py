@@ -26,7 +26,6 @@ from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.options import Options
 from pans.trainer.tasks.registry import Task, load_task
 
-from . import plots
 from .active import OTHER_SEEDS, PROFILE, finished_row, shot_figures
 from .dynamics import ALPHAS, training
 from .page import (
@@ -255,7 +254,7 @@ def frontier_page(asked: Asked) -> Made:
         done = sum(row["way"] == way for row in measured)
         asked.report(f"frontier: {way}: {done} of {sum(point.way == way for point in points()) * asked.seeds} rows")
     rows = beside_direct(rows)
-    return Made(click_budgets(rows) + rows, {"": partial(plots.frontier, points=rows)})
+    return Made(click_budgets(rows) + rows)
 
 
 def by_point(measured: Rows) -> Rows:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.resources
-import itertools
 import json
 import math
 import re
@@ -15,8 +14,11 @@ import time
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import say
@@ -113,15 +115,18 @@ def flat(whole: Row, first: Row) -> Row:
     return found | {key: whole[key] for key in ("objects", "trials") if key in whole}
 
 
+def by_epoch(columns: Row, **facts: Any) -> Rows:
+    """Return one row per epoch of the table `epochs` from columns over the epochs."""
+    rows = [dict(zip(columns, values)) for values in zip(*columns.values())]
+    return [{"table": "epochs", **facts, "epoch": number} | row for number, row in enumerate(rows, start=1)]
+
+
 def interpolated(curve: Rows, place: float, of: str, value: str = "value") -> float | None:
     """Return a curve's `value` where its figure `of` is `place`, linear in the logarithm of `of`; None outside of the curve."""
     known = sorted((float(row[of]), float(row[value])) for row in curve)
     if not known or not known[0][0] <= place <= known[-1][0]:
         return None
-    for (x0, y0), (x1, y1) in itertools.pairwise(known):
-        if place <= x1:
-            return y0 + (y1 - y0) * (math.log(place / x0) / math.log(x1 / x0) if x1 > x0 else 0.0)
-    return known[-1][1]
+    return float(np.interp(math.log(place), [math.log(x) for x, _ in known], [y for _, y in known]))
 
 
 # ---- tables ----
@@ -223,7 +228,10 @@ def _columns(parts: Iterable[Any]) -> tuple[Column, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """An entry of pages.toml: title, Markdown file (without .md), function that measures it, tables, captions of pictures."""
+    """An entry of pages.toml: title, Markdown file (without .md), function that measures it, tables, captions of pictures.
+
+    `plots` names the [plots] entry of each picture that is drawn from the rows alone; the others are drawn by the module.
+    """
 
     name: str
     title: str
@@ -232,12 +240,21 @@ class Page:
     tables: tuple[Table, ...]
     captions: Mapping[str, str]
     trainings: str
+    plots: Mapping[str, str] = field(default_factory=dict)
 
     def measure(self, asked: Asked) -> Made:
         """Measure the page, or collect what is finished."""
         module, _, function = self.make.partition(":")
         made: Made = getattr(importlib.import_module(f".{module}", __package__), function)(asked)
         return made
+
+    def drawn(self, made: Made) -> Made:
+        """Return `made` with the pictures that are drawn from its rows alone."""
+        from .plots import curves
+
+        specs = {ending: _FILE["plots"][name] for ending, name in self.plots.items()} if made.rows else {}
+        pictures = {ending: partial(curves, rows=made.rows, spec=spec) for ending, spec in specs.items()}
+        return Made(made.rows, {**pictures, **made.pictures})
 
     @property
     def markers(self) -> tuple[str, str]:
@@ -283,8 +300,8 @@ def page_of(name: str) -> Page:
                 one.get("needs", "table"),
             )
         )
-    captions, trainings = facts.get("pictures", {}), facts["trainings"]
-    return Page(name, facts["title"], facts.get("file", name), facts["make"], tuple(tables), captions, trainings)
+    captions, trainings, plots = facts.get("pictures", {}), facts["trainings"], facts.get("plots", {})
+    return Page(name, facts["title"], facts.get("file", name), facts["make"], tuple(tables), captions, trainings, plots)
 
 
 def page_json(page: Page, rows: Rows) -> str:
@@ -325,6 +342,7 @@ def is_page_file(path: Path) -> bool:
 
 def write_page(folder: Path, page: Page, made: Made) -> None:
     """Write NAME.json, the page's part of its Markdown file, and its pictures, each whole or not at all."""
+    made = page.drawn(made)
     make_folder(folder)
     replace_file(folder / f"{page.name}.json", page_json(page, made.rows).encode())
     _put(folder, page, made.rows, made.pictures)

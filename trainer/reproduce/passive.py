@@ -252,7 +252,7 @@ def passive_page(asked: Asked) -> Made:
             if (row.features, dark) in SHOWN_CELLS and path.with_suffix(".npz").is_file():
                 title = f"d_f = {row.features}, dark {dark:g}\nSSIM {figures['value']:.3f}"
                 samples.append((title, read_samples(path.with_suffix(".npz"))))
-    pictures: dict[str, Draw] = {"": partial(plots.measure_over_patterns, name=name, rows=rows)}
+    pictures: dict[str, Draw] = {}
     if samples:
         pictures["-pictures"] = partial(plots.samples, name=name, cells=samples)
     return Made(rows + direct, pictures)
@@ -321,7 +321,7 @@ def field_page(asked: Asked) -> Made:
             asked.report(f"d_f = {row.features}: not trained yet (pans reproduce {FIELD} --rows {row.features})")
             continue
         rows.append(field_row(row, found, direct))
-    return Made(rows + direct, {"": partial(plots.fibre_field, rows=rows, direct=direct)})
+    return Made(rows + direct)
 
 
 def field_row(row: PassiveRow, found: Row, direct: Rows) -> Row:

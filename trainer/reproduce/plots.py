@@ -14,12 +14,7 @@ from pans.trainer.evaluate.picture_samples import SAMPLES, Samples
 from pans.trainer.figures import new_figure, save_figure, use_files_alone
 
 from .page import FIRST_OBJECTS, Row, Rows, of_table
-from .printed import ACTIVE, PASSIVE
 
-PANS, ENVELOPE = "PANS", "end-to-end, envelope"  # ways that are drawn apart from the others
-TITLES = {"fashion-mnist": "FashionMNIST", "mnist": "MNIST"}
-FIRST, ALL = ("first_200", "first_spread"), ("value", "spread_trials")
-PARTS = ((FIRST, f"first {FIRST_OBJECTS}"), (ALL, "all 10 000"))
 FRAME_TRIALS, PIPELINE_TRIALS = 5, 6
 SHAPES = {16: (4, 4), 32: (4, 8)}  # rows and columns of a frame of clicks
 CELL = 5  # points of a frame's cell, the gap between frames is one
@@ -28,73 +23,60 @@ CELLS = ("C0", "C1", "C2", "0.6")  # classes of cells in passing
 Image = NDArray[np.floating]
 
 
-def _xy(axis: Any, rows: Rows, x: str, y: str, style: str = "o-", **more: Any) -> None:
-    axis.plot([row[x] for row in rows], [row[y] for row in rows], style, **more)
+# ---- curves ----
 
 
-def _bars(axis: Any, rows: Rows, x: str, of: tuple[str, str], **style: Any) -> None:
-    """Draw a figure over `x` with the spread of one trial; `of` names both."""
-    line: dict[str, Any] = {"fmt": "o-", "ms": 3.5, "lw": 1.2, "capsize": 2}
-    axis.errorbar([row[x] for row in rows], [row[of[0]] for row in rows], [row[of[1]] for row in rows], **line | style)
+def curves(path: Path, rows: Rows, spec: Row) -> None:
+    """Draw panels of curves over the rows of a page as a [plots] entry of pages.toml describes them."""
+    from matplotlib.ticker import LogLocator, NullFormatter
 
-
-def _note(axis: Any, text: str, x: float, y: float, away: tuple[int, int], **style: Any) -> None:
-    axis.annotate(text, (x, y), textcoords="offset points", xytext=away, **{"fontsize": 8} | style)
-
-
-def _ticks(axis: Any, places: Sequence[float]) -> None:
-    """Set plain numbers at these places of a logarithmic x axis."""
-    from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
-
-    axis.xaxis.set_major_locator(FixedLocator(list(places)))
-    axis.xaxis.set_minor_locator(NullLocator())
-    axis.xaxis.set_major_formatter(ScalarFormatter())
-
-
-def _finish(figure: Any, axes: Any, path: Path, title: str, legend: str | None = None, **settings: Any) -> None:
-    """Set what the axes share, a grid, a legend in each where `legend` says, and save."""
-    for axis in np.atleast_1d(axes).ravel():
-        axis.set(**settings)
+    panels, down = spec["panels"], spec.get("down", 1)
+    width, height = spec["size"]
+    figure, axes = new_figure(width, height, len(panels) // down, down)
+    named: dict[str, Any] = {}
+    numbers: dict[str, int] = {}  # of the labels, for one colour and marker in all panels
+    for axis, panel in zip(np.atleast_1d(axes).ravel(), panels):
+        for line in panel["lines"]:
+            _lines(axis, rows, numbers, {**spec.get("line", {}), **panel.get("line", {}), **line})
+        axis.set(**spec.get("set", {}) | panel.get("set", {}))
         axis.grid(alpha=0.3)
-        if legend and axis.get_legend_handles_labels()[0]:
-            axis.legend(fontsize=8, loc=legend)
-    figure.suptitle(f"{title} (SIMULATED)", fontsize=10)
+        if axis.get_xscale() == "log":
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.xaxis.set_minor_formatter(NullFormatter())
+        named = dict(zip(*reversed(axis.get_legend_handles_labels()))) | named
+    figure.legend(named.values(), named, loc="outside lower center", ncols=4, fontsize=8)
+    figure.suptitle(f"{spec['title']} (SIMULATED)", fontsize=10)
     save_figure(figure, path)
 
 
-# ---- tables of the tasks ----
+def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row) -> None:
+    """Draw one line per label: `y` over `x` of the rows of a table, with error bars and notes where they are asked for."""
+    x, y = line["x"], line["y"]
+    groups: dict[str, Rows] = {}
+    for row in of_table(rows, line["of"]) if "of" in line else rows:
+        wanted = all(row.get(key) == value for key, value in line.get("where", {}).items())
+        if wanted and row.get(x) is not None and row.get(y) is not None:
+            groups.setdefault(line["label"].format(**row), []).append(row)
+    for label, mine in groups.items():
+        number = numbers.setdefault(label, len(numbers))
+        mine.sort(key=lambda row: float(row[x]))
+        errors = [row.get(line["bars"]) or 0.0 for row in mine] if "bars" in line else None
+        line_style = {
+            "fmt": f"{'os^D'[number // 10 % 4]}-",
+            "color": f"C{number % 10}",
+            "ms": 3.5,
+            "lw": 1.2,
+            "capsize": 2,
+        }
+        style = line_style | line.get("style", {})
+        axis.errorbar([row[x] for row in mine], [row[y] for row in mine], errors, label=label, **style)
+        for row in mine if "note" in line else ():
+            words = line["note"].format(**row)
+            axis.annotate(words, (row[x], row[y]), textcoords="offset points", xytext=(4, -10), fontsize=7)
 
 
-def accuracy_against_photons(path: Path, name: str, rows: Rows) -> None:
-    """Draw the first 200 test images against clicks, as the paper does, and all of them against photons."""
-    figure, (left, right) = new_figure()
-    one = [row for row in of_table(rows, "shots") if row["shots"] == 1]
-    for kind, style in (("simulation", "o--"), ("experiment", "s:")):
-        _xy(left, one, "paper_clicks", kind, style, label=f"paper, {kind}")
-    _xy(left, one, "first_clicks", "first_200", label="ours")
-    left.set(xlabel="clicks per decision", title=f"{name}, first {FIRST_OBJECTS} test images, K = 1")
-    ordered = sorted(of_table(rows, "direct"), key=lambda row: float(row["photons"]))
-    for key, label in (("value", "ours"), ("direct", "direct imaging, exact likelihood")):
-        _xy(right, ordered, "photons", key, label=label)
-    for row in ordered:
-        _note(right, str(row["features"]), row["photons"], row["value"], (4, -10))
-    right.set(xlabel="photons per decision", xscale="log", title="all test images, at equal photons (numbers: d_f)")
-    _ticks(right, [5, 10, 20, 30, 50, 100, 200, 500])
-    _finish(figure, (left, right), path, name, "best", ylabel="accuracy, %")
-
-
-def measure_over_patterns(path: Path, name: str, rows: Rows) -> None:
-    """Draw accuracy or SSIM over the number of patterns, one colour per dark count: ours solid, the paper's dashed."""
-    table = PASSIVE[name]
-    figure, axis = new_figure(width=6.0, panels=1)
-    for i, dark in enumerate(table.dark):
-        printed = [row for row in table.rows if row.values]
-        axis.plot([r.features for r in printed], [r.values[i] for r in printed], "o--", color=f"C{i}", alpha=0.6)
-        if mine := [row for row in rows if row["dark"] == dark]:
-            _xy(axis, mine, "features", "value", color=f"C{i}", label=f"dark counts {dark:g}")
-    whose = "ours solid, the paper's dashed" if any(row.values for row in table.rows) else "ours"
-    unit = "" if table.measure == "SSIM" else ", %"
-    _finish(figure, axis, path, f"{name}: {whose}", "best", xlabel="patterns, d_f", ylabel=table.measure + unit)
+# ---- pictures given back ----
 
 
 def samples(path: Path, name: str, cells: list[tuple[str, Samples]]) -> None:
@@ -122,77 +104,7 @@ def samples(path: Path, name: str, cells: list[tuple[str, Samples]]) -> None:
     save_figure(figure, path)
 
 
-def fibre_field(path: Path, rows: Rows, direct: Rows) -> None:
-    """Draw accuracy over the number of detectors beside the paper's for its input, and over photons beside direct imaging."""
-    figure, (over, light) = new_figure(width=10.5, panels=2)
-    _xy(over, rows, "features", "value", label="ours")
-    _xy(over, rows, "features", "paper", "s--", color="0.6", label="the paper, its own input")
-    _xy(light, rows, "photons", "value", label="ours, photons detected")
-    _xy(light, rows, "reaching", "value", "x:", color="C0", label="ours, must reach the optics")
-    _xy(light, direct, "photons", "value", "k-", label="direct imaging")
-    over.set(xlabel="detectors, d_f")
-    light.set(xlabel="photons per digit", xscale="log")
-    title = "digits behind a fibre as a field, W complex and conserving"
-    _finish(figure, (over, light), path, title, "lower right", ylabel="accuracy, %")
-
-
 # ---- trained rows ----
-
-
-def fig_3(path: Path, rows: Rows) -> None:
-    """Draw accuracy over d_f at one shot: the paper's experiment and band of simulation, ours on its images and on all."""
-    figure, panels = new_figure(width=11.0, height=4.6)
-    for axis, name in zip(panels, ACTIVE):
-        mine = [row for row in rows if row["set"] == name]
-        x, simulation, band = (
-            np.array([row[key] for row in mine]) for key in ("features", "simulation", "simulation_std")
-        )
-        shade = {"color": "C3", "alpha": 0.15, "lw": 0, "label": "paper, simulation, mean ± 3 spreads"}
-        axis.fill_between(x, simulation - 3 * band, simulation + 3 * band, **shade)
-        _bars(axis, mine, "features", ("experiment", "experiment_std"), fmt="s", color="C3", label="paper, experiment")
-        for (of, words), colour in zip(PARTS, ("C0", "C2")):
-            _bars(axis, mine, "features", of, color=colour, label=f"ours, {words}")
-        for row in mine:
-            _note(axis, f"{row['clicks']:.1f}", row["features"], row["value"], (5, -13), color="C2")
-        axis.set_title(f"{TITLES[name]}, K = 1")
-    title = "bars: spread of one trial; numbers: our clicks per decision, all images"
-    _finish(figure, panels, path, title, "lower right", xlabel="patterns, d_f", ylabel="accuracy, %")
-
-
-def multi_shot(path: Path, rows: Rows) -> None:
-    """Draw accuracy over d_f x K, one curve per d_f: the paper's simulation, ours on its images, ours on all."""
-    figure, panels = new_figure(width=12.0, height=7.4, panels=3, rows=2)
-    sets = ((("simulation", "simulation_std"), "paper, simulation"), *((of, f"ours, {words}") for of, words in PARTS))
-    for across, name in zip(panels, ACTIVE):
-        for axis, (of, whose) in zip(across, sets):
-            for i, row in enumerate(ACTIVE[name]):
-                curve = [point for point in rows if (point["set"], point["features"]) == (name, row.features)]
-                _bars(axis, curve, "detections", of, color=f"C{i}", label=f"d_f = {row.features}")
-            axis.set(xscale="log", title=f"{TITLES[name]}: {whose}")
-            _ticks(axis, [2.0**k for k in range(1, 10)])
-            axis.sharey(across[0])
-        across[0].set_ylabel("accuracy, %")
-        across[2].legend(fontsize=8, loc="lower right")
-    _finish(
-        figure, panels, path, "K = 1, 2, 3, 5 along each curve; bars: spread of one trial", xlabel="detections, d_f x K"
-    )
-
-
-def robustness(path: Path, rows: Rows, sweep: str) -> None:
-    """Draw accuracy over the light or the dark counts, one curve per d_f: the paper's images, and all."""
-    label, mark = {"eta": ("light, times the trained (eta)", 1.0), "dark": ("dark counts of an exposure", 0.1)}[sweep]
-    figure, panels = new_figure(width=11.0, height=4.8)
-    for axis, (of, words) in zip(panels, PARTS):
-        for i, features in enumerate(dict.fromkeys(row["features"] for row in rows)):
-            curve = [point for point in rows if point["features"] == features]
-            _bars(axis, curve, "setting", of, color=f"C{i}", label=f"d_f = {features}")
-        axis.axvline(mark, color="grey", lw=0.8, ls=":")
-        axis.axhline(10, color="grey", lw=0.8, ls="--")
-        axis.set(xscale="log", title=f"FashionMNIST, {words}, K = 1", ylim=(0, 90))
-    free = "lower center" if sweep == "eta" else "lower left"
-    _finish(
-        figure, panels, path, "bars: spread of one trial; dashed: guessing", free, xlabel=label, ylabel="accuracy, %"
-    )
 
 
 def confusions(path: Path, rows: Rows, name: str) -> None:
@@ -216,7 +128,7 @@ def confusions(path: Path, rows: Rows, name: str) -> None:
     for axis in axes[len(rows) :]:
         axis.set_axis_off()
     words = "K = 1, all 10 000 test images; true class down, decision across, numbers in % from 1 % on (SIMULATED)"
-    figure.suptitle(f"{TITLES[name]}, {words}", fontsize=10)
+    figure.suptitle(f"{name}, {words}", fontsize=10)
     save_figure(figure, path)
 
 
@@ -366,155 +278,7 @@ def frames(path: Path, classes: Sequence[str], shown: dict[float, NDArray[np.flo
     save_figure(figure, path)
 
 
-def information(path: Path, rows: Rows) -> None:
-    """Draw bits, and Fisher's ratios, over photons: frames and click words."""
-    figure, panels = new_figure(width=13.0, panels=3)
-    for way in dict.fromkeys(row["way"] for row in rows):
-        mine = [row for row in rows if row["way"] == way]
-        for axis, key in zip(panels, ("bits", "trace", "discriminant")):
-            _xy(axis, [row for row in mine if row.get(key) is not None], "photons", key, label=way)
-    panels[0].axhline(np.log2(10), color="grey", lw=0.8, ls=":")  # all there is to know of ten classes
-    panels[0].set(ylabel="bits of the label, at least", ylim=(0, 3.5))
-    panels[1].set(ylabel="Fisher: tr(S_b) / tr(S_w)", yscale="log", ylim=(1e-4, 3))
-    panels[2].set(ylabel="Fisher: tr(S_w^-1 S_b)")
-    title = "what 784 photon counters and ten click words tell of the label, FashionMNIST"
-    _finish(figure, panels, path, title, "best", xlabel="photons per decision", xscale="log")
-
-
-def paradigms(path: Path, rows: Rows) -> None:
-    """Draw accuracy as the paper does (PANS over clicks, the others over photons), over photons, and over illumination."""
-    figure, panels = new_figure(width=15.0, height=5.6, panels=3)
-    for number, way in enumerate(dict.fromkeys(row["way"] for row in rows)):
-        mine, ours = [row for row in rows if row["way"] == way], way == PANS
-        style: dict[str, Any] = (
-            {"color": "k", "lw": 2, "ms": 5} if ours else {"color": f"C{number}", "lw": 1.2, "ms": 3}
-        )
-        places = ("first_clicks" if ours else "first_photons", "photons", "illumination")
-        for axis, x, y in zip(panels, places, ("first_200", "value", "value")):
-            _xy(axis, mine, x, y, "o--" if "posterior" in way else "o-", label=way, **style)
-            for row in mine if ours else ():
-                _note(axis, str(row["features"]), row[x], row[y], (5, -9), fontsize=7)
-    for kind, line, colour in (("simulation", "^:", "r"), ("experiment", "s:", "m")):
-        printed = ACTIVE["fashion-mnist"]
-        values = [getattr(row, kind)[0] for row in printed]
-        panels[0].plot(
-            [row.clicks for row in printed], values, line, color=colour, ms=4, label=f"the paper's PANS, {kind}"
-        )
-    panels[0].set(
-        xlabel="PANS: clicks; the others: photons",
-        ylabel="accuracy, %",
-        title="first 200 test images, as the paper counts",
-    )
-    panels[1].set(xlabel="photons detected per decision", title="all test images, at equal photons detected")
-    panels[2].set(xlabel="illumination (sum of pattern intensities)", title="all test images, at equal illumination")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
-    title = (
-        "FashionMNIST, K = 1; baselines with perfect photon counters, PANS with thresholded detectors (numbers: d_f)"
-    )
-    _finish(figure, panels, path, title, xscale="log", ylim=(5, 92))
-
-
-def end_to_end(path: Path, rows: Rows) -> None:
-    """Draw one curve per number of patterns, light to dark, and the envelope as a thick one."""
-    from matplotlib import colormaps
-
-    figure, axis = new_figure(width=7.0, height=4.6, panels=1)
-    ways = list(dict.fromkeys(row["way"] for row in rows))
-    for number, way in enumerate(ways):
-        green = colormaps["Greens"](0.3 + 0.65 * number / max(1, len(ways) - 2))
-        style: dict[str, Any] = (
-            {"color": "k", "lw": 4, "alpha": 0.35, "style": "-"} if way == ENVELOPE else {"color": green, "lw": 1}
-        )
-        mine = [row for row in rows if row["way"] == way]
-        _xy(axis, mine, "photons", "value", ms=3, label=way.removeprefix("end-to-end, "), **style)
-    axis.axhline(10, color="grey", lw=0.8, ls=":")
-    axis.set(xscale="log", xlabel="photons detected per decision", ylabel="accuracy, %")
-    _finish(figure, axis, path, "conventional end-to-end, FashionMNIST, all test images", "best")
-
-
-def sensing_map(path: Path, rows: Rows) -> None:
-    """Draw accuracy of compressive sensing over the number of patterns (down) and photons (across), with the numbers."""
-    levels, features = (list(dict.fromkeys(row[key] for row in rows)) for key in ("photons_asked", "features"))
-    values = np.array([row["value"] for row in rows]).reshape(len(features), len(levels))
-    figure, axis = new_figure(width=6.8, height=4.4, panels=1)
-    shown = axis.imshow(values, cmap="viridis", vmin=10, vmax=85, aspect="auto", origin="lower")
-    for (y, x), value in np.ndenumerate(values):
-        axis.text(x, y, f"{value:.1f}", ha="center", va="center", fontsize=9, color="w" if value < 60 else "k")
-    axis.set_xticks(range(len(levels)), [f"{level:g}" for level in levels])
-    axis.set_yticks(range(len(features)), [str(each) for each in features])
-    axis.set(xlabel="photons detected per decision", ylabel="patterns d_f")
-    figure.colorbar(shown, label="accuracy, all test images, %")
-    axis.set_title("compressive sensing, trained on clean measurements (SIMULATED)", fontsize=10)
-    save_figure(figure, path)
-
-
-def sensing_training(path: Path, rows: Rows) -> None:
-    """Draw loss and accuracy on clean measurements over the epochs, one colour per number of patterns."""
-    figure, (left, right) = new_figure(width=10.0, height=4.0)
-    for number, row in enumerate(rows):
-        epochs, style = row["epochs"], {"color": f"C{number}", "ms": 3}
-        x, label = range(1, len(epochs["loss"]) + 1), f"d_f = {row['features']}"
-        left.plot(x, epochs["loss"], "o-", label=label, **style)
-        right.plot(x, epochs["training"], ":", **style)
-        right.plot(x, epochs["held_out"], "o-", label=label, **style)
-    left.set(ylabel="training loss")
-    right.set(ylabel="accuracy on clean measurements, %", title="dotted: training objects, solid: test images")
-    _finish(
-        figure, (left, right), path, "compressive sensing, random binary patterns, FashionMNIST", "best", xlabel="epoch"
-    )
-
-
 # ---- trainings, cells in passing, the frontier ----
-
-
-def courses(path: Path, rows: Rows) -> None:
-    """Draw training and held-out accuracy and illumination over the epochs, one panel per training."""
-    figure, axes = new_figure(width=3.1 * len(rows) + 0.6, height=3.3, panels=len(rows))
-    panels = list(np.atleast_1d(axes))
-    for axis, row in zip(panels, rows):
-        epochs = row["epochs"]
-        x = range(1, len(epochs["training"]) + 1)
-        lines = axis.plot(x, epochs["training"], color="C0", label="training objects")
-        lines += axis.plot(x, epochs["held_out"], color="C1", label="test images")
-        illumination = axis.twinx()
-        lines += illumination.plot(x, epochs["illumination"], "--", color="C2", label="illumination (right)")
-        illumination.set_ylim(0, 1.15 * max(epochs["illumination"]))
-        axis.set_title(f"d_f = {row['features']}, alpha = {row['alpha']:g}", fontsize=9)
-        if axis is panels[0]:
-            axis.set_ylabel("accuracy, %")
-            axis.legend(handles=lines, fontsize=7, loc="lower right")
-    lowest = min(min(row["epochs"]["held_out"]) for row in rows)
-    title = "FashionMNIST, K = 1, one draw of clicks after every epoch"
-    _finish(figure, panels, path, title, xlabel="epoch", ylim=(lowest - 2, 92))
-
-
-def stages(path: Path, patterns: dict[int, Image], peaks: list[float]) -> None:
-    """Draw normalised patterns (mean 1 over all), one row per stage with its own scale, and the largest value over the epochs.
-
-    Above each pattern stands its mean. The colours follow the square root: few pixels hold most of the light.
-    """
-    from matplotlib import pyplot
-    from matplotlib.colors import PowerNorm
-
-    use_files_alone()
-    count = len(next(iter(patterns.values())))
-    figure = pyplot.figure(figsize=(1.0 * count + 1.2, 1.3 * len(patterns) + 2.4), layout="constrained")
-    parts: Any = figure.subfigures(2, 1, height_ratios=(1.3 * len(patterns), 2.2))
-    axes: Any = parts[0].subplots(len(patterns), count, squeeze=False)
-    for line, letter, (after, normal) in zip(axes, "abcdefgh", patterns.items()):
-        top = float(normal.max())
-        for axis, pattern in zip(line, normal):
-            axis.imshow(
-                pattern.reshape(math.isqrt(pattern.size), -1), cmap="magma", norm=PowerNorm(0.5, vmin=0, vmax=top)
-            )
-            axis.set(xticks=[], yticks=[])
-            axis.set_title(f"{pattern.mean():.2f}", fontsize=7)
-        line[0].set_ylabel(f"{letter}: epoch {after}\nto {top:.0f}", fontsize=8)
-    axis = parts[1].subplots()
-    axis.plot(range(1, len(peaks) + 1), peaks, "o-", ms=3)
-    axis.set(xlabel="epoch", ylabel="largest over mean", ylim=(0, None))
-    parts[0].suptitle("patterns over their common mean; numbers: mean of a pattern (SIMULATED)", fontsize=9)
-    save_figure(figure, path)
 
 
 def sequence(path: Path, found: Row, margin: float) -> None:
@@ -543,43 +307,17 @@ def sequence(path: Path, found: Row, margin: float) -> None:
     save_figure(figure, path)
 
 
-def patterns(path: Path, levels: Any, side: int) -> None:
-    """Draw patterns (n, side * side), each by the root of its light over its brightest; above each its illumination."""
-    shown = np.sqrt(np.array(levels)).reshape(-1, side, side)
-    across = (len(shown) + 1) // 2
-    figure, axes = new_figure(width=1.9 * across, height=4.2, panels=across, rows=2)
-    for axis in axes.ravel():
-        axis.set_axis_off()
-    for number, (axis, pattern) in enumerate(zip(axes.ravel(), shown)):
-        axis.imshow(pattern, cmap="magma", vmin=0, vmax=max(float(pattern.max()), 1e-12))
-        axis.set_title(f"{number + 1}: {float(np.sum(levels[number])):.1f}", fontsize=8)
-    figure.suptitle("patterns, root of the light; above each: its illumination (SIMULATED)", fontsize=10)
-    save_figure(figure, path)
-
-
-def frontier(path: Path, points: Rows) -> None:
-    """Draw a row of two panels per task: accuracy on all images over photons and over clicks, and the paper's points over clicks."""
-    figure, panels = new_figure(width=12.5, height=10.5, panels=2, rows=len(TITLES))
-    ways = list(dict.fromkeys(row["way"] for row in points))
-    for across, name in zip(panels, TITLES):
-        for axis, key in zip(across, ("photons", "clicks")):
-            for number, way in enumerate(ways):
-                curve = sorted((r for r in points if (r["task"], r["way"]) == (name, way)), key=lambda r: float(r[key]))
-                errors = [math.hypot(row["error_seeds"] or 0.0, row["error_objects"]) for row in curve]
-                style = {
-                    "color": f"C{number % 10}",
-                    "fmt": "os^Dv"[number // 10] + ("-" if "automaton" in way else "--"),
-                }
-                x, y = ([row[of] for row in curve] for of in (key, "value"))
-                axis.errorbar(x, y, errors, label=way, ms=4, lw=1.2, capsize=2, **style)
-            axis.set(xscale="log", xlabel=f"{key} per decision", ylabel="accuracy, %", title=TITLES[name])
-            _ticks(axis, [1, 2, 4, 6, 10, 17, 40, 100, 200])
-            axis.grid(alpha=0.3)
-        printed = ACTIVE[name]
-        values = [row.simulation[0] for row in printed]
-        across[1].plot(
-            [row.clicks for row in printed], values, "kx:", label=f"paper, fixed patterns, first {FIRST_OBJECTS}"
-        )
-    figure.legend(*panels[0][1].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
-    figure.suptitle("all 10 000 test images; bars: standard errors (SIMULATED)", fontsize=10)
+def patterns(path: Path, lines: dict[str, Image], title: str) -> None:
+    """Draw patterns (n, pixels), one line per key with its own scale, by the root of the light; above each its sum."""
+    figure, axes = new_figure(
+        1.1 * len(next(iter(lines.values()))) + 1, 1.35 * len(lines) + 0.6, len(next(iter(lines.values()))), len(lines)
+    )
+    for across, (label, shown) in zip(np.atleast_2d(axes), lines.items()):
+        for axis, pattern in zip(across, shown):
+            root = np.sqrt(pattern).reshape(math.isqrt(pattern.size), -1)
+            axis.imshow(root, cmap="magma", vmin=0, vmax=max(float(np.sqrt(shown.max())), 1e-12))
+            axis.set(xticks=[], yticks=[])
+            axis.set_title(f"{pattern.sum():.3g}", fontsize=7)
+        across[0].set_ylabel(label, fontsize=8)
+    figure.suptitle(f"{title} (SIMULATED)", fontsize=9)
     save_figure(figure, path)

@@ -72,7 +72,7 @@ def information_page(asked: Asked) -> Made:
             errors = [sampling_error(one["value"], one["objects"]) for one in (row, other)]
             row |= against(row["value"], other["value"], *errors)
     rows = frames + words
-    return Made(rows, {"": partial(plots.information, rows=rows)})
+    return Made(rows)
 
 
 def _information_of_frames(task: Task) -> Rows:

@@ -96,7 +96,7 @@ def _parts(part: Objects) -> tuple[U8, I64, U8]:
 
 
 def sequence_page(asked: Asked) -> Made:
-    """Return rows of single frames and whole passages, and one per cell of the sequence."""
+    """Return one row per way to judge: single frames and whole passages. The pictures show a sequence of cells."""
     made_with = {
         "options": differing_options(OPTIONS),
         "cells": [TRAINED, JUDGED, SHOWN],
@@ -108,9 +108,10 @@ def sequence_page(asked: Asked) -> Made:
         asked.report("sequence: not measured yet (pans reproduce sequence)")
         return Made([])
     strip = partial(plots.sequence, found=found, margin=SIDE_PX / (2 * STEP_PX))
-    return Made(
-        found["rows"], {"": strip, "-patterns": partial(plots.patterns, levels=found["patterns"], side=SIDE_PX)}
+    drawn = partial(
+        plots.patterns, lines={"light": np.array(found["patterns"])}, title="ten patterns and their illumination"
     )
+    return Made(found["rows"], {"": strip, "-patterns": drawn})
 
 
 def _measured(asked: Asked) -> Row:
@@ -120,7 +121,7 @@ def _measured(asked: Asked) -> Row:
     task = task_in_passing(whole)
     trained = train(task, load_profile(PROFILE), OPTIONS)
     shown = _sequence(task, whole, trained)
-    rows = [*_of_frames(task, trained), _of_passages(task, whole, trained), *_of_cells(shown, list(task.classes))]
+    rows = [*_of_frames(task, trained), _of_passages(task, whole, trained)]
     assert trained.quantised is not None, "active encoders have levels"
     patterns = np.round(trained.quantised.patterns(), 4).tolist()
     return {"rows": rows, **shown, "patterns": patterns, "classes": task.classes}
@@ -167,7 +168,7 @@ def _sequence(task: Task, whole: Task, trained: Trained) -> Row:
         fields += [cells[index], empty[place + 1]]
     strip = np.concatenate(fields)
     starts = range(0, len(strip) - SIDE_PX + 1, STEP_PX)
-    light, words = _shots(task, np.stack([strip[s : s + SIDE_PX] for s in starts]), trained, seed=3)
+    _, words = _shots(task, np.stack([strip[s : s + SIDE_PX] for s in starts]), trained, seed=3)
     middles = np.array(
         [(2 * place + 1) * SIDE_PX for place in range(len(order))]
     )  # first row of the window on that cell
@@ -176,28 +177,8 @@ def _sequence(task: Task, whole: Task, trained: Trained) -> Row:
         "words": words.tolist(),
         "outputs": np.exp(_log_outputs(trained)[words]).round(3).tolist(),
         "truth": [truth_at(s - int(middles[k]), int(labels[order[k]])) for s, k in zip(starts, nearest)],
-        "cell": nearest,
-        "photons": light.sum(axis=1).round(3).tolist(),
-        "labels": [int(labels[index]) for index in order],
         "strip": strip[:: len(strip) // 600 + 1, :: SIDE_PX // 25].tolist(),
     }
-
-
-def _of_cells(shown: Row, names: list[str]) -> Rows:
-    """What was decided on each cell of the sequence: frames right of those in the middle, and the evidence of them added."""
-    outputs, truth, cell = (np.array(shown[key]) for key in ("outputs", "truth", "cell"))
-    clicks, photons = _bits(np.array(shown["words"])).sum(axis=1), np.array(shown["photons"])
-    rows = []
-    for place, label in enumerate(shown["labels"]):
-        here = (cell == place) & (truth == label)
-        sums = np.log(outputs[here] + 1e-3).sum(axis=0)
-        facts: Row = {"table": "cells", "cell": place + 1, "class": names[label], "frames": int(here.sum())}
-        facts |= {
-            "right": int((outputs[here].argmax(axis=1) == label).sum()),
-            "decided": names[int(sums[:NULL].argmax())],
-        }
-        rows.append(facts | {"clicks": int(clicks[here].sum()), "photons": float(photons[here].sum())})
-    return rows
 
 
 def _shots(task: Task, images: U8, trained: Trained, seed: int) -> tuple[F64, I64]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +17,27 @@ from pans.trainer.evaluate.accuracy import (
     EXACT_OUTCOMES_MAX,
     Light,
     decision_shares,
-    evaluate_exactly,
-    evaluate_sampled,
     light_of,
-    row_of,
     sampled_shares,
 )
 from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.tasks.registry import Objects, load_task
 
 from . import plots
-from .active import PARTS, PROFILE, TrainedRow, beside_paper, measured_on, shot_figures, trained_rows
+from .active import (
+    EXACT_WORK_MAX,
+    PARTS,
+    PROFILE,
+    TRIALS,
+    TRIALS_OF_ALL,
+    TrainedRow,
+    beside_paper,
+    enumerable,
+    judged,
+    measured_on,
+    shot_figures,
+    trained_rows,
+)
 from .page import FIRST_OBJECTS, VERDICTS, Asked, Draw, Made, Row, Rows, against, flat, interpolated, sampling_error
 from .printed import ACTIVE, SHOTS
 
@@ -36,9 +47,6 @@ SETTINGS = {  # factors of the light, dark counts of an exposure
     "dark": tuple(10.0 ** (exponent / 4) for exponent in range(-12, 1)),
 }
 SHOWN = (0.001, 0.01, 0.1, 1.0, 10.0, 100.0)  # settings that the page names
-TRIALS = {FIRST_OBJECTS: 100}
-TRIALS_OF_ALL = 10
-EXACT_WORK_MAX = 1 << 25  # objects times click words
 LEVEL = 2.0  # points below the best that still count as level with it
 WORST = 3  # confusions that a table names
 SHOT_FEATURES = (16, 32)  # of the page single-shot
@@ -63,7 +71,7 @@ def fig_3_page(asked: Asked) -> Made:
         for name in ACTIVE
         for row in trained_rows(asked, name)
     ]
-    return Made(rows, {"": partial(plots.fig_3, rows=rows)})
+    return Made(rows)
 
 
 def multi_shot_page(asked: Asked) -> Made:
@@ -74,7 +82,7 @@ def multi_shot_page(asked: Asked) -> Made:
         for row in trained_rows(asked, name)
         for shots in SHOTS
     ]
-    return Made(duels(points), {"": partial(plots.multi_shot, rows=points)})
+    return Made(duels(points) + points)
 
 
 def duels(points: Rows) -> Rows:
@@ -129,29 +137,15 @@ def _duels(rows: Rows, pair: tuple[int, int], spent: str, value: str, error: str
 
 def measure_setting(bundle: Bundle, test: Objects, sweep: str, setting: float) -> Row:
     """Return the figures of `bundle` at that factor of the light (`eta`), or with that many dark counts per exposure (`dark`)."""
-    eta, dark = (setting, None) if sweep == "eta" else (1.0, setting)
-    found = {}
-    for part, count in PARTS.items():
-        objects = test.first(count)
-        lit = light_of(bundle, load_profile(PROFILE), objects.images, eta=eta, dark=dark)
-        if enumerable(bundle, len(objects)):
-            found[part] = row_of(evaluate_exactly(bundle, lit, objects.labels))
-        else:
-            trials = TRIALS.get(len(objects), TRIALS_OF_ALL)
-            found[part] = row_of(evaluate_sampled(bundle, lit, objects.labels, shots=1, trials=trials, seed=1))
-    return {"setting": setting, **found}
-
-
-def enumerable(bundle: Bundle, objects: int) -> bool:
-    """Return whether a page enumerates all click words of one shot for that many objects, or samples them."""
-    return objects << bundle.n_features <= EXACT_WORK_MAX
+    how: dict[str, Any] = {sweep: setting}
+    return {"setting": setting, **{part: judged(bundle, test.first(count), **how) for part, count in PARTS.items()}}
 
 
 def swept_page(asked: Asked) -> Made:
     """Return one row per number of patterns as trained, with the effect of the sweep, and one per setting."""
     sweep = "dark" if asked.name == "dark-counts" else "eta"
     settings, trained, rows = SETTINGS[sweep], [], []
-    facts = {"settings": settings, "trials": [TRIALS[FIRST_OBJECTS], TRIALS_OF_ALL], "exact": EXACT_WORK_MAX}
+    facts = {"settings": settings, "trials": [TRIALS, TRIALS_OF_ALL], "exact": EXACT_WORK_MAX}
     for row in trained_rows(asked, SWEPT):
         made = measured_on(asked, row, facts, partial(_all_settings, row, asked.data_dir, sweep))
         if made is not None:
@@ -163,7 +157,7 @@ def swept_page(asked: Asked) -> Made:
             for found in swept:
                 shown = any(math.isclose(found["setting"], setting) for setting in SHOWN)
                 rows.append({"table": "swept", "shown": shown} | of_row | found)
-    return Made(trained + rows, {"": partial(plots.robustness, rows=rows, sweep=sweep)})
+    return Made(trained + rows)
 
 
 def _all_settings(row: TrainedRow, data_dir: str | None, sweep: str) -> Row:
@@ -212,7 +206,7 @@ def confusion_page(asked: Asked) -> Made:
     for name in ACTIVE:
         drawn = []
         for row in trained_rows(asked, name):
-            facts = {"trials": [TRIALS[FIRST_OBJECTS], TRIALS_OF_ALL]}
+            facts = {"trials": [TRIALS, TRIALS_OF_ALL]}
             made = measured_on(asked, row, facts, partial(_matrix, row, asked.data_dir))
             if made is not None:
                 found = {"table": "confusion", "set": name, "features": row.features} | shot_figures(row.figures)

@@ -69,8 +69,8 @@ def asked(cache, monkeypatch):
 def write(folder, name, made):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
     write_page(folder, page_of(name), made)
-    assert set(made.pictures) == {*page_of(name).captions}
-    assert all((folder / f"{name}{ending}.png").stat().st_size > 5000 for ending in made.pictures)
+    assert set(page_of(name).drawn(made).pictures) == {*page_of(name).captions}
+    assert all((folder / f"{name}{ending}.png").stat().st_size > 5000 for ending in page_of(name).drawn(made).pictures)
 
 
 def test_points_meet_where_the_curves_of_more_patterns_reach():
@@ -101,7 +101,7 @@ def test_shots_and_fig_3_stand_on_the_figures_of_the_table(asked, cache, tmp_pat
     assert "fashion-mnist d_f=6 is not trained yet: pans reproduce fashion-mnist --rows 6" in said
     write(tmp_path, "fig-3", first)
     shots = trained.multi_shot_page(question("multi-shot"))
-    assert {row["duels"] for row in shots.rows} == {0}  # one number of patterns alone
+    assert {row["duels"] for row in of_table(shots.rows, "duels")} == {0}  # one number of patterns alone
     write(tmp_path, "multi-shot", shots)
 
 
@@ -119,7 +119,7 @@ def test_light_and_dark_counts_are_measured_once(asked, monkeypatch, tmp_path, n
     assert trained.swept_page(question(name, collect=True)).rows == []
     assert f"{name}: fashion-mnist, d_f = 4 is not measured yet" in said
     made = trained.swept_page(question(name))
-    monkeypatch.setattr(trained, "measure_setting", None)
+    monkeypatch.setattr(trained, "judged", None)
     assert trained.swept_page(question(name, collect=True)).rows == made.rows
     (base,), rows = of_table(made.rows, "trained"), {row["setting"]: row for row in of_table(made.rows, "swept")}
     if name == "eta":
