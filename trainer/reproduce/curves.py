@@ -1,35 +1,46 @@
-"""Accuracy of FashionMNIST against photons: PANS beside the alternatives (paper, Fig. 2E), end-to-end optimisation, compressive sensing.
+"""Accuracy against light: PANS beside the alternatives (paper, Fig. 2E), end-to-end optimisation, compressive sensing, and the frontier.
 
-PANS' rows are those of `pans reproduce fashion-mnist` in the same cache folder; every curve is one `pans baseline` command.
+PANS' rows are those of `pans reproduce fashion-mnist` in the same cache folder; the other ways are in ways.toml.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import statistics
+from dataclasses import replace
 from functools import partial
+from itertools import groupby
 
-from pans.trainer.baselines.common import Decide, measure, run_trials, silent
+from pans.trainer.baselines.common import Decide, measure, run_trials
 from pans.trainer.baselines.networks import EpochOfFit, clean_mlp, patterns
-from pans.trainer.baselines.options import METHODS, BaselineOptions
-from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.tasks.registry import load_task
 
-from .active import finished_row, shot_figures
-from .page import FIRST_OBJECTS, Asked, Made, Row, Rows, against, by_epoch, flat, interpolated, kept
+from .active import OTHER_SEEDS, finished_row, shot_figures
+from .dynamics import ALPHAS, training
+from .page import FIRST_OBJECTS, Asked, Made, Row, Rows, against, by_epoch, flat, interpolated, kept, sampling_error
 from .printed import ACTIVE, DIRECT
+from .ways import measured_points
 
 TASK = "fashion-mnist"
-LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3, 5e3, 1e4, 1e6)
-POSTERIOR_LEVELS = LEVELS[:7]  # at more it is a nearest neighbour
-SENSING_LEVELS = (5.0, 100.0)
-NETWORK_LEVELS = (100.0, 1e3, 1e4)  # a training each
-E2E_FEATURES = (3, 4, 6, 8, 10, 16, 24, 32, 64)  # the paper's
 PANS, ENVELOPE = "PANS", "end-to-end, envelope"
-
-FEATURES = (4, 16, 32, 64, 128, 256, 784)  # of the page `compressive`
-SENSINGS = (  # patterns, convolutions, epochs, d_f
-    *(("binary", False, 15, features) for features in FEATURES),
+EXACT, STOPPING, CLEAN = "direct, exact posterior", "direct, stops when sure", "direct, network of clean frames"
+FIXED, FIXED_LIGHT = "ours, fixed, held to clicks", "ours, fixed, light weighed"
+LONGER = (
+    "automaton",
+    "automaton, trained on",
+    "larger automaton",
+    "larger automaton, trained on",
+    "larger automaton, trained on twice",
+)
+BUDGETED = (
+    *LONGER,
+    "small automaton",
+    "automaton, held to clicks",
+)  # ways that the paper's click budgets are compared with
+MEANS = ("exposures", "value", "error_objects", "first_200", "clicks", "photons", "illumination")
+SENSINGS = (  # of the page compressive: patterns, convolutions, epochs, d_f
+    *(("binary", False, 15, features) for features in (4, 16, 32, 64, 128, 256, 784)),
     ("gaussian", False, 15, 64),
     ("binning", False, 15, 64),
     ("binary", True, 5, 64),
@@ -40,80 +51,23 @@ PHOTONS = (10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
 TRIALS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Curve:
-    """One way over photon levels, on `TASK`."""
-
-    way: str
-    options: BaselineOptions
-    levels: tuple[float, ...]
-
-    @property
-    def words(self) -> tuple[str, ...]:
-        """The words of `pans baseline` that measure the curve alone, but for the task; the cache knows the curve by them."""
-        o = self.options
-        of_patterns = () if o.paradigm == "direct" else ("--features", str(o.features))
-        family = ("--patterns", o.patterns) if o.paradigm == "compressive" else ()
-        method = () if o.method == METHODS["e2e"][0] else ("--method", o.method)
-        epochs = () if o.epochs is None else ("--epochs", str(o.epochs))
-        photons = ("--photons", *(f"{level:g}" for level in self.levels))
-        return (o.paradigm, *of_patterns, *family, *method, *epochs, "--trials", str(o.trials), *photons)
-
-
-def _sensing(family: str, method: str, trials: int) -> BaselineOptions:
-    return BaselineOptions("compressive", method, features=64, patterns=family, trials=trials)
-
-
-CLEAN = Curve("direct, network of clean frames", BaselineOptions("direct", "clean-cnn", epochs=2, trials=2), LEVELS)
-POSTERIOR = Curve("direct, exact posterior", BaselineOptions("direct", "bayes", trials=2), POSTERIOR_LEVELS)
-CURVES = (  # what takes longest is last
-    CLEAN,
-    POSTERIOR,
-    Curve("random binary, clean features", _sensing("binary", "clean-mlp", 5), LEVELS),
-    Curve("Hadamard, clean features", _sensing("hadamard", "clean-mlp", 5), LEVELS),
-    Curve("random binary, exact posterior", _sensing("binary", "bayes", 2), SENSING_LEVELS),
-    Curve("Hadamard, exact posterior", _sensing("hadamard", "bayes", 2), SENSING_LEVELS),
-    Curve("direct, network of each level", BaselineOptions("direct", "cnn", epochs=2, trials=2), NETWORK_LEVELS),
-)
-
-
-def curve_rows(asked: Asked, curve: Curve) -> Rows:
-    """Return the rows of a curve, each with its `way`; none where it was not measured and nothing is to be measured."""
-    name = "-".join(word.lstrip("-").replace(".", "") for word in curve.words[: curve.words.index("--photons")])
-
-    def make() -> Row:
-        return {"rows": list(baseline_rows(load_task(TASK, asked.data_dir), curve.options, curve.levels, silent))}
-
-    found = kept(asked.cache / f"baseline-{name}.json", {"words": curve.words}, make, collect=asked.collect)
-    words = f"pans baseline {curve.words[0]} --task {TASK} {' '.join(curve.words[1:])}"
-    asked.report(f"{curve.way}: {'not measured yet' if found is None else 'measured'} ({words})")
-    rows = [] if found is None else found["rows"]
-    facts: Row = {"table": "curves", "way": curve.way}
-    return [facts | {key: r[key] for key in ("features", "photons_asked")} | flat(r, r["first_200"]) for r in rows]
-
-
-def end_to_end_rows(asked: Asked) -> Rows:
-    """Return conventional end-to-end optimisation with every number of patterns."""
-    curves = [
-        Curve(f"end-to-end, d_f = {d}", BaselineOptions("e2e", "qat", features=d, trials=5), LEVELS)
-        for d in E2E_FEATURES
-        if asked.wants(d)
-    ]
-    return [row for curve in curves for row in curve_rows(asked, curve)]
+def curve_rows(asked: Asked, page: str) -> Rows:
+    """Return the ways of a page over their levels of photons."""
+    return [{"table": "curves"} | row for row in measured_points(asked, page)]
 
 
 def envelope(rows: Rows) -> Rows:
     """Return the best of all rows at each photon level, as rows of the way `ENVELOPE`; chosen by all test objects."""
-    levels = sorted({row["photons_asked"] for row in rows})
-    best = [max((r for r in rows if r["photons_asked"] == n), key=lambda r: float(r["value"])) for n in levels]
+    levels = sorted({row["level"] for row in rows})
+    best = [max((r for r in rows if r["level"] == n), key=lambda r: float(r["value"])) for n in levels]
     return [row | {"way": ENVELOPE, "table": "envelope"} for row in best]
 
 
 def fig_2e_page(asked: Asked) -> Made:
     """Return the rows of every curve and of the envelope, and PANS beside direct imaging and the envelope at equal light."""
-    curves = [row for curve in CURVES for row in curve_rows(asked, curve)]
-    best = [row | {"table": "curves"} for row in envelope(end_to_end_rows(asked))]
-    posterior = [row for row in curves if row["way"] == POSTERIOR.way]
+    curves = curve_rows(asked, "fig-2e")
+    best = [row | {"table": "curves"} for row in envelope(curve_rows(asked, "end-to-end"))]
+    posterior = [row for row in curves if row["way"] == EXACT]
     posterior += _levels_between(posterior)
     pans = []
     for row in ACTIVE[TASK]:
@@ -131,8 +85,7 @@ def fig_2e_page(asked: Asked) -> Made:
                         mine["value"], there, mine["error_objects"], error, prefix=prefix
                     )
         pans.append(mine)
-    rows = [*pans, *curves, *best]
-    return Made(rows)
+    return Made([*pans, *curves, *best])
 
 
 def _levels_between(measured: Rows) -> Rows:
@@ -140,15 +93,14 @@ def _levels_between(measured: Rows) -> Rows:
     if not measured:
         return []
     of_a_photon = measured[0]["illumination"] / measured[0]["photons"]
-    known = {row["photons_asked"] for row in measured}
+    known = {row["level"] for row in measured}
     return [row | {"illumination": row["photons"] * of_a_photon} for row in DIRECT[TASK] if row["photons"] not in known]
 
 
 def end_to_end_page(asked: Asked) -> Made:
     """Return the envelope, and the rows of every number of patterns."""
-    rows = end_to_end_rows(asked)
-    best = envelope(rows)
-    return Made(best + rows)
+    rows = curve_rows(asked, "end-to-end")
+    return Made(envelope(rows) + rows)
 
 
 # ---- compressive sensing ----
@@ -171,7 +123,7 @@ def compressive_page(asked: Asked) -> Made:
             facts: Row = {"family": family, "classifier": classifier, "features": features}
             trainings += by_epoch(found["epochs"], **facts)
             for cell in found["cells"]:
-                light = {"table": "cells", "photons_asked": cell["photons_asked"]}
+                light = {"table": "cells", "level": cell["level"]}
                 cells.append(light | facts | flat(cell, cell["first_200"]))
     return Made(cells + trainings)
 
@@ -193,5 +145,123 @@ def sensed(data_dir: str | None, features: int, family: str, convolutions: bool,
     for photons in PHOTONS:
         done = run_trials(measurement, photons, "counting", at(photons, "counting"), trials=TRIALS, seed=0)
         first = row_of(done.measured(FIRST_OBJECTS))
-        cells.append({"photons_asked": photons, **row_of(done.measured()), "first_200": first})
+        cells.append({"level": photons, **row_of(done.measured()), "first_200": first})
     return {"epochs": course, "cells": cells}
+
+
+# ---- the frontier ----
+
+
+def fixed_rows(asked: Asked) -> Rows:
+    """Return our fixed patterns from the finished parts of the pages `fashion-mnist`, `mnist` and `alpha`, none of them measured now."""
+    rows: Rows = []
+    for name, table in ACTIVE.items():
+        for row in table:
+            for seed in (0, *OTHER_SEEDS.get((name, row.features), ())):
+                figures = finished_row(asked.cache, name, row, seed)
+                if figures is not None:
+                    rows.append(
+                        {"task": name, "way": FIXED, "level": float(row.features), "exposures": row.features}
+                        | shot_figures(figures)
+                    )
+    for alpha in ALPHAS[1:]:
+        found = training(replace(asked, collect=True, report=lambda _: None), 32, alpha)
+        if found is not None:
+            rows.append({"task": "fashion-mnist", "way": FIXED_LIGHT, "level": alpha, "exposures": 32} | found["final"])
+    return rows
+
+
+def photons_at_least(clicks: float, features: int) -> float:
+    """Return the least photoelectrons of that many clicks of so many thresholded exposures: -d_f ln(1 - clicks / d_f).
+
+    The mean of lambda over exposures is least, for a given mean of 1 - exp(-lambda), where all are equal (Jensen).
+
+    >>> round(photons_at_least(4.939, 10), 2)
+    6.81
+    """
+    if not 0 <= clicks < features:
+        raise ValueError(f"{clicks:g} clicks of {features} exposures, allowed: below {features}, at least 0")
+    return -features * math.log1p(-clicks / features)
+
+
+def frontier_page(asked: Asked) -> Made:
+    """Return one row per point beside direct imaging at its photons, and the paper's click budgets beside our automata."""
+    measured = measured_points(asked, "frontier", asked.seeds)
+    rows = beside_direct(by_point(measured + fixed_rows(asked)))
+    return Made(click_budgets(rows) + rows)
+
+
+def by_point(measured: Rows) -> Rows:
+    """Return means over the seeds of each task, way and level, with `seeds` and the standard error over them (None of one seed)."""
+
+    def key(row: Row) -> tuple[str, str, float]:
+        return row["task"], row["way"], row["level"]
+
+    rows = []
+    for (task, way, level), group in groupby(sorted(measured, key=key), key):
+        found = list(group)
+        values = [row["value"] for row in found]
+        error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
+        facts: Row = {
+            "table": task,
+            "task": task,
+            "way": way,
+            "level": level,
+            "seeds": len(found),
+            "error_seeds": error,
+        }
+        rows.append(facts | {mean: statistics.fmean(row[mean] for row in found) for mean in MEANS})
+    return sorted(rows, key=lambda row: (row["task"], row["way"], row["photons"]))
+
+
+def error_of(row: Row) -> float:
+    """Return the standard error of a point: from its seeds, where there are several, and from having few objects."""
+    return math.hypot(row["error_seeds"] or 0.0, row["error_objects"])
+
+
+def beside_direct(rows: Rows) -> Rows:
+    """Return the points, those of other ways beside exact direct imaging and beside direct imaging that stops, at their own photons.
+
+    Both errors count, as if the images were drawn for each: they are the same, so that the true error is smaller.
+    """
+    found = []
+    for row in rows:
+        for way, prefix in ((EXACT, ""), (STOPPING, "sure_")):
+            curve = [
+                other | {"error": error_of(other)}
+                for other in rows
+                if (other["task"], other["way"]) == (row["task"], way)
+            ]
+            there, error = (interpolated(curve, row["photons"], "photons", of) for of in ("value", "error"))
+            if row["way"] not in (EXACT, STOPPING) and there is not None and error is not None:
+                row = (
+                    row | {f"{prefix}direct": there} | against(row["value"], there, error_of(row), error, prefix=prefix)
+                )
+        found.append(row)
+    return found
+
+
+def click_budgets(rows: Rows) -> Rows:
+    """Return the paper's thirteen rows beside the automaton whose clicks on all images come nearest to the row's from below.
+
+    It is chosen by clicks, not by accuracy. Of large automata of one level the one that was trained longest stands for all.
+    """
+    automata = [row for row in rows if row["way"] in BUDGETED]
+    longest: dict[tuple[str, float], str] = {}
+    for row in sorted((row for row in automata if row["way"] in LONGER), key=lambda row: LONGER.index(row["way"])):
+        longest[row["task"], row["level"]] = row["way"]
+    automata = [row for row in automata if row["way"] not in LONGER or row["way"] == longest[row["task"], row["level"]]]
+    found = []
+    for name, table in ACTIVE.items():
+        for printed in table:
+            line: Row = {"table": "budgets", "task": name, "features": printed.features, "paper": printed.simulation[0]}
+            line |= {"paper_clicks": printed.clicks, "paper_illumination": printed.illumination}
+            line["paper_photons"] = photons_at_least(printed.clicks, printed.features)
+            below = [row for row in automata if row["task"] == name and row["clicks"] <= printed.clicks]
+            if below:
+                ours = max(below, key=lambda row: float(row["clicks"]))
+                theirs = sampling_error(printed.simulation[0], FIRST_OBJECTS)
+                line |= {key: ours[key] for key in ("way", "seeds", *MEANS)}
+                line |= against(ours["value"], printed.simulation[0], error_of(ours), theirs)
+            found.append(line)
+    return found

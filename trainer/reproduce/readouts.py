@@ -25,7 +25,7 @@ from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.tasks.registry import Task, load_task
 
 from . import plots
-from .curves import CLEAN, POSTERIOR, curve_rows
+from .curves import CLEAN, EXACT, curve_rows
 from .page import FIRST_OBJECTS, Asked, Draw, Made, Row, Rows, against, kept, sampling_error
 from .trained import neighbours_agree
 
@@ -203,17 +203,14 @@ def frames_page(asked: Asked) -> Made:
         found = kept(path, made_with, partial(_map_of_frames, part, photons), collect=asked.collect)
         if found is not None:
             maps[photons] = found
-    curves = {
-        name: curve_rows(replace(asked, collect=True), curve)
-        for name, curve in (("network", CLEAN), ("posterior", POSTERIOR))
-    }
+    curves = curve_rows(replace(asked, collect=True), "fig-2e")
     rows = []
     for photons in SHOWN:
         row: Row = {"table": "frames", "photons": photons, "illumination": whole.illumination(photons)}
         if photons in maps:
             row |= {f"map_{key}": maps[photons][key] for key in ("neighbours", "value", "error_objects", "clicks")}
-        for name, curve in curves.items():
-            at = next((each for each in curve if each["photons_asked"] == photons), {})
+        for name, way in (("network", CLEAN), ("posterior", EXACT)):
+            at = next((each for each in curves if (each["way"], each["level"]) == (way, photons)), {})
             row |= {
                 f"{name}_{key}": at[key]
                 for key in ("value", "spread_trials", "error_objects", "first_200", "clicks")

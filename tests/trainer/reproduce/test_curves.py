@@ -1,7 +1,6 @@
 """Pages of the alternatives, of readouts and of trainings that are followed: measured once, read between levels, drawn."""
 
 # ruff: noqa: E402  (what follows needs torch)
-import argparse
 import dataclasses
 from functools import partial
 
@@ -15,10 +14,8 @@ pytest.importorskip("sklearn", reason="needs the plot extra")
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.common import measure
 from pans.trainer.baselines.networks import clean_mlp, patterns
-from pans.trainer.baselines.options import BaselineOptions
-from pans.trainer.commands import baseline as cmd_baseline
 from pans.trainer.options import Options
-from pans.trainer.reproduce import curves, dynamics, readouts
+from pans.trainer.reproduce import curves, dynamics, readouts, ways
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train import head_fit
@@ -52,55 +49,39 @@ def write(folder, name, made):
     assert all((folder / f"{name}{ending}.png").stat().st_size > 3000 for ending in page_of(name).drawn(made).pictures)
 
 
-# ---- baselines over photons ----
-
-
-def test_every_curve_is_a_command_that_the_baselines_take():
-    parser = argparse.ArgumentParser()
-    cmd_baseline.BASELINE.configure(parser)
-    assert len({curve.way for curve in curves.CURVES}) == len(curves.CURVES)
-    for curve in curves.CURVES:
-        args = parser.parse_args([curve.words[0], "--task", curves.TASK, *curve.words[1:]])
-        cmd_baseline._check(args)
-        assert cmd_baseline._options(args) == curve.options
-        assert tuple(args.photons) == curve.levels == tuple(sorted(curve.levels))
-
-
-def test_a_curve_is_measured_once_and_none_when_collecting(task, asked, monkeypatch):
-    monkeypatch.setattr(curves, "load_task", lambda *_: task)
-    page, said = asked
-    curve = curves.Curve("end-to-end, d_f = 3", BaselineOptions("e2e", "qat", 3, epochs=60, trials=2), (5.0, 1e4))
-    assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == []
-    assert "pans baseline e2e --task fashion-mnist --features 3" in said[0]
-    few, many = curves.curve_rows(page, curve)
-    assert (few["photons_asked"], few["photons"]) == (5, pytest.approx(5, rel=1e-5))
-    assert few["value"] < many["value"]
-    assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == [few, many]
+# ---- alternatives over photons ----
 
 
 def row(way, photons, value, features=10):
     light = {"clicks": photons / 2, "photons": photons, "illumination": 3 * photons}
-    return {"way": way, "features": features, "photons_asked": photons, "value": value, "error_objects": 0.4} | light
+    return {
+        "table": "curves",
+        "way": way,
+        "features": features,
+        "level": photons,
+        "value": value,
+        "error_objects": 0.4,
+    } | light
 
 
 def test_the_envelope_is_the_best_at_each_level():
     rows = [row("a", 5.0, 30.0, 3), row("b", 5.0, 20.0, 32), row("a", 100.0, 60.0, 3), row("b", 100.0, 80.0, 32)]
     best = curves.envelope(rows)
-    assert [(r["photons_asked"], r["value"], r["features"]) for r in best] == [(5.0, 30.0, 3), (100.0, 80.0, 32)]
+    assert [(r["level"], r["value"], r["features"]) for r in best] == [(5.0, 30.0, 3), (100.0, 80.0, 32)]
     assert {r["way"] for r in best} == {curves.ENVELOPE}
 
 
 def test_pans_stands_beside_the_others_at_its_own_light(asked, monkeypatch):
     page, said = asked
-    direct = [row(curves.POSTERIOR.way, n, a, 784) | {"table": "curves"} for n, a in ((10.0, 50.0), (1000.0, 90.0))]
-    end_to_end = [row("e2e", n, a, 6) | {"table": "curves"} for n, a in ((5.0, 30.0), (5000.0, 83.0))]
+    found = {
+        "fig-2e": [row(curves.EXACT, n, a, 784) for n, a in ((10.0, 50.0), (1000.0, 90.0))],
+        "end-to-end": [row("e2e", n, a, 6) for n, a in ((5.0, 30.0), (5000.0, 83.0))],
+    }
     pans = {3: row("PANS", 100.0, 72.0, 3), 32: row("PANS", 2000.0, 90.0, 32)}
-    monkeypatch.setattr(curves, "CURVES", (curves.POSTERIOR,))
     monkeypatch.setattr(curves, "DIRECT", {curves.TASK: []})  # no levels but those of these rows
-    monkeypatch.setattr(curves, "curve_rows", lambda *_: direct)
-    monkeypatch.setattr(curves, "end_to_end_rows", lambda *_: end_to_end)
+    monkeypatch.setattr(curves, "curve_rows", lambda _, name: found[name])
     monkeypatch.setattr(curves, "finished_row", lambda _cache, _task, printed: pans.get(printed.features))
-    monkeypatch.setattr(curves, "shot_figures", lambda figures: figures)
+    monkeypatch.setattr(curves, "shot_figures", lambda figures: {**figures, "table": "pans"})
     made = curves.fig_2e_page(page)
     first, last = of_table(made.rows, "pans")
     assert (first["direct_photons_value"], first["direct_photons_verdict"]) == (pytest.approx(70), "above")
@@ -112,14 +93,28 @@ def test_pans_stands_beside_the_others_at_its_own_light(asked, monkeypatch):
 
 
 def test_pages_of_curves_are_put_together_from_what_is_finished(task, asked, tmp_path, monkeypatch):
-    monkeypatch.setattr(curves, "load_task", lambda *_: task)
-    monkeypatch.setattr(curves, "LEVELS", (5.0, 30.0, 5000.0))
-    page, _ = asked
+    def way(name, page, options):
+        levels = {curves.TASK: {"5": {}, "30": {}, "5000": {}}}
+        return {"name": name, "page": page, "kind": "baseline", "options": options, "levels": levels}
+
+    few = way(
+        "end-to-end, d_f = 3",
+        "end-to-end",
+        {"paradigm": "e2e", "method": "qat", "features": 3, "epochs": 60, "trials": 2},
+    )
+    many = way("end-to-end, d_f = 9", "end-to-end", {"paradigm": "e2e", "method": "qat", "features": 9, "trials": 2})
+    direct = way(curves.EXACT, "fig-2e", {"paradigm": "direct", "method": "bayes", "trials": 1})
+    monkeypatch.setattr(ways, "WAYS", [few, many, direct])
+    monkeypatch.setattr(ways, "_task", lambda *_: task)
+    page, said = asked
     made = curves.end_to_end_page(dataclasses.replace(page, rows=(3,)))
     assert [r["way"] for r in made.rows] == [curves.ENVELOPE] * 3 + ["end-to-end, d_f = 3"] * 3
+    assert (made.rows[0]["features"], made.rows[0]["photons"]) == (3, pytest.approx(5, rel=1e-4))
+    assert made.rows[0]["value"] < made.rows[2]["value"]
     write(tmp_path, "end-to-end", made)
     collected = curves.fig_2e_page(dataclasses.replace(page, rows=(3,), collect=True))
     assert [r["way"] for r in collected.rows] == [curves.ENVELOPE] * 3
+    assert "fig-2e: fashion-mnist, direct, exact posterior, 5, seed 0: not measured yet, or out of reach" in said
     write(tmp_path, "fig-2e", collected)
 
 

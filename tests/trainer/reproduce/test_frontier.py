@@ -15,11 +15,13 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import train as adaptive_train
 from pans.trainer.adaptive.options import AutomatonOptions
+from pans.trainer.baselines.options import METHODS, BaselineOptions
 from pans.trainer.options import Options, check_options
-from pans.trainer.reproduce import frontier
-from pans.trainer.reproduce.frontier import EXACT, STOPPING, Point
+from pans.trainer.reproduce import curves, ways
+from pans.trainer.reproduce.curves import EXACT, STOPPING
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
 from pans.trainer.reproduce.printed import ACTIVE
+from pans.trainer.reproduce.ways import Point
 from pans.trainer.tasks.registry import Objects, Task
 
 QUICK = {"exposures": 4, "states": 3, "grow_epochs": 1, "tune_epochs": 1, "epochs": 1, "reroutes": 0}
@@ -38,7 +40,7 @@ def halves() -> Task:
 
 @pytest.fixture
 def asked(halves, tmp_path, monkeypatch):
-    monkeypatch.setattr(frontier, "_task", lambda *_: halves)
+    monkeypatch.setattr(ways, "_task", lambda *_: halves)
     return Asked("frontier", tmp_path, report=lambda _: None, seeds=1)
 
 
@@ -49,12 +51,16 @@ def made(way: str, level: float, photons: float, value: float, clicks: float = 1
 
 
 def test_the_points_can_be_trained_and_every_start_is_there():
-    found = list(frontier.points())
-    assert len({(point.task, point.way, point.level) for point in found}) == len(found)
+    found = [point for page in ("frontier", "fig-2e", "end-to-end") for point in ways.points(page)]
+    assert len({point.stem for point in found}) >= len(found) - 4  # levels of direct imaging are on two pages
     for point in found:
         assert point.task in ACTIVE
         if point.kind == "fixed":
             check_options(Options(**dict(point.options)), load_profile("ideal"))
+        if point.kind == "baseline":
+            assert point.level in point.levels
+            options = BaselineOptions(**dict(point.options))
+            assert options.method in METHODS[options.paradigm]
         if point.kind == "automaton":
             AutomatonOptions(**dict(point.options))
     twice = next(point for point in found if point.way == "larger automaton, trained on twice")
@@ -64,13 +70,13 @@ def test_the_points_can_be_trained_and_every_start_is_there():
 
 def test_seeds_are_put_together_with_their_standard_error():
     rows = [made("automaton", 10, 9.9, value) for value in (80.0, 82.0, 84.0)]
-    (found,) = frontier.by_point(rows)
+    (found,) = curves.by_point(rows)
     assert (found["seeds"], found["value"], found["first_200"]) == (3, pytest.approx(82), pytest.approx(83))
     assert found["error_seeds"] == pytest.approx(2 / math.sqrt(3))
-    assert frontier.error_of(found) == pytest.approx(math.hypot(2 / math.sqrt(3), 0.3))
-    (one,) = frontier.by_point(rows[:1])
+    assert curves.error_of(found) == pytest.approx(math.hypot(2 / math.sqrt(3), 0.3))
+    (one,) = curves.by_point(rows[:1])
     assert one["error_seeds"] is None
-    assert frontier.error_of(one) == 0.3
+    assert curves.error_of(one) == 0.3
 
 
 def test_margins_are_over_direct_imaging_at_the_same_photons():
@@ -78,7 +84,7 @@ def test_margins_are_over_direct_imaging_at_the_same_photons():
     rows += [made("automaton", 40, 40.0, 90.0), made("masks", 4, 4.0, 50.0)]  # 40 is beyond direct imaging's levels
     rows += [made(EXACT, 8, 8.0, 10.0, task="fashion-mnist")]
     rows += [made(STOPPING, 6, 6.0, 60.0), made(STOPPING, 10, 32 / 3, 80.0)]  # not for 4 photons
-    found = {(row["way"], row["level"]): row for row in frontier.beside_direct(frontier.by_point(rows))}
+    found = {(row["way"], row["level"]): row for row in curves.beside_direct(curves.by_point(rows))}
     automaton = found["automaton", 8]
     assert (automaton["direct"], automaton["ahead"]) == pytest.approx((50, 25))  # half way in the logarithm
     assert automaton["error"] == pytest.approx(0.3 * math.sqrt(2))
@@ -93,14 +99,14 @@ def test_click_budgets_take_the_automaton_that_spends_most_within_them_and_not_t
     rows += [made("automaton, held to clicks", 9, 9.0, 80.0, clicks=4.9)]
 
     def budgets():
-        return {(row["task"], row["features"]): row for row in frontier.click_budgets(frontier.by_point(rows))}
+        return {(row["task"], row["features"]): row for row in curves.click_budgets(curves.by_point(rows))}
 
     found = budgets()
     assert len(found) == 13
     assert "value" not in found["fashion-mnist", 3]
     assert found["mnist", 4]["value"] == 70.0  # 2.164 clicks in the paper
     assert found["mnist", 9]["ahead"] == pytest.approx(80 - 81.23)
-    assert found["mnist", 4]["paper_photons"] == pytest.approx(frontier.photons_at_least(2.164, 4))
+    assert found["mnist", 4]["paper_photons"] == pytest.approx(curves.photons_at_least(2.164, 4))
     rows += [made("automaton, trained on", 6, 6.0, 75.0, clicks=1.9)]  # it takes the place of that of 6
     assert budgets()["mnist", 4]["value"] == 99.0
 
@@ -110,15 +116,15 @@ def test_no_photons_give_those_clicks_with_less_than_the_bound():
     for _ in range(200):
         light = rng.gamma(0.7, 2.0, 10)
         clicks = float(-np.expm1(-light).sum())
-        assert light.sum() >= frontier.photons_at_least(clicks, 10) - 1e-12
-    assert frontier.photons_at_least(float(-10 * np.expm1(-0.4)), 10) == pytest.approx(4.0)  # equal light reaches it
+        assert light.sum() >= curves.photons_at_least(clicks, 10) - 1e-12
+    assert curves.photons_at_least(float(-10 * np.expm1(-0.4)), 10) == pytest.approx(4.0)  # equal light reaches it
     with pytest.raises(ValueError, match="allowed: below 10"):
-        frontier.photons_at_least(10.0, 10)
+        curves.photons_at_least(10.0, 10)
 
 
 def test_an_automaton_is_trained_once_and_trained_on_from_the_one_in_the_cache(asked, monkeypatch):
-    on = Point("mnist", "automaton, trained on", 2.0, "automaton", (("photons", 1.5), ("epochs", 2)), GROWN)
-    first, second = frontier.point_row(asked, GROWN, 0), frontier.point_row(asked, on, 0)
+    on = Point("mnist", "automaton, trained on", 2.0, "automaton", (("photons", 1.5), ("epochs", 2)), start=GROWN)
+    first, second = ways.point_row(asked, GROWN, 0), ways.point_row(asked, on, 0)
     assert first is not None
     assert first["value"] > 60
     assert first["exposures"] <= 4
@@ -129,27 +135,27 @@ def test_an_automaton_is_trained_once_and_trained_on_from_the_one_in_the_cache(a
     trained_on = load_bundle(asked.cache / f"{on.stem}-seed0.pans")[0].provenance["options"]
     assert (trained_on["start"], trained_on["seed"], trained_on["epochs"]) == (digest, 1, 2)
     collect = replace(asked, collect=True)
-    assert (frontier.point_row(collect, GROWN, 0), frontier.point_row(collect, on, 0)) == (first, second)
-    assert frontier.point_row(collect, GROWN, 1) is None
-    assert frontier.point_row(collect, replace(GROWN, options=(*GROWN.options, ("patterns", 3))), 0) is None
+    assert (ways.point_row(collect, GROWN, 0), ways.point_row(collect, on, 0)) == (first, second)
+    assert ways.point_row(collect, GROWN, 1) is None
+    assert ways.point_row(collect, replace(GROWN, options=(*GROWN.options, ("patterns", 3))), 0) is None
 
     def never(*_args, **_named):
         raise AssertionError("trained again")
 
     monkeypatch.setattr(adaptive_train, "train_automaton", never)
     (asked.cache / f"{on.stem}-seed0.json").unlink()
-    again = frontier.point_row(asked, on, 0)  # measured again, from its bundle
+    again = ways.point_row(asked, on, 0)  # measured again, from its bundle
     assert again is not None
     assert again["value"] == pytest.approx(second["value"], rel=1e-12)
     with pytest.raises(AssertionError, match="trained again"):
-        frontier.point_row(asked, GROWN, 1)
+        ways.point_row(asked, GROWN, 1)
 
 
 def test_a_bundle_that_was_not_made_for_a_page_is_not_replaced(asked):
     path = asked.cache / f"{GROWN.stem}-seed0.pans"
     path.write_bytes(b"something of somebody")
     with pytest.raises(Exception, match=r"automaton-2-seed0\.pans"):
-        frontier.point_row(asked, GROWN, 0)
+        ways.point_row(asked, GROWN, 0)
     assert path.read_bytes() == b"something of somebody"
 
 
@@ -158,18 +164,18 @@ def test_the_page_measures_every_kind_of_point_and_is_drawn(asked, tmp_path, mon
     bayes = {"paradigm": "direct", "method": "bayes", "trials": 1}
     stopping = bayes | {"method": "stopping"}
     fixed = {"features": 3, "alpha": 0.0, "photons": 3.0, "epochs": 2, "hidden": 8, "batch": 50}
-    ways = [
+    wanted = [
         {"name": EXACT, "kind": "baseline", "options": bayes, "levels": {"mnist": {"1": {}, "100": {}}}},
         {"name": STOPPING, "kind": "baseline", "options": stopping, "levels": {"mnist": {"3": {}, "1000": {}}}},
         {"name": "fixed", "kind": "fixed", "options": fixed, "levels": {"mnist": {"3": {}}}},
     ]
-    monkeypatch.setattr(frontier, "WAYS", ways)
-    page = frontier.frontier_page(asked)
+    monkeypatch.setattr(ways, "WAYS", wanted)
+    page = curves.frontier_page(asked)
     points = {(row["way"], row["level"]): row for row in of_table(page.rows, "mnist")}
     assert set(points) == {(EXACT, 1), (EXACT, 100), (STOPPING, 3), ("fixed", 3)}  # stopping cannot spend 1000 photons
     assert points[EXACT, 1]["photons"] == pytest.approx(1, rel=1e-4)
     assert points["fixed", 3]["exposures"] == 3
     assert "ahead" in points["fixed", 3]
-    assert frontier.frontier_page(replace(asked, collect=True)).rows == page.rows
+    assert curves.frontier_page(replace(asked, collect=True)).rows == page.rows
     write_page(tmp_path, page_of("frontier"), page)
     assert (tmp_path / "frontier.png").stat().st_size > 5000

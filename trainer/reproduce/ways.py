@@ -1,0 +1,177 @@
+"""Ways to measure and decide, at levels of light (ways.toml): baselines, fixed patterns and automata, from several seeds.
+
+A point is one way at one level of one task. Finished figures and bundles stay in the cache folder.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive.options import AutomatonOptions, for_task, started_from, with_defaults
+from pans.trainer.baselines.common import silent
+from pans.trainer.baselines.options import BaselineOptions
+from pans.trainer.baselines.rows import baseline_rows
+from pans.trainer.evaluate.accuracy import row_of
+from pans.trainer.options import Options
+from pans.trainer.tasks.registry import Task, load_task
+
+from .active import PROFILE
+from .page import FIRST_OBJECTS, Asked, Row, Rows, check_cached_bundle, flat, kept, read_toml
+
+WAYS: list[Row] = read_toml("ways.toml")["way"]
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One way at one level of one task: the kind of recipe, its options but for the seed, and all levels that share them."""
+
+    task: str
+    way: str
+    level: float
+    kind: str
+    options: tuple[tuple[str, Any], ...]
+    levels: tuple[float, ...] = ()
+    start: Point | None = None
+
+    @property
+    def stem(self) -> str:
+        """What its files in the cache are called, but for the seed."""
+        words = "".join(letter for letter in self.way.lower().replace(" ", "-") if letter.isalnum() or letter == "-")
+        return f"frontier-{self.task}-{words}-{self.level:g}"
+
+    def training_seed(self, seed: int) -> int:
+        """Return the seed of the training: the next one after that of the automaton it starts from, for other distortions."""
+        return seed if self.start is None else self.start.training_seed(seed) + 1
+
+    def made_with(self, seed: int) -> Row:
+        """Return the whole recipe of a row: one that was made with another is made again."""
+        start = {} if self.start is None else {"start": self.start.made_with(seed)}
+        return {"kind": self.kind, **dict(self.options), "seed": self.training_seed(seed), **start}
+
+
+def points(page: str) -> Iterator[Point]:
+    """Yield all points of a page, way by way."""
+    known: dict[tuple[str, str, float], Point] = {}
+    for way in (way for way in WAYS if way.get("page", "frontier") == page):
+        for task, levels in way["levels"].items():
+            for text, more in levels.items():
+                start = known[task, way["start"], float(text)] if "start" in way else None
+                shared = tuple(float(other) for other, options in levels.items() if options == more)
+                options = tuple((way["options"] | more).items())
+                known[task, way["name"], float(text)] = Point(
+                    task, way["name"], float(text), way["kind"], options, shared, start
+                )
+    yield from known.values()
+
+
+def measured_points(asked: Asked, page: str, seeds: int = 1) -> Rows:
+    """Return one row per point and seed that is finished, or measured now: one seed of everything comes before the next."""
+    rows: Rows = []
+    for seed in range(seeds):
+        for point in points(page):
+            features = dict(point.options).get("features")
+            if features is not None and not asked.wants(features):
+                continue
+            found = point_row(asked, point, seed)
+            if found is None:
+                asked.report(
+                    f"{page}: {point.task}, {point.way}, {point.level:g}, seed {seed}: not measured yet, or out of reach"
+                )
+            else:
+                rows.append({"task": point.task, "way": point.way, "level": point.level} | found)
+    return rows
+
+
+def point_row(asked: Asked, point: Point, seed: int) -> Row | None:
+    """Return the flat figures of a point from one seed, from the cache or measured now; None where it is missing or out of reach."""
+    if (
+        point.kind == "baseline"
+    ):  # all levels of the same options at once: what is trained or drawn for them is the same
+        path = asked.cache / f"{replace(point, level=point.levels[0]).stem}-seed{seed}.json"
+        made_with = point.made_with(seed) | {"levels": point.levels}
+        found = kept(path, made_with, partial(_baseline, asked, point, seed), collect=asked.collect)
+        return None if found is None else found["rows"].get(f"{point.level:g}")
+    make = partial({"fixed": _fixed, "automaton": _automaton}[point.kind], asked, point, seed)
+    return kept(asked.cache / f"{point.stem}-seed{seed}.json", point.made_with(seed), make, collect=asked.collect)
+
+
+@functools.lru_cache(maxsize=1)  # the points of a task share it
+def _task(name: str, data_dir: str | None) -> Task:
+    return load_task(name, data_dir)
+
+
+def _baseline(asked: Asked, point: Point, seed: int) -> Row:
+    options = BaselineOptions(**dict(point.options), seed=seed)
+    exposures = {"fsi": 1, "hadamard": 2}.get(
+        options.paradigm, 0
+    ) * options.features or 1  # one per mask, two per pair, one frame
+    facts = {"exposures": exposures, "features": options.features}
+    rows = baseline_rows(_task(point.task, asked.data_dir), options, point.levels, silent)
+    return {"rows": {f"{row['photons_asked']:g}": flat(row, row["first_200"]) | facts for row in rows}}
+
+
+def _fixed(asked: Asked, point: Point, seed: int) -> Row:
+    from pans.trainer.train.loop import train
+
+    from .passive import measure
+
+    task, options = _task(point.task, asked.data_dir), Options(**dict(point.options), seed=seed)
+    return measure(point.task, task, train(task, load_profile(PROFILE), options)) | {"exposures": options.features}
+
+
+def _automaton(asked: Asked, point: Point, seed: int) -> Row:
+    from pans.trainer.export.automaton import measure_walks
+
+    task, profile = _task(point.task, asked.data_dir), load_profile(PROFILE)
+    bundle, _ = load_bundle(trained_automaton(asked, point, seed))
+    whole, first = (row_of(measure_walks(bundle, task.test.first(count), profile)) for count in (None, FIRST_OBJECTS))
+    return flat(whole, first) | {"exposures": whole["exposures_mean"]}
+
+
+def trained_automaton(asked: Asked, point: Point, seed: int) -> Path:
+    """Return where the automaton of a point is, trained now unless one of the same recipe is there; the one it starts from comes first."""
+    from pans.trainer.adaptive.train import train_automaton
+    from pans.trainer.device import keep_freed_memory
+    from pans.trainer.export.automaton import export_automaton
+
+    path, task, profile = (
+        asked.cache / f"{point.stem}-seed{seed}.pans",
+        _task(point.task, asked.data_dir),
+        load_profile(PROFILE),
+    )
+    start = None if point.start is None else load_bundle(trained_automaton(asked, point.start, seed))
+    options = AutomatonOptions(seed=point.training_seed(seed), **dict(point.options))
+    if start is None:
+        exposures, states = with_defaults(options, profile)
+        options = replace(options, exposures=exposures, states=states)
+    else:
+        options = started_from(options, *start, task, profile)
+    options = for_task(options, point.task)
+    if path.is_file() and asdict(options).items() <= dict(load_bundle(path)[0].provenance.get("options", {})).items():
+        return path
+    check_cached_bundle(path)
+    keep_freed_memory()
+    checkpoint = path.with_suffix(".checkpoint")
+    trained = train_automaton(
+        task,
+        profile,
+        options,
+        checkpoint=checkpoint,
+        resume=checkpoint.is_file(),
+        report=lambda at: (
+            asked.report(f"{path.stem}: {at.stage}, {at.done} of {at.steps}") if at.done % 8 == 0 else None
+        ),
+        teacher=asked.cache / f"frontier-{task.name}-soft-targets.npz",  # of all seeds
+        start=None if start is None else start[0],
+    )
+    provenance = {"command": "pans reproduce frontier", "options": asdict(options)}
+    export_automaton(path, trained, task, profile, name=path.stem, provenance=provenance, force=True)
+    checkpoint.unlink(missing_ok=True)
+    return path
