@@ -250,8 +250,7 @@ class Page:
 
     def drawn(self, made: Made) -> Made:
         """Return `made` with the pictures that are drawn from its rows alone."""
-        from .plots import curves
-
+        curves = importlib.import_module(".plots", __package__).curves
         specs = {ending: _FILE["plots"][name] for ending, name in self.plots.items()} if made.rows else {}
         pictures = {ending: partial(curves, rows=made.rows, spec=spec) for ending, spec in specs.items()}
         return Made(made.rows, {**pictures, **made.pictures})
