@@ -15,11 +15,11 @@ import time
 from types import FrameType
 from typing import NoReturn
 
-from pans.firmware_sim.options import add_options, settings_from
 from pans.firmware_sim.ports.faults import check_possible, parse_faults
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument, check_options
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.runtime.cli import Command, emit, say
+from pans.runtime.cli.option_fields import add_options, options_from
 from pans.runtime.ranges import Range
 from pans.runtime.timing.cpu import check_core
 
@@ -38,7 +38,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    options = check_options(settings_from(args, SimOptions))
+    options = check_options(options_from(args, SimOptions))
     check_core(args.core)
     check_possible(parse_faults(args.faults), pace="real", listen=args.listen)
     instrument, clock = build_instrument(options, time.perf_counter_ns())

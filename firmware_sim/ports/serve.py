@@ -22,9 +22,9 @@ from pans.firmware_sim.device.clock import (
     DeviceClock,
     SteppedDevice,
 )
-from pans.firmware_sim.options import option, words_of
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.bundle.optics import Analyser
+from pans.runtime.cli.option_fields import option, words_of
 from pans.runtime.errors import ConfigError, LinkError, UsageError, as_usage_error
 from pans.runtime.imaging import bleaching_of, imaging_of, is_spec
 from pans.runtime.instrument.profile import Profile, load_profile
