@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.decision import Output
     from pans.runtime.core.plan import Plan
-    from pans.runtime.decide.verdict import Decider
     from pans.runtime.link.base import Link
     from pans.runtime.live import LiveCore, LiveRun, RunResult
     from pans.runtime.live.dark_run import DarkRun
@@ -102,8 +101,6 @@ class _Prepared:
 
     profile: Profile
     bundle: Bundle  # with the patterns that are displayed
-    bundle_sha256: str
-    decider: Decider
     dark: DarkRun
     plan: Plan
     core: LiveCore
@@ -275,10 +272,11 @@ def _prepare(options: RunOptions, profile: Profile) -> _Prepared:
         say(f"pans: {placed.words()}")
         bundle = placed.shown
     dark = DarkRun.of(options, placed.profile if placed and not options.calibration else profile)
-    n_objects, flow_run = -(-options.decisions // options.trials), None
+    n_objects, flow_run, seconds = -(-options.decisions // options.trials), None, options.seconds
     core: LiveCore
     if flow is not None:
-        plan, flow_core, n_cycles = plan_flow(dark.profile, bundle, decider, flow, shots, options.seconds)
+        plan, flow_core, n_cycles = plan_flow(dark.profile, bundle, decider, flow, shots, seconds)
+        seconds = 0.0  # the end of a flow is in its plan
         flow_core.guard = dark.guard(plan, bundle, shots, flow=True)
         second = load_profile(options.act_profile) if options.act_profile else profile
         core, flow_run = flow_core, FlowRun(flow_core, open_actuator(options.act, second))
@@ -303,20 +301,12 @@ def _prepare(options: RunOptions, profile: Profile) -> _Prepared:
     return _Prepared(
         profile=profile,
         bundle=bundle,
-        bundle_sha256=bundle_sha256,
-        decider=decider,
         dark=dark,
         plan=plan,
         core=core,
         flow_run=flow_run,
         frames=shots * (1 if flow is None else flow.pool),
-        # the end of a flow is in its plan
-        options=replace(
-            options,
-            n_cycles=n_cycles,
-            lease_ms=profile.timing.lease_ms,
-            seconds=options.seconds if flow is None else 0.0,
-        ),
+        options=replace(options, n_cycles=n_cycles, lease_ms=profile.timing.lease_ms, seconds=seconds),
         header=header,
         expected_decisions=n_objects * options.trials,
         registration=placed,
@@ -402,30 +392,30 @@ def _recorded(options: RunOptions, ready: _Prepared, link: Link, around: _Around
     """Run with a recording, if one is asked for."""
     from pans.runtime.record import Recorder
 
-    if options.recording is None:
-        result = _watched(options, ready, link, None, around)
-        return _conclude(options, ready, result, _summary(options, ready, result))
-    header = ready.header | {"simulated": link.simulated}
+    recorder: Recorder | None = None
     with ExitStack() as opened:
-        opened.enter_context(gone_if_refused(options))
-        # the bundle's bytes are not held by a name: they may have 64 MiB, and the run begins here
-        recorder = opened.enter_context(
-            Recorder(
-                options.recording,
-                header,
-                bundle=_same_bundle(options, ready),
-                overwrite=options.force,
-                limits=part_limits(options),
+        if options.recording is not None:
+            opened.enter_context(gone_if_refused(options))
+            header, limits = ready.header | {"simulated": link.simulated}, part_limits(options)
+            # the bundle's bytes are not held by a name: they may have 64 MiB, and the run begins here
+            recorder = opened.enter_context(
+                Recorder(
+                    options.recording,
+                    header,
+                    bundle=_same_bundle(options, ready),
+                    overwrite=options.force,
+                    limits=limits,
+                )
             )
-        )
         result = _watched(options, ready, link, recorder, around)
         summary = _summary(options, ready, result)
-        if (kept := recorder.keep_deleted()) is not None:
+        if recorder is not None and (kept := recorder.keep_deleted()) is not None:
             options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
             fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
             warn(fault)
             summary = replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
-        summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
+        if recorder is not None:
+            summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
     return _conclude(options, ready, result, summary)
 
 
@@ -434,7 +424,7 @@ def _same_bundle(options: RunOptions, ready: _Prepared) -> bytes:
     from pans.runtime.container import read_file
 
     data = read_file(options.bundle)
-    if hashlib.sha256(data).hexdigest() != ready.bundle_sha256:
+    if hashlib.sha256(data).hexdigest() != ready.header["bundle_sha256"]:
         raise DamagedFileError(f"{options.bundle}: changed while the run began", remedy="run it again")
     return data
 
@@ -511,13 +501,10 @@ def _conclude(options: RunOptions, ready: _Prepared, result: RunResult, summary:
     confusion, page, bundle = result.tally.confusion, options.page, ready.bundle
     if ready.flow_run is not None:
         confusion = confusion + ready.flow_run.core.matcher.confusion
-    recording = options.recording
     if page is not None:
-        facts = what_was_run(
-            options, ready.profile, bundle.name, ready.bundle_sha256, ready.decider.name, recording, summary
-        )
+        facts = what_was_run(options, ready.profile, bundle.name, ready.header, summary)
         write_markdown(page, summary, facts, confusion, bundle.classes, force=options.force)
-    return Outcome(summary, confusion, recording, page)
+    return Outcome(summary, confusion, options.recording, page)
 
 
 def process_start_ns() -> int:

@@ -9,7 +9,7 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +35,14 @@ if TYPE_CHECKING:
 
 STATE_FORMAT = "pans-state 1"
 STATE_MAX_BYTES = 1 << 16
+NAME_FILES = (
+    "bundle",
+    "profile",
+    "flow",
+    "act_profile",
+    "calibration",
+    "registration",
+)  # options that name a file to read
 
 
 def check_run_files(options: RunOptions) -> None:
@@ -53,38 +61,22 @@ def check_run_files(options: RunOptions) -> None:
     if state is not None:
         check_outputs([state], inputs=inputs, force=options.force, ours=is_state_file)  # its folder must be there
         outputs.append(state)
+    force, mine = options.force, {state}
     check_outputs(
-        outputs,
-        inputs=inputs,
-        force=options.force,
-        ours=lambda path: path == state and is_state_file(path),
-        makes_folders=True,
+        outputs, inputs=inputs, force=force, ours=lambda path: path in mine and is_state_file(path), makes_folders=True
     )
     _check_disk(options)
 
 
 def input_files(options: RunOptions) -> list[str | Path | None]:
     """Return the files that a run reads."""
-    named = (
-        options.bundle,
-        options.profile,
-        options.flow,
-        options.act_profile,
-        options.calibration,
-        options.registration,
-    )
+    named = [getattr(options, name) for name in NAME_FILES]
     return [*options.files_read, *named, *files_of_url(options.device)]
 
 
 def _check_disk(options: RunOptions) -> None:
     """A run that would be stopped at once does not begin."""
-    folder = (
-        options.out_root
-        if options.out_root is not None
-        else None
-        if options.recording is None
-        else options.recording.parent
-    )
+    folder = options.out_root or (options.recording.parent if options.recording else None)
     if folder is None or not options.stop_below:
         return
     there = next((path for path in (folder, *folder.absolute().parents) if path.is_dir()), Path.cwd())
@@ -176,21 +168,16 @@ def part_limits(options: RunOptions) -> PartLimits | None:
 
 
 def what_was_run(
-    options: RunOptions,
-    profile: Profile,
-    name: str,
-    bundle_sha256: str,
-    backend: str,
-    recording: Path | None,
-    summary: Summary,
+    options: RunOptions, profile: Profile, name: str, header: Mapping[str, Any], summary: Summary
 ) -> dict[str, str]:
-    """The lines below the summary page's figures."""
+    """The lines below the summary page's figures; `header` is the recording's."""
+    log = f"decision log SHA-256 {summary.decisions_sha256[:16]}…; pans replay recomputes it"
     return {
-        "bundle": f"{name} ({options.bundle.name}, SHA-256 {bundle_sha256[:16]}…)",
+        "bundle": f"{name} ({options.bundle.name}, SHA-256 {header['bundle_sha256'][:16]}…)",
         "device": f"{options.device} (firmware {summary.device.get('firmware', 'unknown')})",
         "profile": f"{profile.name}: {profile.description}",
-        "decision back end": backend,
-        "recording": f"{recording} (decision log SHA-256 {summary.decisions_sha256[:16]}…; pans replay recomputes it)",
+        "decision back end": header["config"]["backend"],
+        "recording": f"{options.recording} ({log})",
         "command": options.command,
         "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
     }
