@@ -22,7 +22,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, warn
 from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.ranges import Range
-from pans.runtime.record.format import MAGIC, READABLE_VERSIONS, Kind, limits_of
+from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
 from pans.runtime.run_folder import LATEST, RUNS, locked
 from pans.runtime.safe_text import one_line
 
@@ -109,9 +109,9 @@ def _begin(path: Path) -> tuple[dict[str, Any], str]:
     """Return a recording's header and the name of the bundle inside, {} and "" if they cannot be read."""
     header: dict[str, Any] = {}
     with suppress(PansError, OSError), open_regular(path) as file:
-        version, chain = check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, READABLE_VERSIONS, str(path))
+        _, chain = check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, (FORMAT_VERSION,), str(path))
         for number in range(2):
-            block = read_block(file, number, chain, limits_of(version), str(path))
+            block = read_block(file, number, chain, LIMITS, str(path))
             if block is not None and block.kind == Kind.HEADER:
                 header, chain = parse_json_object(block.payload, str(path)), block.chain
             elif block is not None and block.kind == Kind.BUNDLE:

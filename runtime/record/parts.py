@@ -177,7 +177,6 @@ def _joined(path: Path, parts: tuple[Recording, ...], broken: list[str]) -> Join
     return JoinedRecording(
         path=path,
         size=sum(part.size for part in parts),
-        version=max(part.version for part in parts),
         header=first.header,
         kinds=sum((Counter(part.kinds) for part in parts), Counter()),
         n_decisions=sum(part.n_decisions for part in parts),

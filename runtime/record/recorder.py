@@ -37,13 +37,9 @@ from .format import (
     MESSAGE,
     MESSAGE_MAX_BYTES,
     PART_EVENT,
-    RUNS_VERSION,
-    TIMING_DTYPE,
     TIMING_ROWS_MAX,
     TIMING_RUN_DTYPE,
     Kind,
-    expand_timings,
-    version_for,
 )
 from .log import LogEncoder
 from .part_names import chained, files_of_parts, part_path
@@ -171,18 +167,16 @@ class Recorder:
         self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
         self.parts = 0  # 0: one file
         self._header = {"created_utc": datetime.now(UTC).isoformat(timespec="seconds"), **header}
-        self._version = version_for(header)
         self._messages = _ByteBuffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
         self._commands = _ByteBuffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
         self._answers = _ByteBuffer(Kind.ANSWERS, _EVENT_BUFFER_BYTES)
         self._events = _ByteBuffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
         self._decisions = _RowBuffer(Kind.DECISIONS, DECISION_DTYPE)
-        self._timings = _RowBuffer(Kind.TIMINGS, TIMING_DTYPE)
-        self._timing_runs = _RowBuffer(Kind.TIMING_RUNS, TIMING_RUN_DTYPE)
-        self._in_runs = 0  # decisions in these
+        self._timings = _RowBuffer(Kind.TIMINGS, TIMING_RUN_DTYPE)
+        self._timed = 0  # decisions in these
         # A decision is written behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
         self._first = (self._commands, self._answers, self._messages, self._decisions)
-        self._in_order = (*self._first, self._timings, self._timing_runs)
+        self._in_order = (*self._first, self._timings)
         self._pack, self._pack_stamped = _packing()
         self._replaced = self._files_in_the_way(overwrite)
         self._closed: deque[PartFacts] = deque()
@@ -306,32 +300,20 @@ class Recorder:
 
     def add_timing(self, record: Sequence[Any]) -> None:
         """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
-        self._end_runs()
-        if self._timings.add(record):
+        self._timed += 1
+        if self._timings.add((*record, 1)):
             self._write_up_to(self._timings)
 
     def add_timing_runs(self, runs: NDArray[np.void]) -> None:
         """Keep the host times of many decisions, TIMING_RUN_DTYPE (n,), at most 2^16 of each run."""
-        if self._version < RUNS_VERSION:
-            self._add_rows(self._timings, expand_timings(runs))
-            return
-        if self._timings.used:
-            self._write_up_to(self._timings)  # the order of time
-        self._in_runs += int(runs["count"].sum())
-        self._add_rows(self._timing_runs, runs)
-        if self._in_runs > TIMING_ROWS_MAX // 2:
-            self._end_runs()
-
-    def _end_runs(self) -> None:
-        if self._timing_runs.used:
-            self._write_up_to(self._timing_runs)
-
-    def _add_rows(self, buffer: _RowBuffer, rows: NDArray[np.void]) -> None:
+        self._timed += int(runs["count"].sum())
         done = 0
-        while done < len(rows):
-            done += buffer.add_many(rows[done:])
-            if not buffer.room():
-                self._write_up_to(buffer)
+        while done < len(runs):
+            done += self._timings.add_many(runs[done:])
+            if not self._timings.room():
+                self._write_up_to(self._timings)
+        if self._timed > TIMING_ROWS_MAX // 2:
+            self._write_up_to(self._timings)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
         """Keep one JSON-able event: a gap, an alarm, a late decision, a link that went away."""
@@ -570,8 +552,8 @@ class Recorder:
             rows = self._decisions.rows[: self._decisions.used]
             self._decisions.used = 0
             return self._framed(Kind.DECISIONS, self.open_file.log.block(rows))
-        if buffer is self._timing_runs:
-            self._in_runs = 0
+        if buffer is self._timings:
+            self._timed = 0
         return self._framed(buffer.kind, buffer.empty())
 
     def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:

@@ -34,15 +34,15 @@ from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.frame import Messages
 
 from .format import (
+    FORMAT_VERSION,
+    LIMITS,
     MAGIC,
     MESSAGE,
-    READABLE_VERSIONS,
     TIMING_DTYPE,
     TIMING_ROWS_MAX,
     TIMING_RUN_DTYPE,
     Kind,
     expand_timings,
-    limits_of,
 )
 from .log import LogReader
 
@@ -55,7 +55,6 @@ class Recording:
 
     path: Path
     size: int
-    version: int  # of the format
     header: Mapping[str, Any]
     kinds: Mapping[Kind, int]  # number of whole blocks
     n_decisions: int
@@ -95,8 +94,7 @@ class Recording:
     def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
         """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block."""
         with open_regular(self.path) as file:
-            version, chain = _start(file, str(self.path))
-            for block in _blocks(file, version, chain, str(self.path)):
+            for block in _blocks(file, _start(file, str(self.path)), str(self.path)):
                 if not wanted or block.kind in wanted:
                     yield block
                 if block.end >= self.end_offset:
@@ -111,7 +109,7 @@ class Recording:
         return self._pairs(Kind.COMMANDS)
 
     def answers(self) -> Iterator[tuple[int, bytes]]:
-        """Yield (arrival host_ns, decoded bytes) of WELCOME, ACK and PONG, in order; none before format version 3."""
+        """Yield (arrival host_ns, decoded bytes) of WELCOME, ACK and PONG, in order."""
         return self._pairs(Kind.ANSWERS)
 
     def decisions(self) -> NDArray[np.void]:
@@ -132,11 +130,8 @@ class Recording:
 
     def iter_timings(self) -> Iterator[NDArray[np.void]]:
         """Yield the host times block by block, TIMING_DTYPE (n,); memory holds one block."""
-        for block in self.iter_blocks(Kind.TIMINGS, Kind.TIMING_RUNS):
-            if block.kind == Kind.TIMINGS:
-                yield np.frombuffer(_whole_rows(block, TIMING_DTYPE, self.path), TIMING_DTYPE)
-            else:
-                yield expand_timings(_checked_runs(block, self.path))
+        for block in self.iter_blocks(Kind.TIMINGS):
+            yield expand_timings(_checked_runs(block, self.path))
 
     def clock_samples(self) -> NDArray[np.void]:
         """Return all clock samples, CLOCK_DTYPE (n,)."""
@@ -241,17 +236,17 @@ def _checked_event(event: dict[str, Any], where: str) -> dict[str, Any]:
     return event
 
 
-def _start(file: Any, where: str) -> tuple[int, int]:
-    """Read the prologue: the format version and the checksum that seeds the first block."""
+def _start(file: Any, where: str) -> int:
+    """Read the prologue; return the checksum that seeds the first block."""
     start = file.read(FILE_PROLOGUE.size)
     if not start.startswith(MAGIC):
         start += file.read(KIND_BYTES)  # to say what it is
-    return check_prologue(start, MAGIC, READABLE_VERSIONS, where)
+    return check_prologue(start, MAGIC, (FORMAT_VERSION,), where)[1]
 
 
-def _blocks(file: Any, version: int, chain: int, where: str) -> Iterator[Block]:
-    index, limits = 0, limits_of(version)
-    while (block := read_block(file, index, chain, limits, where)) is not None:
+def _blocks(file: Any, chain: int, where: str) -> Iterator[Block]:
+    index = 0
+    while (block := read_block(file, index, chain, LIMITS, where)) is not None:
         yield block
         if block.kind == Kind.END:
             if rest := len(file.read(MIB)):
@@ -270,7 +265,6 @@ class _Scan:
         self.end: dict[str, Any] | None = None
         self.end_offset = 0
         self.n_decisions = 0
-        self.version = 0
         self.bundle_place: tuple[int, int] | None = None
         self.log = LogReader()
 
@@ -316,8 +310,7 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             try:
-                scan.version, chain = _start(file, str(path))
-                for block in _blocks(file, scan.version, chain, str(path)):
+                for block in _blocks(file, _start(file, str(path)), str(path)):
                     scan.take(block)
             except DamagedFileError as error:
                 if not salvage or not scan.kinds[Kind.HEADER]:
@@ -332,7 +325,6 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
     return Recording(
         path=Path(path),
         size=size,
-        version=scan.version,
         header=scan.header,
         kinds={kind: count for kind, count in scan.kinds.items() if count},
         n_decisions=scan.n_decisions,

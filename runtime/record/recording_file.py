@@ -19,7 +19,7 @@ from pans.runtime.container import MIB, block_ends, canonical_json, file_prologu
 from pans.runtime.errors import RecordingError, UsageError
 from pans.runtime.outputs import beside_name, place_new, refuse_existing, sync_folder
 
-from .format import LIMITS, MAGIC, Kind, version_for
+from .format import FORMAT_VERSION, LIMITS, MAGIC, Kind
 from .log import LogEncoder
 
 Pieces = tuple[bytes, bytes | memoryview, bytes]  # what stands before a payload, the payload, what stands behind it
@@ -36,13 +36,14 @@ class RecordingFile:
         self.path = path
         self.first_decision = self.n_decisions = self.n_blocks = self.size_bytes = 0
         self.log = LogEncoder()
-        version = version_for(header)
-        facts = {"format_version": version} | ({"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {})
+        facts = {"format_version": FORMAT_VERSION} | (
+            {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
+        )
         text = canonical_json({**facts, **header})
         self._hidden: Path | None = beside_name(path)
         self._file = _create(self._hidden, path)
         self._counts_names = os.fstat(self._file.fileno()).st_nlink > 0  # not every file system does
-        start, self._chain = file_prologue(MAGIC, version)
+        start, self._chain = file_prologue(MAGIC, FORMAT_VERSION)
         try:
             self.write(start, *self.framed(Kind.HEADER, text))
             if bundle:

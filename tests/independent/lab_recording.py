@@ -16,7 +16,7 @@ import numpy as np
 from lab_bundle import MIB, demand, strict_json
 from numpy.typing import NDArray
 
-HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END, ANSWERS, TIMING_RUNS = range(1, 12)
+HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END, ANSWERS = range(1, 11)
 LIMITS = {kind: 2 * MIB for kind in range(1, 12)} | {HEADER: 4 * MIB, BUNDLE: 64 * MIB}
 VERDICT = [("clicks", "<u4"), ("label", "<u2"), ("flags", "<u4"), ("probability", "<f4"), ("counts_crc", "<u4")]
 PLACE = [("index", "<u8"), ("tick", "<u8"), ("exposure_index", "<u8"), ("object", "<u4"), ("shot", "<u4")]
@@ -73,15 +73,14 @@ def iter_blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, payload) of every block, with the chain of checksums checked."""
     magic, version, chain = struct.unpack_from("<8sII", data)
     demand(magic == b"PANSRECD" and zlib.crc32(data[:12]) == chain, "no recording")
-    demand(version in (2, 3, 4, 5, 6), f"version {version}")
-    known = set(LIMITS) - ({ANSWERS} if version == 2 else set()) - ({TIMING_RUNS} if version < 5 else set())
+    demand(version == 1, f"version {version}")
     at, index, kind = 16, 0, 0
     while at < len(data):
         demand(kind != END, "bytes behind END")
         demand(at + 20 <= len(data), "cut within a block")
         length, number, kind, zeros, crc = struct.unpack_from("<IIB3sI", data, at)
         demand(zlib.crc32(data[at : at + 12], chain) == crc, f"the head of block {index}")
-        demand(number == index and zeros == b"\0\0\0" and kind in known and length <= LIMITS[kind], f"block {index}")
+        demand(number == index and zeros == b"\0\0\0" and kind in LIMITS and length <= LIMITS[kind], f"block {index}")
         payload, tail = data[at + 16 : at + 16 + length], data[at + 16 + length : at + 20 + length]
         demand(len(tail) == 4, "cut within a block")
         chain = zlib.crc32(payload, crc)
@@ -105,8 +104,6 @@ def _take(recording: Recording, kind: int, payload: bytes) -> None:
     elif kind == CLOCK:
         recording.clock += struct.iter_unpack("<qQq", payload)
     elif kind == TIMINGS:
-        recording.timings += struct.iter_unpack("<Qqqqq", payload)
-    elif kind == TIMING_RUNS:
         for first, *times, count in struct.iter_unpack("<QqqqqI", payload):
             demand(count > 0, "a run of no decisions")
             recording.timings += [(first + k, *times) for k in range(count)]

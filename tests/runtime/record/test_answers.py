@@ -13,7 +13,7 @@ from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import DamagedFileError, DeviceError
+from pans.runtime.errors import DeviceError
 from pans.runtime.live import LiveRun, Observers, RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.record.format import Kind
@@ -64,18 +64,6 @@ def test_a_refusal_that_ends_the_set_up_is_on_record(tmp_path: Path, capsys: pyt
     assert (told["command"], told["status"] > 0) == ("LOAD_PLAN", True)
     recording = read_recording(path)
     assert replay(recording, recording.bundle())[:2] == (0, recording.decisions_sha256)
-
-
-def test_recordings_from_before_the_answers_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pans.runtime.record.format.FORMAT_VERSION", 2)
-    with pytest.MonkeyPatch.context() as without:
-        without.setattr(Recorder, "add_answer", lambda *_: None)
-        recording = read_recording(record(tmp_path / "old.pansrec"))
-    assert (recording.version, list(recording.answers())) == (2, [])
-    assert recording.complete
-    assert replay(recording, recording.bundle()).as_recorded
-    with pytest.raises(DamagedFileError, match="kind"):
-        read_recording(record(tmp_path / "mixed.pansrec"))
 
 
 def test_an_answer_that_is_none_is_a_violation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

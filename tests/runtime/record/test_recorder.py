@@ -64,7 +64,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert found.complete
     assert found.damage == ""
     assert found.header["seed"] == 7
-    assert found.header["format_version"] == found.version == 3
+    assert found.header["format_version"] == 1
     assert found.summary == {"accuracy": 0.75}
     assert found.end_offset == found.size == path.stat().st_size
     assert list(found.messages()) == [(100 + i, bytes([i]) * i) for i in range(5)]
@@ -82,29 +82,25 @@ def test_everything_comes_back(tmp_path: Path) -> None:
 
 
 def test_times_that_decisions_share_stand_once(tmp_path: Path) -> None:
-    """Between single ones, in the order of time; a recording of another version has them one by one."""
+    """Between single ones, in the order of time."""
     runs = np.array([(1, 10, 20, 30, 40, 3), (4, 11, 21, 31, 41, 1), (5, 12, 22, 32, 42, 9000)], TIMING_RUN_DTYPE)
     single = [(0, 9, 19, 29, 39), (9005, 13, 23, 33, 43)]
     shared = [(first + k, *times) for first, *times, count in runs.tolist() for k in range(count)]
-    sizes = []
-    for name, config in (("runs", {"mode": "parallel"}), ("rows", {})):
-        with Recorder(tmp_path / name, {"config": config}) as recorder:
-            recorder.add_timing(single[0])
-            recorder.add_timing_runs(runs)
-            recorder.add_timing(single[1])
-            recorder.close({})
-        found = read_recording(tmp_path / name)
-        assert found.version == (5 if config else 3)
-        assert found.timings().tolist() == [single[0], *shared, single[1]]
-        sizes.append(found.size)
-    assert sizes[0] < 2000 < 300_000 < sizes[1]
+    with Recorder(tmp_path / "runs", {}) as recorder:
+        recorder.add_timing(single[0])
+        recorder.add_timing_runs(runs)
+        recorder.add_timing(single[1])
+        recorder.close({})
+    found = read_recording(tmp_path / "runs")
+    assert found.timings().tolist() == [single[0], *shared, single[1]]
+    assert found.size < 2000
 
 
 @pytest.mark.parametrize("counts", [[0], [1 << 20, 1], [0xFFFFFFFF] * 3])
 def test_runs_that_ask_for_much_memory_are_refused(tmp_path: Path, counts: list[int]) -> None:
     runs = np.zeros(len(counts), TIMING_RUN_DTYPE)
     runs["count"] = counts
-    with Recorder(tmp_path / "a", {"config": {"mode": "parallel"}}) as recorder:
+    with Recorder(tmp_path / "a", {}) as recorder:
         recorder.add_timing_runs(runs)
         recorder.close({})
     with pytest.raises(DamagedFileError, match="allowed: 1 or more in each, 1048576 at most"):
@@ -120,7 +116,7 @@ def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
         last = zlib.crc32(payload, first)
         return start + struct.pack("<I", first) + payload + struct.pack("<I", last), last
 
-    start = b"PANSRECD" + struct.pack("<I", 3)
+    start = b"PANSRECD" + struct.pack("<I", 1)
     chain = zlib.crc32(start)
     wanted = start + struct.pack("<I", chain)
     run = struct.pack("<QQQIIIIIIhH", 0, 0, 8, 0, 0, 1, 0, 0, 0, -1, 0)
@@ -128,7 +124,7 @@ def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
     parts = [hashlib.sha256(part).digest() for part in (verdict, bytes(2), run)]
     log = hashlib.sha256(b"".join(parts)).hexdigest()
     end = {"blocks": 4, "decisions": 1, "decisions_sha256": log, "summary": {}}
-    header = {**HEADER, "format_version": 3}
+    header = {**HEADER, "format_version": 1}
     payloads = [
         (1, json.dumps(header, sort_keys=True, separators=(",", ":")).encode()),
         (10, struct.pack("<qI", -6, 3) + b"yes"),
@@ -149,7 +145,7 @@ def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
 
 def test_rows_are_packed_as_documented() -> None:
     assert DECISION_DTYPE.itemsize == 56
-    assert TIMING_DTYPE.itemsize == 40
+    assert TIMING_RUN_DTYPE.itemsize == 44
     flags = [int(flag) for flag in DecisionFlag]
     assert flags == [1, 2, 4, 8, 16, 32, 64, 128, 256]
 
