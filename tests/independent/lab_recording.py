@@ -17,7 +17,7 @@ from lab_bundle import MIB, demand, strict_json
 from numpy.typing import NDArray
 
 HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END, ANSWERS = range(1, 11)
-LIMITS = {kind: 2 * MIB for kind in range(1, 12)} | {HEADER: 4 * MIB, BUNDLE: 64 * MIB}
+LIMITS = {kind: 2 * MIB for kind in range(1, 11)} | {HEADER: 4 * MIB, BUNDLE: 64 * MIB}
 VERDICT = [("clicks", "<u4"), ("label", "<u2"), ("flags", "<u4"), ("probability", "<f4"), ("counts_crc", "<u4")]
 PLACE = [("index", "<u8"), ("tick", "<u8"), ("exposure_index", "<u8"), ("object", "<u4"), ("shot", "<u4")]
 ROW = np.dtype([*PLACE, *VERDICT[:2], ("truth", "<i2"), *VERDICT[2:], ("exposures", "<u4")])
