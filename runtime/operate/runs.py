@@ -27,7 +27,7 @@ from pans.runtime.run_folder import LATEST, RUNS, locked
 from pans.runtime.safe_text import one_line
 
 OURS = re.compile(
-    r"[^/]*\.pansrec|[^/]*\.parts\.json|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock"
+    r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock"
 )
 RUN_LOCK = ".pans-run.lock"
 END_MAX_BYTES = 1 << 24  # read from the end of a recording, in which its END is looked for

@@ -224,7 +224,7 @@ def test_salvage_reads_what_stands_before_the_damage(path: Path) -> None:
 
 def forged(path: Path, blocks: list[tuple[int, bytes]]) -> Path:
     """A file whose checksums all fit, whatever its blocks say."""
-    start = b"PANSRECD" + struct.pack("<I", 2)
+    start = b"PANSRECD" + struct.pack("<I", 1)
     chain = zlib.crc32(start)
     out = start + struct.pack("<I", chain)
     for index, (kind, payload) in enumerate(blocks):
@@ -266,7 +266,7 @@ def test_messages_cannot_reach_past_their_block(payload: bytes, tmp_path: Path) 
 
 
 def test_a_length_beyond_the_file_allocates_nothing(tmp_path: Path) -> None:
-    start = b"PANSRECD" + struct.pack("<I", 2)
+    start = b"PANSRECD" + struct.pack("<I", 1)
     head = struct.pack("<IIBxxx", 0xFFFFFFFF, 0, 1)
     crc = zlib.crc32(start)
     path = tmp_path / "f.pansrec"
