@@ -26,9 +26,7 @@ from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
 from pans.runtime.run_folder import LATEST, RUNS, locked
 from pans.runtime.safe_text import one_line
 
-OURS = re.compile(
-    r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock"
-)
+OURS = re.compile(r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock")
 RUN_LOCK = ".pans-run.lock"
 END_MAX_BYTES = 1 << 24  # read from the end of a recording, in which its END is looked for
 KEEP = Range(0, 1_000_000, whole=True)
