@@ -146,20 +146,6 @@ def quantise_head(layers: tuple[Layer, ...], calibration: NDArray[np.floating[An
     return head
 
 
-def int8_reference(head: Int8Head, counts: NDArray[np.integer[Any]], shots: int) -> NDArray[np.float64]:
-    """Return the scores (n, classes) of click counts (n, d_f): integer sums, and float32 between them as the kernel has it."""
-    steps = counts.astype(np.int64)
-    unit = np.float32(1) / np.float32(shots)
-    matrices = head.matrices()
-    for weights, scale, bias in matrices[:-1]:
-        value = (steps @ weights.astype(np.int64)).astype(np.float32) * (scale * unit) + bias
-        steps = np.floor(np.clip(value, 0, STEP_MAX) + np.float32(0.5)).astype(np.int64)
-        unit = np.float32(1)
-    weights, scale, bias = matrices[-1]
-    sums = (steps @ weights.astype(np.int64)).astype(np.float32)
-    return np.asarray(sums * (scale * unit) + bias, np.float64)
-
-
 def _hidden_ranges(
     layers: tuple[Layer, ...], calibration: NDArray[np.floating[Any]] | None
 ) -> list[NDArray[np.float64]]:

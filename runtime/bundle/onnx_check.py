@@ -112,10 +112,10 @@ class _Call:
         """Integers given as attribute `name` or, in later operator sets, as input `number`; () if in neither."""
         if name in self.node.attributes or number >= len(self.inputs) or self.inputs[number] is None:
             return tuple(self.attribute(name, ()))
-        values = self.given(number)
+        values = self.given(number).reshape(-1)
         if values.dtype != np.int64 or (ROWS in values and name != "shape"):
             raise ValueError(f"has {name} that are not a short constant")
-        return tuple(values.reshape(-1).tolist())
+        return tuple(values.tolist())
 
 
 def per_row(dims: Dims) -> int:
@@ -202,9 +202,8 @@ def _windows(call: _Call, sizes: Dims, kernel: Dims) -> Dims:
     if how == "VALID":
         pads = (0,) * 2 * rank
     found = []
-    for size, before, behind, k, stride, dilation, more in zip(
-        sizes, pads[:rank], pads[rank:], kernel, strides, dilations, further, strict=True
-    ):
+    axes = zip(sizes, pads[:rank], pads[rank:], kernel, strides, dilations, further, strict=True)
+    for size, before, behind, k, stride, dilation, more in axes:
         reach = (k - 1) * dilation + 1
         if before + behind > 2 * reach:
             raise ValueError("has pads wider than its kernel")
@@ -221,21 +220,12 @@ def _windows(call: _Call, sizes: Dims, kernel: Dims) -> Dims:
 def _conv(call: _Call) -> Dims:
     dims, weights, groups = call.dims(), call.constant(1), call.attribute("group", 1)
     turned, window = call.node.op == "ConvTranspose", math.prod(weights[2:])
-    outer, inner = (
-        weights[1::-1] if turned else weights[:2]
-    )  # channels out and in; the second axis has those of a group
-    if turned and (
-        call.attribute("auto_pad", "NOTSET") not in ("NOTSET", "") or "output_shape" in call.node.attributes
-    ):
+    outer, inner = weights[1::-1] if turned else weights[:2]  # channels; the second axis has those of a group
+    if turned and (call.attribute("auto_pad", "NOTSET") != "NOTSET" or "output_shape" in call.node.attributes):
         raise ValueError("has auto_pad or output_shape, allowed: pads alone")
-    if (
-        groups < 1
-        or inner * (1 if turned else groups) != dims[1]
-        or call.attribute("kernel_shape", weights[2:]) != weights[2:]
-    ):
-        raise ValueError(
-            f"has weights {shape_text(weights)} in {groups} groups for {shape_text(dims)}, which do not fit"
-        )
+    fits = groups >= 1 and inner * (1 if turned else groups) == dims[1]
+    if not fits or call.attribute("kernel_shape", weights[2:]) != weights[2:]:
+        raise ValueError(f"has weights {shape_text(weights)} for {shape_text(dims)}, which do not fit")
     channels = outer * groups if turned else outer
     output = (dims[0], channels, *_windows(call, dims[2:], weights[2:]))
     call.operations = per_row(dims if turned else output) * (outer if turned else inner) * window
@@ -269,13 +259,8 @@ def _reshape(call: _Call) -> Dims:
     if ROWS in dims and sizes[:1] in ([-1], [1]):  # 1 is right where a head has a fixed batch of one
         sizes[0] = ROWS
     total, rest = math.prod(dims), math.prod(size for size in sizes if size != -1)
-    if (
-        call.attribute("allowzero", 0)
-        or sizes.count(-1) > 1
-        or rest < 1
-        or total % rest
-        or (-1 not in sizes and total != rest)
-    ):
+    fits = rest >= 1 and total % rest == 0 and (total == rest or sizes.count(-1) == 1)
+    if not fits or sizes.count(-1) > 1 or call.attribute("allowzero", 0):
         raise ValueError(f"gives the shape {shape_text(wanted)} to {shape_text(dims)}, which does not fit")
     return tuple(total // rest if size == -1 else size for size in sizes)
 
@@ -313,6 +298,10 @@ def _gather(call: _Call) -> Tensor | Dims:
     return values.shape[:axis] + call.constant(1) + values.shape[axis + 1 :]
 
 
+def _shape(call: _Call) -> Tensor:
+    return np.array(call.dims()[call.attribute("start", 0) : call.node.attributes.get("end")], np.int64)
+
+
 def _constant(call: _Call) -> Tensor:
     (value,) = call.node.attributes.values()
     return _constant_of(np.asarray(value))
@@ -331,14 +320,10 @@ _RULES: Mapping[str, Callable[[_Call], Tensor | Dims]] = {
         ("Softmax LogSoftmax LayerNormalization", _along_axis),
         ("ReduceMax ReduceMean ReduceMin ReduceSum", _reduce),
         *(("Cast", _cast), ("Reshape", _reshape), ("Flatten", _flatten), ("Concat", _concat), ("Slice", _slice)),
-        *(("Gather", _gather), ("Constant", _constant)),
-        ("Shape", lambda call: np.array(call.dims()[call.attribute("start", 0) : call.node.attributes.get("end")])),
+        *(("Gather", _gather), ("Constant", _constant), ("Shape", _shape)),
         ("Unsqueeze", lambda call: np.expand_dims(call.given(0), call.integers("axes", 1))),
         ("Squeeze", lambda call: np.squeeze(call.given(0), call.integers("axes", 1) or None)),
-        (
-            "Transpose",
-            lambda call: np.transpose(call.given(0), call.attribute("perm", tuple(range(call.given(0).ndim))[::-1])),
-        ),
+        ("Transpose", lambda call: np.transpose(call.given(0), call.node.attributes.get("perm"))),
     )
     for name in names.split()
 }

@@ -48,7 +48,12 @@ def quantisation_cost(
     Each object is decided on TRIALS times from sampled clicks. Without a profile every photon counts and black is black. ValueError for
     images that are not of the bundle's size, or labels beyond its classes.
     """
-    _check(bundle, images, labels)
+    if bundle.picture_shape is not None:
+        raise ValueError(f"{bundle.name} makes pictures, which are not right or wrong")
+    if images.shape[1:] != bundle.image_shape:
+        raise ValueError(f"images are {images.shape[1:]}, allowed with these patterns: {bundle.image_shape}")
+    if len(images) == 0 or labels.min() < 0 or labels.max() >= bundle.n_classes:
+        raise ValueError(f"labels must be 0 to {bundle.n_classes - 1}, one for each image")
     law = IDEAL if profile is None else click_law(profile, exposure_us)
     decider, rng = make_decider(bundle, shots=1), np.random.default_rng(SEED)
     right = np.zeros((2, len(images)))
@@ -66,12 +71,3 @@ def quantisation_cost(
     spread = float((right[1] - right[0]).std(ddof=1)) if len(images) > 1 else 0.0
     given, shown = right.mean(axis=1)
     return QuantisationCost(float(given), float(shown), spread / math.sqrt(len(images)), len(images), TRIALS)
-
-
-def _check(bundle: Bundle, images: NDArray[np.uint8], labels: NDArray[np.int64]) -> None:
-    if bundle.picture_shape is not None:
-        raise ValueError(f"{bundle.name} makes pictures, which are not right or wrong")
-    if images.shape[1:] != bundle.image_shape:
-        raise ValueError(f"images are {images.shape[1:]}, allowed with these patterns: {bundle.image_shape}")
-    if len(images) == 0 or labels.min() < 0 or labels.max() >= bundle.n_classes:
-        raise ValueError(f"labels must be 0 to {bundle.n_classes - 1}, one for each image")

@@ -202,14 +202,7 @@ class OutOfBudget(Exception):
 class Search:
     """A search that goes on from its journal; `best` is what has been reached, at any time."""
 
-    def __init__(
-        self,
-        names: tuple[str, ...],
-        n_objects: int,
-        budget: Budget,
-        measure: Measure,
-        keep: Keep,
-    ) -> None:
+    def __init__(self, names: tuple[str, ...], n_objects: int, budget: Budget, measure: Measure, keep: Keep) -> None:
         self.names, self.budget = names, budget
         self.best, self.accepted, self.ended = STILL, 0, ""
         self.steps: dict[str, float] = {name: FIRST_STEP[name] for name in names}

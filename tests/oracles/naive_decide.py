@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
+from pans.runtime.bundle.layers import STEP_MAX, Int8Head
+
 
 def word_of(clicks: Sequence[int]) -> int:
     """The table row of single clicks: bit i is pattern i."""
@@ -58,3 +62,17 @@ def mlp_scores(
 def integer_sums(steps: Sequence[int], weights: Sequence[Sequence[int]]) -> list[int]:
     """The sums of one int8 layer in unbounded integers."""
     return [sum(steps[i] * weights[i][k] for i in range(len(steps))) for k in range(len(weights[0]))]
+
+
+def int8_reference(head: Int8Head, counts: np.ndarray, shots: int) -> np.ndarray:
+    """Return the scores (n, classes) of click counts (n, d_f): integer sums, and float32 between them as the kernel has it."""
+    steps = counts.astype(np.int64)
+    unit = np.float32(1) / np.float32(shots)
+    matrices = head.matrices()
+    for weights, scale, bias in matrices[:-1]:
+        value = (steps @ weights.astype(np.int64)).astype(np.float32) * (scale * unit) + bias
+        steps = np.floor(np.clip(value, 0, STEP_MAX) + np.float32(0.5)).astype(np.int64)
+        unit = np.float32(1)
+    weights, scale, bias = matrices[-1]
+    sums = (steps @ weights.astype(np.int64)).astype(np.float32)
+    return np.asarray(sums * (scale * unit) + bias, np.float64)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from heads import head_bundle, onnx_chain, random_layers
 
-from pans.runtime.bundle.layers import Int8Head, Layer, int8_reference, quantise_head, read_layers, reference_scores
+from pans.runtime.bundle.layers import Int8Head, Layer, quantise_head, read_layers, reference_scores
 from pans.runtime.bundle.model import bundle_bytes, parse_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.mlp import Int8Decider, ReferenceDecider, SparseDecider, golden_counts
@@ -160,7 +160,7 @@ def test_int8_scores_are_those_of_the_definition(sizes: list[int], shots: int) -
     decider = Int8Decider(head_bundle(layers, int8_head=head))
     counts = counts_of(sizes[0], shots)
     np.testing.assert_allclose(
-        decider.scores_batch(counts, shots), int8_reference(head, counts, shots), rtol=3e-7, atol=1e-6
+        decider.scores_batch(counts, shots), naive.int8_reference(head, counts, shots), rtol=3e-7, atol=1e-6
     )
 
 
@@ -189,7 +189,7 @@ def test_int8_errors_stay_within_their_bound() -> None:
         + np.maximum(calibration @ layers[0].weights + layers[0].bias, 0).max(0) * 1.05 / 255
     )
     step = np.where(step > 0, step, 1 / 255)
-    found, wanted = int8_reference(head, calibration, 1), reference_scores(layers, calibration)
+    found, wanted = naive.int8_reference(head, calibration, 1), reference_scores(layers, calibration)
     hidden_error = calibration.sum(1)[:, None] * (s1 * step / 2)[None, :] + step / 2
     hidden = np.maximum(calibration @ layers[0].weights.astype(float) + layers[0].bias, 0)
     bound = (
@@ -206,7 +206,7 @@ def test_dead_units_and_columns_do_no_harm() -> None:
     layers = (Layer(weights, np.array([0.0, -1.0], np.float32), True), Layer(weights, np.zeros(2, np.float32), False))
     head = quantise_head(layers)
     assert np.isfinite(head.affine).all()
-    assert int8_reference(head, np.array([[1, 1]]), 1).tolist() == [[0.0, 0.0]]
+    assert naive.int8_reference(head, np.array([[1, 1]]), 1).tolist() == [[0.0, 0.0]]
 
 
 def test_heads_that_eight_bits_cannot_hold_are_refused() -> None:

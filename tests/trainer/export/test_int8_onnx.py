@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from heads import head_bundle, random_layers
+from naive_decide import int8_reference
 
-from pans.runtime.bundle.layers import int8_reference, quantise_head, reference_scores
+from pans.runtime.bundle.layers import quantise_head, reference_scores
 from pans.runtime.decide.backends import make_decider
 
 pytest.importorskip("onnx")

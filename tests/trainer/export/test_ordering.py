@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from bundles import made_bundle
 from commands import json_of
+from naive_decide import int8_reference
 
-from pans.runtime.bundle.layers import Layer, int8_reference, quantise_head
+from pans.runtime.bundle.layers import Layer, quantise_head
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.imaging import Bleaching
