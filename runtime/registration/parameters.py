@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.imaging import Imaging, seen
 from pans.runtime.instrument.estimate import CountModel
@@ -68,6 +68,13 @@ def imaging_of(vector: F64, shape: Shape) -> Imaging:
     black, coefficients = max(0.0, float(vector[6])), vector[7:DARK]
     flat = (1.0 + coefficients @ flat_basis(shape)).reshape(shape) if coefficients.any() else None
     return Imaging(**geometry, black=black, gain=float(vector[5]), flat=flat)
+
+
+def vector_of(imaging: Imaging, flat: ArrayLike = (0.0,) * len(FLAT), dark: float = 0.0) -> F64:
+    """Return the vector of the facts in `imaging`, but for its flat field, which is given by its coefficients."""
+    facts = imaging.numbers()
+    geometry = [facts[one.name] for one in GEOMETRY]
+    return np.array([*geometry, facts["gain"], facts["black"], *np.asarray(flat, np.float64), dark])
 
 
 def worths() -> F64:

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tables import vector_of
 
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import Imaging, seen
@@ -21,6 +20,7 @@ from pans.runtime.registration.parameters import (
     Bench,
     flat_basis,
     information_per_exposure,
+    vector_of,
     worths,
 )
 from pans.runtime.registration.target import built_in_target, target_sha256

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tables import vector_of
 
 from pans.runtime.cli import main
 from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
@@ -26,7 +25,7 @@ from pans.runtime.registration.file import (
     registration_values,
     save_registration,
 )
-from pans.runtime.registration.parameters import DARK
+from pans.runtime.registration.parameters import DARK, vector_of
 
 PROFILE = load_profile("dmd-spad")
 TABLE = Imaging(right_px=1.0, down_px=-0.5, rotation_deg=2.0, scale=1.01, psf_px=0.6, black=0.002, gain=0.9)

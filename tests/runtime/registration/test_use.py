@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tables import vector_of
 
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle
@@ -21,7 +20,7 @@ from pans.runtime.record import read_recording
 from pans.runtime.registration.correct import corrected
 from pans.runtime.registration.estimate import Estimate
 from pans.runtime.registration.file import load_registration, registration_values, save_registration
-from pans.runtime.registration.parameters import DARK
+from pans.runtime.registration.parameters import DARK, vector_of
 
 PROFILE = load_profile("oled-qcmos")
 URL = "sim:oled-qcmos?pace=fast&seed=3&optics=shift=1,1"
