@@ -70,7 +70,7 @@ def imaging_of(vector: F64, shape: Shape) -> Imaging:
     return Imaging(**geometry, black=black, gain=float(vector[5]), flat=flat)
 
 
-def vector_of(imaging: Imaging, flat: ArrayLike = (0.0,) * len(FLAT), dark: float = 0.0) -> F64:
+def vector_of(imaging: Imaging, flat: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0), dark: float = 0.0) -> F64:
     """Return the vector of the facts in `imaging`, but for its flat field, which is given by its coefficients."""
     facts = imaging.numbers()
     geometry = [facts[one.name] for one in GEOMETRY]
