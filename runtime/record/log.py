@@ -1,6 +1,6 @@
 """The decision log on disk and its hash: what a decision needs in bytes, and the way back to the rows.
 
-Owns the form of DECISIONS blocks (docs/reference/formats.md). Never touches a file and never decides. Each different verdict stands once
+DECISIONS blocks (docs/reference/formats.md): each different verdict stands once
 and is named by its number; what else a row holds goes up in equal steps, so that a run of decisions needs its first row and the steps:
 2 bytes for a decision of a fast, regular stream, not 56. Nothing is left out: the rows come back bit for bit. The hash does not depend
 on how the rows were cut into blocks.
@@ -38,7 +38,7 @@ _ROW_BITS, _VERDICT_BITS = (
     for dtype in (DECISION_DTYPE, VERDICT_DTYPE)
 )
 _HEAD = struct.Struct("<III")  # runs, verdicts, decisions
-_FIRST_SLOTS, _SLOTS = 1 << 13, 1 << 19  # for record_kernels.SLOTS_PER_VERDICT
+_FIRST_SLOTS, _SLOTS = 1 << 13, 1 << 19  # see log_kernels.SLOTS_PER_VERDICT
 
 
 class _Parts(NamedTuple):
@@ -54,7 +54,7 @@ class LogEncoder:
     """Rows in, blocks and their hash out; all memory is allocated here, before arming."""
 
     def __init__(self) -> None:
-        from . import kernels  # numba: only who writes or replays decisions needs it
+        from . import log_kernels as kernels  # numba: only who writes or replays decisions needs it
 
         self._encode = kernels.encode_rows
         self._hash = _LogHash()
@@ -62,9 +62,7 @@ class LogEncoder:
         self._state[kernels.SLOT_MASK] = _FIRST_SLOTS - 1
         self._keys = np.full((LONG_VERDICT, 3), 0, np.uint64)
         self._slots = np.full(_SLOTS, LONG_VERDICT, np.uint16)
-        self._runs: NDArray[np.void] = np.full(
-            BLOCK_ROWS, 0, RUN_DTYPE
-        )  # touched, which np.zeros leaves to the first use
+        self._runs: NDArray[np.void] = np.full(BLOCK_ROWS, 0, RUN_DTYPE)
         self._verdicts: NDArray[np.void] = np.full(BLOCK_ROWS, 0, VERDICT_DTYPE)
         self._exposures = np.full(BLOCK_ROWS, 0, EXPOSURES_DTYPE)
         self._codes = np.full(BLOCK_ROWS, 0, np.uint16)
@@ -92,14 +90,11 @@ class LogEncoder:
         return self._hash.hexdigest()
 
     def _take(self, rows: NDArray[np.void]) -> _Parts:
+        """Return the parts of the block that holds `rows`, and add them to the hash."""
         bits = np.ascontiguousarray(rows, DECISION_DTYPE).view(_ROW_BITS)
-        return self._made(len(rows), *self._encode(bits, *self._arrays))
-
-    def _made(self, n_rows: int, n_runs: int, n_verdicts: int) -> _Parts:
-        """Return the parts of the block that a kernel has made, and add them to the hash."""
-        parts = _Parts(
-            self._runs[:n_runs], self._verdicts[:n_verdicts], self._exposures[:n_verdicts], self._codes[:n_rows]
-        )
+        n_runs, n_verdicts = self._encode(bits, *self._arrays)
+        known = self._verdicts[:n_verdicts], self._exposures[:n_verdicts]
+        parts = _Parts(self._runs[:n_runs], *known, self._codes[: len(rows)])
         self._hash.update(parts)
         return parts
 

@@ -30,7 +30,6 @@ from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.outputs import refuse_existing
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.commands import Arm, pack_arm
-from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Opcode, encode_command
 
 from .format import (
@@ -177,7 +176,7 @@ class Recorder:
         # A decision is written behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
         self._first = (self._commands, self._answers, self._messages, self._decisions)
         self._in_order = (*self._first, self._timings)
-        self._pack, self._pack_stamped = _packing()
+        self._pack = _packing()
         self._replaced = self._files_in_the_way(overwrite)
         self._closed: deque[PartFacts] = deque()
         self._deleted = {"parts": 0, "bytes": 0, "decisions": 0}
@@ -250,25 +249,12 @@ class Recorder:
         """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
         self._add_bytes(self._messages, host_ns, data)
 
-    def add_messages(self, host_ns: int, messages: Messages, first: int, count: int) -> None:
-        """Keep `count` of `messages` from place `first` on, which arrived together."""
-        buffer, stop = self._messages, first + count
-        while True:
-            first, buffer.used = self._pack(
-                messages.buffer, messages.spans, first, stop, host_ns, buffer.array, buffer.used
-            )
-            if first == stop:
-                return
-            begin, end = messages.spans[first].tolist()
-            self._add_bytes(buffer, host_ns, messages.buffer[begin:end].tobytes())  # makes room
-            first += 1
-
     def add_stamped(self, kind: Kind, data: NDArray[np.uint8], spans: NDArray[np.int64]) -> None:
         """Keep many MESSAGES, COMMANDS or ANSWERS: `spans` int64 (n, 4) are where each begins and ends in `data`, and its time in ns."""
         buffer = {Kind.MESSAGES: self._messages, Kind.COMMANDS: self._commands, Kind.ANSWERS: self._answers}[kind]
         first = 0
         while first < len(spans):
-            first, buffer.used = self._pack_stamped(data, spans, first, buffer.array, buffer.used)
+            first, buffer.used = self._pack(data, spans, first, buffer.array, buffer.used)
             if first < len(spans):
                 begin, end, host_ns, _ = spans[first].tolist()
                 self._add_bytes(buffer, host_ns, data[begin:end].tobytes())  # makes room
@@ -581,13 +567,12 @@ def load_kernels() -> None:
     LogEncoder()
 
 
-def _packing() -> tuple[Any, Any]:
-    from .kernels import pack_messages, pack_stamped  # numba is loaded only by who records
+def _packing() -> Any:
+    from .log_kernels import pack_stamped  # numba is loaded only by who records
 
     none = np.zeros(0, np.uint8)
-    pack_messages(none, np.zeros((0, 2), np.int64), 0, 0, 0, none, 0)
     pack_stamped(none, np.zeros((0, 4), np.int64), 0, none, 0)
-    return pack_messages, pack_stamped
+    return pack_stamped
 
 
 def _finish_part(full: RecordingFile, following: str, struck: list[Path]) -> None:

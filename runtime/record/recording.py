@@ -166,7 +166,7 @@ class Recording:
 
     def iter_messages(self) -> Iterator[Messages]:
         """Yield the device's messages in order, many at once: bodies in one block of the file, valid until the next ones."""
-        from .kernels import message_spans  # numba is loaded only by who replays
+        from .log_kernels import message_spans  # numba is loaded only by who replays
 
         spans = np.zeros((MESSAGES_AT_ONCE, 2), np.int64)
         for block in self.iter_blocks(Kind.MESSAGES):

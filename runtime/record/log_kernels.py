@@ -1,7 +1,4 @@
-"""The compiled kernels of a recording: rows to runs, verdicts and codes of the compact decision log; messages to a block.
-
-Owns the loops over rows and bytes; what its output means is told in log.py, which also owns the arrays. Never allocates.
-"""
+"""Compiled loops of a recording: rows of decisions to runs, verdicts and codes of the log (log.py), messages to a block."""
 
 from __future__ import annotations
 
@@ -19,12 +16,9 @@ TICK_STEP, EXPOSURE_STEP, SHOT_STEP, N_VERDICTS, SLOT_MASK, N_RUNS, PART, N_STAT
 
 _MESSAGE_HEAD = MESSAGE.size
 _U = np.uint64
-SLOTS_PER_VERDICT = _U(
-    8
-)  # at least: a look-up that meets no other verdict on its way is one whose branches are foreseen
+SLOTS_PER_VERDICT = _U(8)  # at least, so that a look-up hardly ever meets another verdict on its way
 _ZERO, _ONE, _U32, _HALF_LEFT, _TRUTH_MASK = _U(0), _U(1), _U(1 << 32), _U(32), _U(0xFFFF)
 _LONG, _RUN_MAX = _U(LONG_VERDICT), _U(RUN_ROWS_MAX)
-_NO_STEPS = _ZERO, _ZERO, _ZERO
 _MIX, _FOLD = _U(0x9E3779B97F4A7C15), _U(40)  # 2^64 over the golden ratio: spreads keys over slots
 
 
@@ -63,45 +57,25 @@ def _find_runs(rows, state, runs):  # type: ignore[no-untyped-def]
                 _go_on(i - first, state, runs)
             if i == n:
                 break
-        whose = _U(objects[i]), _U(truths[i]) & _TRUTH_MASK
-        _add_stretch(
-            _U(indices[i]), (_U(ticks[i]), _U(exposures[i]), _U(shots[i])), _NO_STEPS, _ONE, whose, state, runs
-        )
+        truth = _U(truths[i]) & _TRUTH_MASK
+        _add_row(_U(indices[i]), _U(ticks[i]), _U(exposures[i]), _U(shots[i]), _U(objects[i]), truth, state, runs)
         i += _ONE
     return _close(state, runs)
 
 
 @inner
-def _add_stretch(index, begins, steps, count, whose, state, runs):  # type: ignore[no-untyped-def]
-    """Add `count` decisions in equal steps: to the open run as far as they go on with it, else to runs that begin with them.
-
-    begins and steps: ticks, exposures and shots; whose: object and truth. All of them uint64.
-    """
-    done = _ZERO
-    while done < count:
-        here, rows = index + done, state[RUN_ROWS]
-        tick, exposure, shot = begins[0] + done * steps[0], begins[1] + done * steps[1], begins[2] + done * steps[2]
-        fits = _ZERO < rows < _RUN_MAX and here == state[NEXT_INDEX]
-        fits = fits and whose[0] == state[OBJECT] and whose[1] == state[TRUTH]
-        by = tick - state[NEXT_TICK], exposure - state[NEXT_EXPOSURE], shot - state[NEXT_SHOT]
-        if rows == _ONE and fits:  # the second decision says what the steps are
-            fits = by[0] < _U32 and by[1] < _U32 and by[2] < _U32
-            if fits:
-                state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = by
-                state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = tick, exposure, shot
-        elif rows > _ONE:
-            fits = fits and by[0] | by[1] | by[2] == _ZERO
-        if not fits:
-            _close(state, runs)
-            state[RUN_ROWS], state[PART], state[OBJECT], state[TRUTH] = _ZERO, _ZERO, whose[0], whose[1]
-            state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = here, tick, exposure, shot
-            state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = _NO_STEPS  # of a single one none are known
-        many = _ONE
-        same = steps[0] == state[TICK_STEP] and steps[1] == state[EXPOSURE_STEP] and steps[2] == state[SHOT_STEP]
-        if fits and same:
-            many = min(count - done, _RUN_MAX - state[RUN_ROWS])
-        _go_on(many, state, runs)
-        done += many
+def _add_row(index, tick, exposure, shot, number, truth, state, runs):  # type: ignore[no-untyped-def]
+    """Add one decision: as the second of the open run, whose steps it then says, else as the first of a run of its own."""
+    by = tick - state[NEXT_TICK], exposure - state[NEXT_EXPOSURE], shot - state[NEXT_SHOT]
+    fits = state[RUN_ROWS] == _ONE and index == state[NEXT_INDEX] and number == state[OBJECT] and truth == state[TRUTH]
+    if fits and by[0] < _U32 and by[1] < _U32 and by[2] < _U32:
+        state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = by
+    else:
+        _close(state, runs)
+        state[RUN_ROWS], state[PART], state[OBJECT], state[TRUTH] = _ZERO, _ZERO, number, truth
+        state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = _ZERO, _ZERO, _ZERO  # a single one has none
+    state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = index, tick, exposure, shot
+    _go_on(_ONE, state, runs)
 
 
 @inner
@@ -233,39 +207,22 @@ def message_spans(payload, at, spans):  # type: ignore[no-untyped-def]
 
 
 @outer
-def pack_messages(buffer, spans, first, stop, host_ns, out, used):  # type: ignore[no-untyped-def]
-    """Put the bodies at spans[first:stop] of `buffer` behind out[:used], each with `host_ns` and its length (record_format.MESSAGE).
-
-    Ends at the first that does not fit; return its place, or `stop`, and the bytes used.
-    """
-    while first < stop:
-        begin, end = spans[first, 0], spans[first, 1]
-        if used + _MESSAGE_HEAD + end - begin > out.size:
-            break
-        used = _pack(buffer, begin, end, host_ns, out, used)
-        first += 1
-    return first, used
-
-
-@outer
 def pack_stamped(buffer, spans, first, out, used):  # type: ignore[no-untyped-def]
-    """As `pack_messages`, from `first` on, with a time for each: spans int64 (n, 4) of begin, end, time in ns, and what does not matter."""
+    """Put the bodies at spans[first:] of `buffer` behind out[:used], each with its time and its length (format.MESSAGE).
+
+    spans int64 (n, 4): begin, end, time in ns, and what does not matter. Return the place of the first that does not fit, or n, and the
+    bytes used.
+    """
     while first < spans.shape[0]:
-        begin, end = spans[first, 0], spans[first, 1]
+        begin, end, host_ns = spans[first, 0], spans[first, 1], spans[first, 2]
         if used + _MESSAGE_HEAD + end - begin > out.size:
             break
-        used = _pack(buffer, begin, end, spans[first, 2], out, used)
+        for i in range(8):
+            out[used + i] = np.uint8(host_ns >> 8 * i & 0xFF)
+        for i in range(4):
+            out[used + 8 + i] = np.uint8(end - begin >> 8 * i & 0xFF)
+        used += _MESSAGE_HEAD
+        copy_span(buffer, _U(begin), _U(end), out, _U(used))
+        used += end - begin
         first += 1
     return first, used
-
-
-@inner
-def _pack(buffer, begin, end, host_ns, out, used):  # type: ignore[no-untyped-def]
-    """Put one body behind out[:used]; return the bytes used."""
-    for i in range(8):
-        out[used + i] = np.uint8(host_ns >> 8 * i & 0xFF)
-    for i in range(4):
-        out[used + 8 + i] = np.uint8(end - begin >> 8 * i & 0xFF)
-    used += _MESSAGE_HEAD
-    copy_span(buffer, _U(begin), _U(end), out, _U(used))
-    return used + end - begin
