@@ -1,7 +1,6 @@
-"""`pans bench`: decision speed and accuracy of this machine.
+"""`pans bench`: decision speed and accuracy of this machine; each benchmark is found by entry point (`pans.benches`).
 
-Owns the arguments and the report; each benchmark is found by entry point (`pans.benches`), so that the simulator's joins from its own
-package. Exit code 0 whatever the figures are: a benchmark measures, tests judge.
+The exit code is 0 whatever the figures are: a benchmark measures, tests judge.
 """
 
 from __future__ import annotations
@@ -24,32 +23,18 @@ NAMES = ("decide", "link", "loop", "ingest", "turn")
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("what", choices=[*NAMES, "all"], help="what to measure")
-    parser.add_argument(
-        "--bundle", type=Path, action="append", default=[], help="a bundle to decide with (decide: may be repeated)"
-    )
-    parser.add_argument(
-        "--inputs",
-        type=Path,
-        action="append",
-        default=[],
-        help="decide: .npz with counts (n, d_f), shots, labels; one per --bundle",
-    )
-    parser.add_argument(
-        "--seconds",
-        type=Range(0.01, 86_400).option,
-        default=5.0,
-        help="loop: length of each of its six runs (default 5)",
-    )
-    parser.add_argument("--load", action="store_true", help="loop: keep both cores busy with other processes")
-    parser.add_argument(
-        "--frames",
-        type=Range(0, 10**12, whole=True).option,
-        default=0,
-        help="ingest: also run the whole way over this many frames",
-    )
-    parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
-    parser.add_argument("--plot", type=Path, help="write a plot of speed against error (plot extra)")
+    add = parser.add_argument
+    add("what", choices=[*NAMES, "all"], help="what to measure")
+    add("--bundle", type=Path, action="append", default=[], help="a bundle to decide with (decide: may be repeated)")
+    inputs = "decide: .npz with counts (n, d_f), shots, labels; one per --bundle"
+    add("--inputs", type=Path, action="append", default=[], help=inputs)
+    seconds = "loop: length of each of its six runs (default 5)"
+    add("--seconds", type=Range(0.01, 86_400).option, default=5.0, help=seconds)
+    add("--load", action="store_true", help="loop: keep both cores busy with other processes")
+    frames = "ingest: also run the whole way over this many frames"
+    add("--frames", type=Range(0, 10**12, whole=True).option, default=0, help=frames)
+    add("--quick", action="store_true", help="fewer and shorter runs")
+    add("--plot", type=Path, help="write a plot of speed against error (plot extra)")
     add_force(parser)
 
 

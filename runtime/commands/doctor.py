@@ -323,75 +323,73 @@ def _first_line(path: str) -> str:
 # -- what each real-time setting brings --------------------------------------------------------------------------------
 
 
-def _compared(
-    setting: str, in_force: str, found: Rehearsal, arms: tuple[str, str], q: float, do: dict[str, str]
-) -> dict[str, Any]:
-    """A row that compares two arms by a quantile; `do` by effect, and "refused" for an arm that was not granted.
-
-    A setting helps or harms only if it does so in every round.
-    """
-    turns = [found.arms.get(arm) for arm in arms]
-    rounds = [[float(np.quantile(one, q)) for one in arm.rounds_ns] if arm else [] for arm in turns]
-    effect, better = "", None
-    if rounds[0] and len(rounds[0]) == len(rounds[1]):
-        better = sum(one > two for one, two in zip(*rounds))
-        worse = sum(one < two for one, two in zip(*rounds))
-        ratio = median(rounds[1]) / median(rounds[0])
-        helps, harms = better == len(rounds[0]) and ratio < HELPS, worse == len(rounds[0]) and ratio > HARMS
-        effect = "helps" if helps else "harms" if harms else "none"
-    return {
-        "setting": setting,
-        "in_force": in_force,
-        "measured": f"woken by a timer: {arms[0]}; {arms[1]} (compared by p{100 * q:.0f})",
-        "without": turns[0].figures() if turns[0] else {},
-        "with": turns[1].figures() if turns[1] else {},
-        "rounds_better": better,
-        "rounds": len(rounds[0]) if effect else None,
-        "effect": effect,
-        "do": do.get(effect or "refused", "nothing"),
-    }
+# Row, the arms without and with it ("base": bound, at the best priority that is granted), the quantile that is compared, and what to do by
+# effect; "refused" for an arm that was not granted.
+COMPARED: tuple[tuple[str, str, str, float, dict[str, str]], ...] = (
+    ("SCHED_FIFO", "ordinary", "SCHED_FIFO", 0.99, {
+        "harms": "compare once more on a quiet machine; --no-realtime leaves it out",
+        "refused": LIMITS.format(line="$USER - rtprio 20"),
+    }),
+    ("affinity", "ordinary", "bound", 0.99, {"helps": "--core {host} binds the loop"}),
+    ("core kept awake", "base", "kept awake", 0.99, {
+        "helps": "pans run --core {host}, and a simulated device on pans simulate --core {device}: each takes all of its core",
+        "harms": "leave --core out",
+    }),
+    ("C-states", "base", "shallow idle states", 0.5, {
+        "helps": "--core keeps one core out of them; for all: idle=poll or processor.max_cstate=1 at boot",
+        "refused": "to try it, run this as root: the file /dev/cpu_dma_latency is root's",
+    }),
+)  # fmt: skip
 
 
 def settings_of(found: Rehearsal) -> list[dict[str, Any]]:
     """Return a row for each setting: what is in force, what was measured without and with it, and what to do."""
     from pans.runtime.timing.cpu import isolated_cores
 
-    base = "bound, SCHED_FIFO" if found.fifo else "bound"
-    pair = f"pans run --core {found.host}"
-    pair += "" if found.device is None else f", and a simulated device on pans simulate --core {found.device}"
-    cores = ", ".join(str(row["core"]) for row in found.cores) or "unknown"
-    rows = [
-        _compared(
-            "SCHED_FIFO", "granted" if found.fifo else "refused", found, ("ordinary", "SCHED_FIFO"), 0.99,
-            {"harms": "compare once more on a quiet machine; --no-realtime leaves it out",
-             "refused": LIMITS.format(line="$USER - rtprio 20")},
-        ),
-        _compared(
-            "affinity", f"cores {cores} allowed", found, ("ordinary", "bound"), 0.99,
-            {"helps": f"--core {found.host} binds the loop"},
-        ),
-        _compared(
-            "core kept awake", "no: by --core N", found, (base, "kept awake"), 0.99,
-            {"helps": f"{pair}: each takes all of its core", "harms": "leave --core out"},
-        ),
-        _compared(
-            "C-states", _first_line("/sys/devices/system/cpu/cpuidle/current_driver") or "not told by this system", found,
-            (base, "shallow idle states"), 0.5,
-            {"helps": "--core keeps one core out of them; for all: idle=poll or processor.max_cstate=1 at boot",
-             "refused": "to try it, run this as root: the file /dev/cpu_dma_latency is root's"},
-        ),
-    ]  # fmt: skip
-    isolated = isolated_cores()
+    isolated, cores = isolated_cores(), ", ".join(str(row["core"]) for row in found.cores) or "unknown"
+    in_force = {
+        "SCHED_FIFO": "granted" if found.fifo else "refused",
+        "affinity": f"cores {cores} allowed",
+        "core kept awake": "no: by --core N",
+        "C-states": _first_line("/sys/devices/system/cpu/cpuidle/current_driver") or "not told by this system",
+    }
+    rows = []
+    for setting, before, after, q, do in COMPARED:
+        base = "bound, SCHED_FIFO" if found.fifo else "bound"
+        row = _compared(found, base if before == "base" else before, after, q)
+        advice = do.get(row["effect"] or "refused", "nothing").format(host=found.host, device=found.device)
+        advice = advice.replace(", and a simulated device on pans simulate --core None", "")
+        rows.append({"setting": setting, "in_force": in_force[setting], **row, "do": advice})
     others = next((row for row in found.cores if row["core"] == found.host), {})
     is_shared = found.host not in isolated and not found.fifo and others.get("away_ms_per_s", 0.0) > AWAY_MS_PER_S
-    do = f"allow SCHED_FIFO; or isolcpus={found.host} at boot, then --core {found.host}" if is_shared else "nothing"
-    rows.append(_measured("isolcpus", f"cores {sorted(isolated)}" if isolated else "none", others, do))
+    do_isolate = f"allow SCHED_FIFO; or isolcpus={found.host} at boot, then --core {found.host}"
+    rows.append(_measured("isolcpus", f"cores {sorted(isolated)}", others, do_isolate if is_shared else "nothing"))
     worst = max(found.cores, key=lambda row: float(row.get("fifo_away_ms_per_s", 0.0)), default={})
     beyond = {name.removeprefix("fifo_"): value for name, value in worst.items() if name.startswith("fifo_")}
     stolen = "unknown" if found.steal_ms is None else f"{found.steal_ms:.0f} ms stolen in {found.seconds:.0f} s"
     held = float(beyond.get("largest_away_us", 0.0)) > AWAY_US
-    do = "a computer of its own, or cores of its own: no priority helps against interrupts and the hypervisor"
-    return [*rows, _measured("virtualisation", stolen, beyond, do if held else "nothing")]
+    own = "a computer of its own, or cores of its own: no priority helps against interrupts and the hypervisor"
+    return [*rows, _measured("virtualisation", stolen, beyond, own if held else "nothing")]
+
+
+def _compared(found: Rehearsal, before: str, after: str, q: float) -> dict[str, Any]:
+    """Compare two arms by quantile `q`: one helps or harms only if it does so in every round."""
+    arms = [found.arms.get(name) for name in (before, after)]
+    first, second = ([float(np.quantile(one, q)) for one in arm.rounds_ns] if arm else [] for arm in arms)
+    effect, better = "", None
+    if first and len(first) == len(second):
+        better = sum(one > two for one, two in zip(first, second))
+        worse, ratio = sum(one < two for one, two in zip(first, second)), median(second) / median(first)
+        effect = "helps" if better == len(first) and ratio < HELPS else "none"
+        effect = "harms" if worse == len(first) and ratio > HARMS else effect
+    return {
+        "measured": f"woken by a timer: {before}; {after} (compared by p{100 * q:.0f})",
+        "without": arms[0].figures() if arms[0] else {},
+        "with": arms[1].figures() if arms[1] else {},
+        "rounds_better": better,
+        "rounds": len(first) if effect else None,
+        "effect": effect,
+    }
 
 
 def _measured(setting: str, in_force: str, away: dict[str, Any], do: str) -> dict[str, Any]:

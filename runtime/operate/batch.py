@@ -19,7 +19,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -162,31 +163,31 @@ def _end_with_parent() -> Any:
     return lambda: prctl(_DIES_WITH_PARENT, signal.SIGKILL)
 
 
-def results_here(items: Sequence[Item], folder: str) -> Iterator[tuple[Item, dict[str, Any]]]:
-    """Yield each item with its result, one after the other."""
-    for item in items:
-        yield item, run_item(item.words, folder)
+def results_here(items: Sequence[Item], folder: str, workers: int = 1) -> Iterator[tuple[Item, dict[str, Any]]]:
+    """Yield each item with its result as it comes, `workers` processes at a time."""
+    pool = ThreadPoolExecutor(workers)
+    try:
+        futures = {pool.submit(run_item, item.words, folder): item for item in items}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
-def results_of_dask(
-    items: Sequence[Item], folder: str, *, address: str = "", workers: int = 0
-) -> Iterator[tuple[Item, dict[str, Any]]]:
-    """Yield each item with its result as it comes, from the scheduler at `address` or from a local cluster of `workers` processes.
+def results_of_dask(items: Sequence[Item], folder: str, address: str) -> Iterator[tuple[Item, dict[str, Any]]]:
+    """Yield each item with its result as it comes, from the workers of the scheduler at `address`.
 
     An item that fails on several workers, each of which died, has an error and no exit code. LinkError without a scheduler.
     """
     distributed = need_distributed()
-    with ExitStack() as opened:
-        if not address:
-            cluster = distributed.LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
-            address = opened.enter_context(cluster)
-        try:
-            client = opened.enter_context(distributed.Client(address, timeout=CONNECT_S))
-        except (OSError, ValueError) as error:
-            raise LinkError(
-                f"--dask {address}: no scheduler answers: {error}",
-                remedy="start one with `dask scheduler`, or use --workers",
-            ) from error
+    try:
+        client = distributed.Client(address, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise LinkError(
+            f"--dask {address}: no scheduler answers: {error}",
+            remedy="start one with `dask scheduler`, or use --workers",
+        ) from error
+    with client:
         futures = {
             client.submit(run_item, item.words, folder, key=f"pans-{number}", pure=False, retries=RETRIES): item
             for number, item in enumerate(items)
@@ -216,7 +217,7 @@ def need_distributed() -> Any:
         return importlib.import_module("distributed")
     except ImportError as error:
         raise UsageError(
-            "--dask and --workers need the packages dask and distributed, which are not installed",
+            "--dask needs the packages dask and distributed, which are not installed",
             remedy="pip install 'pans-runtime[dask]'",
         ) from error
 
@@ -283,33 +284,20 @@ def flat_rows(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("command", metavar="COMMAND", choices=(*ON_FILES, *ON_NAMES), help="what to do with each input")
-    parser.add_argument(
-        "inputs", nargs="+", metavar="INPUT", help="files or patterns in quotes; of reproduce, train: names"
-    )
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="results: .parquet or .jsonl")
-    parser.add_argument(
-        "--vary",
-        action="append",
-        default=[],
-        metavar="NAME=VALUES",
-        help="run each input with each of these values of --NAME: seed=0-9, or eta=0.5,1,2 (repeatable)",
-    )
-    parser.add_argument(
-        "--with",
-        dest="extra",
-        default="",
-        metavar="WORDS",
-        help="further options of COMMAND; {path}, {folder}, {stem} and varied names are replaced",
-    )
+    add = parser.add_argument
+    add("command", metavar="COMMAND", choices=(*ON_FILES, *ON_NAMES), help="what to do with each input")
+    add("inputs", nargs="+", metavar="INPUT", help="files or patterns in quotes; of reproduce, train: names")
+    add("-o", "--out", type=Path, required=True, metavar="OUT", help="results: .parquet or .jsonl")
+    values = "run each input with each of these values of --NAME: seed=0-9, or eta=0.5,1,2 (repeatable)"
+    add("--vary", action="append", default=[], metavar="NAME=VALUES", help=values)
+    further = "further options of COMMAND; {path}, {folder}, {stem} and varied names are replaced"
+    add("--with", dest="extra", default="", metavar="WORDS", help=further)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=WORKERS.option, metavar="N", help="N processes on this machine (extra dask)")
-    where.add_argument(
-        "--dask", default="", metavar="URL", help="a scheduler of Dask, such as tcp://host:8786 (extra dask)"
-    )
-    parser.add_argument(
-        "--resume", action="store_true", help="go on with these results: only what is missing or has changed"
-    )
+    where.add_argument("--workers", type=WORKERS.option, metavar="N", help="N at a time on this machine")
+    scheduler = "a scheduler of Dask, such as tcp://host:8786 (extra dask)"
+    where.add_argument("--dask", default="", metavar="URL", help=scheduler)
+    resume = "go on with these results: only what is missing or has changed"
+    add("--resume", action="store_true", help=resume)
     add_force(parser)
 
 
@@ -354,7 +342,7 @@ def _journal(args: argparse.Namespace) -> Journal:
         raise UsageError(f"--out {args.out}: allowed are .parquet and .jsonl", remedy="name it results.jsonl")
     if args.out.suffix == ".parquet":
         need_pyarrow()
-    if args.dask or args.workers:
+    if args.dask:
         need_distributed()
     path = args.out if args.out.suffix == ".jsonl" else args.out.with_name(f"{args.out.name}.jsonl")
     if not args.resume and path.exists() and not args.force:
@@ -376,10 +364,7 @@ def _work(args: argparse.Namespace, journal: Journal, todo: list[Item]) -> None:
     if not todo:
         return
     folder, began_s = str(Path.cwd()), time.monotonic()
-    if args.dask or args.workers:
-        results = results_of_dask(todo, folder, address=args.dask, workers=args.workers or 0)
-    else:
-        results = results_here(todo, folder)
+    results = results_of_dask(todo, folder, args.dask) if args.dask else results_here(todo, folder, args.workers or 1)
     reported_s = began_s
     with closing(results), _bar(len(todo)) as step:  # type: ignore[type-var]
         for number, (item, row) in enumerate(results, 1):

@@ -1,6 +1,6 @@
 """Tables as Parquet files (extra `parquet`): the decisions of a recording, and any rows of plain values.
 
-Owns columns and types; pyarrow is imported when a file is written. A file is written whole or not at all.
+pyarrow is imported when a file is written. A file is written whole or not at all.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A bundle's parts as files for other tools, and patterns from such files: PNG pictures, NumPy arrays, the head as ONNX.
 
-Owns which files a bundle becomes and what a folder of pictures means; pixels of PNG files are grey_png.py's. White is the highest level.
+White is the highest level.
 """
 
 from __future__ import annotations

@@ -80,10 +80,9 @@ def test_a_batch_goes_on_where_it_was(
     assert main(["batch", "info", "*/grid.pans", "-o", "r.jsonl"]) == 2  # never replaced
     assert "--resume" in capsys.readouterr().err
     assert json_of(capsys, *words, "--resume", code=1)["run"] == 1
-    assert ran == [("info", "c/grid.pans")]
-    assert [json.loads(line)["item"] for line in Path("r.jsonl").read_text().splitlines()] == [
-        f"{name}/grid.pans" for name in "abc"
-    ]
+    assert len(ran) == 1
+    items = {json.loads(line)["item"] for line in Path("r.jsonl").read_text().splitlines()}
+    assert items == {f"{name}/grid.pans" for name in "abc"}
     os.utime("a/grid.pans", (1, 1))  # a changed input is done again
     assert json_of(capsys, *words, "--resume", code=1)["run"] == 1
     assert json_of(capsys, *words, "--force", code=1)["run"] == 3
@@ -95,7 +94,7 @@ def test_an_interrupted_batch_keeps_what_is_done(
     in_this_process(monkeypatch)
     results = batch.results_here
 
-    def interrupted(items: Any, folder: str) -> Any:
+    def interrupted(items: Any, folder: str, workers: int) -> Any:
         yield next(results(items, folder))
         raise KeyboardInterrupt
 
