@@ -1,8 +1,8 @@
-"""The conformance kit: every rule of the protocol tried on a device over its real link (`pans conform URL`).
+"""Every rule of the protocol tried on a device over its real link (`pans conform URL`).
 
-Each rule of docs/reference/protocol.md, section 12, has a check that sends what the rule speaks of and judges what comes back. `conform`
-tries them all and returns a verdict for each, with the bytes; it never decides anything about light or clicks. A check needs nothing of the
-device but the protocol: it is meant for a lab's own firmware.
+A link and a profile go in; a finding for each rule of docs/reference/protocol.md, section 12, comes out: kept, broken or not tried, with
+the bytes. Start with `judge.conform`; `rules` registers the checks that the other modules hold. It needs nothing of the device but
+the protocol.
 """
 
 from .judge import Finding, conform

@@ -25,10 +25,10 @@ from pans.runtime.wire.commands import (
 from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, ClickBlock, Opcode
 from pans.runtime.wire.schema import COUNT_SCHEMA
 
+from .automata import CYCLES, SLOTS, following, four_states
 from .bench import Bench
 from .plans import Layout
 from .rules import NotTried, need, rule
-from .walks import CYCLES, SLOTS, following, four_states
 
 LEAVES = 5
 MALFORMED, RANGE, STATE = AckStatus.MALFORMED, AckStatus.OUT_OF_RANGE, AckStatus.WRONG_STATE

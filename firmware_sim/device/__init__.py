@@ -1,7 +1,7 @@
 """The instrument as a state machine without I/O: bytes and ticks in, bytes out.
 
-Owns session, commands, lease, runs, the stream's buffer and the gates, as docs/reference/protocol.md says; never reads a clock, sleeps
-or opens a port. `Instrument` is the device; `DeviceClock` is the truth about its ticks, `SteppedDevice` what a shell needs of either.
+Start with `instrument`: sessions, commands, lease and status, as docs/reference/protocol.md says. `view` makes a run from a plan and the
+scene; `walking` and `parallel` are the two kinds of run; `readings` is what the detector reads.
 
 >>> from pans.firmware_sim.device import Instrument
 >>> from pans.firmware_sim.scene import load_scene

@@ -338,13 +338,13 @@ class Instrument:
             return
         self._states.load(piece_of(unpack_states(body)), self._plan.program)
         if self._states.states is not None:
-            from . import walk_kernels
+            from . import readings
 
-            walk_kernels.warm_up()  # ARM must not wait for a compiler
+            readings.warm_up()  # ARM must not wait for a compiler
 
     def _counts(self, opcode: Opcode, body: bytes) -> None:
         """The commands of protocol.md, section 13."""
-        from . import counting
+        from . import readings
 
         self._require_idle(opcode.name)
         program = self._plan.program
@@ -353,7 +353,7 @@ class Instrument:
             return
         asked = unpack_read_counts(body)
         self._states.read_counts(asked, program)
-        counting.warm_up(asked.channels)
+        readings.warm_up(self._states.largest + 1, self._states.channels)
         if program is not None:
             with suppress(Refused):  # ARM says what is wrong
                 self._light_table(program)

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.firmware_sim.program import Program, States
+from pans.firmware_sim.program import Exposures, Program, States
 from pans.firmware_sim.scene.changes import Changes
 from pans.firmware_sim.scene.detector_model import detector_model
 from pans.firmware_sim.scene.drawing import ClickSource
-from pans.firmware_sim.scene.exposure_times import Exposures
 from pans.firmware_sim.scene.light import RunLight, StillMarks, StillObjects, Table, begin, prepare, tabulate, warm_up
 from pans.firmware_sim.scene.moving import SceneFile
 from pans.firmware_sim.scene.optics import passive_photoelectrons
@@ -32,10 +31,9 @@ from .bleached import bleached_photoelectrons
 from .sequential import Measurement
 from .states import ShowList
 from .upload import Refused
-from .walking import PatternLight, PlanSource, ShownSource, Walked, WalkSource
+from .walking import NumberSource, PatternLight, PlanSource, ShownSource, Walked, WalkSource
 
 if TYPE_CHECKING:
-    from .counting import CountedPlan, CountedShows, CountedWalk, ShowsAtOnce, WalkAtOnce
     from .parallel import FrameRun
 
 
@@ -170,29 +168,17 @@ class View:
         model = detector_model(self.profile, self.exposure_us(program))
         facts = (scene.n_objects, exposures, changes, model, self.seed, first_draw)
         walked = Walked(program, light, *facts, light.fresh_sample(), np.zeros(reading.channels))
-        counts = reading.largest > 1
-        source = _counting_source(walked, drive, reading) if counts else _clicking_source(walked, drive)
-        return Measurement(
-            program, arm, StillMarks(scene, program, exposures, changes, source.expected_photoelectrons), source
-        )
+        from .readings import Clicks, Numbers  # numba is loaded only where exposures are read by themselves
 
-
-def _clicking_source(walked: Walked, drive: States | ShowList | None) -> ShownSource | WalkSource:
-    assert drive is not None
-    return ShownSource(walked, drive) if isinstance(drive, ShowList) else WalkSource(walked, drive)
-
-
-def _counting_source(
-    walked: Walked, drive: States | ShowList | None, reading: ReadCounts
-) -> CountedPlan | CountedShows | CountedWalk | ShowsAtOnce | WalkAtOnce:
-    from .counting import CountedPlan, CountedShows, CountedWalk, ShowsAtOnce, WalkAtOnce  # numba: only for who counts
-
-    largest, channels = reading
-    if channels > 1:
-        assert drive is not None
-        if isinstance(drive, ShowList):
-            return ShowsAtOnce(walked, drive, channels)
-        return WalkAtOnce(walked, drive, channels)
-    if drive is None:
-        return CountedPlan(walked, largest)
-    return CountedShows(walked, drive, largest) if isinstance(drive, ShowList) else CountedWalk(walked, drive)
+        channels = reading.channels
+        numbers = reading.largest > 1 and channels == 1
+        reader = Numbers(walked, reading.largest) if numbers else Clicks(walked, channels)
+        source: NumberSource | ShownSource | WalkSource
+        if drive is None:
+            source = NumberSource(walked, reader)
+        elif isinstance(drive, ShowList):
+            source = ShownSource(reader, drive, channels)
+        else:
+            source = WalkSource(walked, reader, drive, channels)
+        marks = StillMarks(scene, program, exposures, changes, source.expected_photoelectrons)
+        return Measurement(program, arm, marks, source)

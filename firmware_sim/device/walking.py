@@ -1,26 +1,22 @@
-"""What an automaton's exposures show and whether they click: followed by the device, or named by the host.
+"""What the exposures of a sequential run show, and what is read of them, one slot after the other.
 
-Owns the light of states and the walk from click to click; never knows messages or time beyond the exposure's number. It shares no code with
-the host's check of the walks, so that each is a test of the other. The number drawn for an exposure depends on the seed and the
-exposure alone: both ways of driving give the same clicks for the same patterns.
+Three kinds of run: fixed patterns, an automaton that the device follows, states that the host names. Each asks a reader (readings.py) for
+what the detector reads. Light and walk share no code with the host's check of the walks, so that each tests the other.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.firmware_sim.program import Program, States
+from pans.firmware_sim.program import Exposures, Program, States
 from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector import sample_clicks
-from pans.firmware_sim.scene.detector_model import DetectorModel, first_click_probability
+from pans.firmware_sim.scene.detector_model import DetectorModel
 from pans.firmware_sim.scene.drawing import ClickSource
-from pans.firmware_sim.scene.exposure_times import Exposures
 from pans.firmware_sim.scene.optics import expected_photoelectrons
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.instrument.profile import Profile
@@ -32,12 +28,29 @@ from .states import ShowList
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
-U64 = NDArray[np.uint64]
 BATCH_EXPOSURES = 1 << 14  # of a plan with fixed patterns, drawn at a time
+MOST_AHEAD = 1024  # the same of photon numbers: an object may stay for as many as the host likes
 BLOCK_ENTRIES = 1 << 20  # objects times patterns that are computed at a time
 MAX_BLOCKS = 4  # and how many of those are kept: 32 MiB of float64
-OBJECTS_AHEAD = 3  # whose thresholds are made where there is time
-MAX_THRESHOLDS = 1 << 22  # of states times objects that are kept, twice each: 64 MiB
+
+
+class Reader(Protocol):
+    """What a detector reads; see readings.Clicks."""
+
+    largest: int
+    at_once: bool  # whether exposures of a cycle depend on nothing but the walk, so that they can be followed together
+
+    def light(self, exposure: int, pattern: int, share: float) -> F64: ...
+
+    def read(self, first: int, light: F64, before: U8) -> U8: ...
+
+    def prepare(self, exposure: int, states: States) -> bool: ...
+
+    def follow(
+        self, first: int, node: int, states: States, adaptive: NDArray[np.bool_], before: U8, stamps: U16, readings: U8
+    ) -> int: ...
+
+    def expected_light(self, number: int, states: States) -> float: ...
 
 
 class SlotSource(Protocol):
@@ -50,9 +63,9 @@ class SlotSource(Protocol):
         """Do a piece of work of a fraction of a millisecond that `exposure` or those after it will need; whether there was any."""
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
-        """Return what is stamped, uint16 (count,), and clicks or numbers, uint8 (count, 1), of exposures from `first` on.
+        """Return what is stamped, uint16 (count,), and what is read, uint8 (count, 1), of exposures from `first` on.
 
-        before uint8 (1,): the click of the one before.
+        before uint8 (1,): the reading of the one before.
         """
 
 
@@ -111,7 +124,7 @@ class PatternLight:
 
 @dataclass(frozen=True, slots=True)
 class Walked:
-    """What every exposure of an automaton's run depends on; `first_draw` exposures were drawn in earlier runs."""
+    """What every exposure depends on that is read by itself; `first_draw` exposures were drawn in earlier runs."""
 
     program: Program
     light: PatternLight
@@ -141,29 +154,38 @@ class Walked:
         cycle = exposure // self.program.n_slots
         return cycle // self.program.cycles_per_object % NO_OBJECT % self.n_objects
 
-    def click(self, exposure: int, photoelectrons: float | F64, before: U8) -> U8:
-        """Draw one exposure with `photoelectrons` expected: uint8 (1,), as `before` of the exposure before.
 
-        Of several detectors that are read at once float64 (channels,), and uint8 (channels,).
-        """
-        light = np.atleast_1d(np.asarray(photoelectrons, np.float64))[None, :]
-        if self.changes:
-            seconds = self.exposures.seconds(self.exposures.begins(exposure, 1))
-            probability = self.changes.probability(
-                self.model, light, seconds, self.exposures.exposure_ticks / self.exposures.tick_hz
-            )
-        else:
-            probability = first_click_probability(self.model, light)
-        return sample_clicks(self.model, probability, self.seed, self.first_draw + exposure, before, self.carriers)[0]
+class NumberSource:
+    """The exposures of a plan whose patterns are fixed, read as photon numbers."""
+
+    def __init__(self, walked: Walked, reader: Reader) -> None:
+        self._walked, self._reader, self.largest = walked, reader, reader.largest
+        self.ahead = min(walked.program.n_slots * walked.program.cycles_per_object, MOST_AHEAD)
+
+    def prepare(self, exposure: int) -> bool:
+        """Nothing."""
+        return False
+
+    def expected_photoelectrons(self, number: int) -> float:
+        """The photoelectrons of one exposure of every pattern on object `number` of the scene; NaN of one that bleaches."""
+        return math.nan if self._walked.sample is not None else float(self._walked.light.of(number).sum())
+
+    def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
+        """See `SlotSource`."""
+        light, program = np.zeros((count, 1)), self._walked.program
+        shown = program.patterns[np.arange(first, first + count) % program.n_slots]
+        for place in np.flatnonzero(shown != DARK_PATTERN).tolist():
+            light[place] = self._reader.light(first + place, int(shown[place]), 1.0)
+        return shown, self._reader.read(first, light, before)
 
 
 class ShownSource:
     """The exposures that the host names one by one; one without a name is dark."""
 
-    ahead, largest = 0, 1
+    ahead = 0
 
-    def __init__(self, walked: Walked, shows: ShowList) -> None:
-        self._walked, self._shows = walked, shows
+    def __init__(self, reader: Reader, shows: ShowList, channels: int) -> None:
+        self._reader, self._shows, self._channels, self.largest = reader, shows, channels, reader.largest
 
     def prepare(self, exposure: int) -> bool:
         """Nothing: what is shown is not known."""
@@ -175,26 +197,28 @@ class ShownSource:
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
         """See `SlotSource`."""
-        stamps, clicks = np.full(count, DARK_PATTERN, np.uint16), np.zeros((count, 1), np.uint8)
+        stamps, light = np.full(count, DARK_PATTERN, np.uint16), np.zeros((count, self._channels))
         for place, exposure in enumerate(range(first, first + count)):
-            shown, light = self._shows.take(exposure), 0.0
+            shown = self._shows.take(exposure)
             if shown is not None:
                 stamps[place] = shown.state
-                light = self._walked.photoelectrons(exposure, shown.pattern, shown.light)
-            clicks[place] = before = self._walked.click(exposure, light, before)
-        return stamps, clicks
+                light[place] = self._reader.light(exposure, shown.pattern, shown.light)
+        return stamps, self._reader.read(first, light, before)
 
 
-class Followed(ABC):
-    """The exposures of an automaton that the device follows, of clicks or of photon numbers."""
+class WalkSource:
+    """The exposures of an automaton that the device follows."""
 
-    def __init__(self, walked: Walked, states: States, *, at_once: bool) -> None:
-        """`at_once`: exposures of a cycle depend on nothing but the walk, so that they can be followed together."""
-        self._walked, self._states = walked, states
+    def __init__(self, walked: Walked, reader: Reader, states: States, channels: int) -> None:
+        self._walked, self._reader, self._states, self._channels = walked, reader, states, channels
         self._adaptive = walked.program.patterns == ADAPTIVE_PATTERN
-        self._state = 0
+        self._state, self.largest = 0, reader.largest
         self._expected: dict[int, float] = {}  # by object of the scene
-        self.ahead = walked.program.n_slots if at_once else 0
+        self.ahead = walked.program.n_slots if reader.at_once else 0
+
+    def prepare(self, exposure: int) -> bool:
+        """See `SlotSource`."""
+        return self._reader.prepare(exposure, self._states)
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
         """See `SlotSource`."""
@@ -205,7 +229,7 @@ class Followed(ABC):
             if slot == 0:
                 self._state = 0
             part = slice(at, at + min(n_slots - slot, count - at))
-            follow = self._at_once if self.ahead else self._one_by_one
+            follow = self._together if self._reader.at_once else self._one_by_one
             follow(first + at, slot, stamps[part], readings[part], before)
             before, at = readings[part.stop - 1], part.stop
         return stamps, readings
@@ -217,95 +241,25 @@ class Followed(ABC):
         """
         if self._walked.sample is not None:
             return math.nan
-        found = self._expected.get(number)
-        if found is None:
-            found = self._expected[number] = self._walk_light(self._light(number))
-        return found
+        if number not in self._expected:
+            self._expected[number] = self._reader.expected_light(number, self._states)
+        return self._expected[number]
 
-    def _light(self, number: int) -> F64:
-        """Photoelectrons of an exposure in each state, float64 (states,)."""
-        return np.asarray(self._walked.light.of(number)[self._states.pattern] * self._states.light)
+    def _together(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
+        """Follow the walk through exposures of one cycle in a compiled loop; stamps (n,) and readings (n, 1) are set."""
+        adaptive = self._adaptive[slot : slot + len(stamps)]
+        node, states = self._state, self._states
+        self._state = self._reader.follow(first, node, states, adaptive, before, stamps, readings[:, 0])
 
     def _one_by_one(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
         """Follow the walk where the detector changes with time, or the object with its dose."""
         states = self._states
         for place, adaptive in enumerate(self._adaptive[slot : slot + len(stamps)].tolist()):
-            lit = adaptive and self._state < len(states.pattern)
-            readings[place] = before = self._expose(first + place, lit, before)
+            node, light = self._state, np.zeros(self._channels)
+            lit = adaptive and node < len(states.pattern)
             if lit:
-                stamps[place] = self._state
-                self._state = int(states.successors[self._state, before[0]])
-
-    @abstractmethod
-    def _at_once(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
-        """Follow the walk through exposures of one cycle in a compiled loop; stamps (n,) and readings (n, 1) are set."""
-
-    @abstractmethod
-    def _expose(self, exposure: int, lit: bool, before: U8) -> U8:
-        """Draw one exposure, of the present state or in the dark, uint8 (1,), as `before` of the exposure before."""
-
-    def _light_now(self, exposure: int, lit: bool) -> float:
-        """The photoelectrons expected of an exposure, of the present state or in the dark."""
-        if not lit:
-            return 0.0
-        pattern, share = int(self._states.pattern[self._state]), float(self._states.light[self._state])
-        return self._walked.photoelectrons(exposure, pattern, share)
-
-    @abstractmethod
-    def _walk_light(self, light: F64) -> float:
-        """The light of a walk in expectation, from that of its states (states,)."""
-
-
-class WalkSource(Followed):
-    """The clicks of an automaton that the device follows."""
-
-    largest = 1
-
-    def __init__(self, walked: Walked, states: States) -> None:
-        super().__init__(walked, states, at_once=not walked.changing)
-        self._kept: dict[int, U64] = {}
-
-    def prepare(self, exposure: int) -> bool:
-        """See `SlotSource`: the thresholds of one of the objects to come."""
-        walked = self._walked
-        if walked.changing:
-            return False
-        visit = walked.program.n_slots * walked.program.cycles_per_object
-        for ahead in range(OBJECTS_AHEAD):
-            number = walked.object_of(exposure + ahead * visit)
-            if number not in self._kept:
-                self._thresholds(number)
-                self.expected_photoelectrons(number)
-                return True
-        return False
-
-    def _at_once(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
-        from . import walk_kernels
-
-        walked = self._walked
-        self._state = walk_kernels.follow(
-            self._thresholds(walked.object_of(first)), self._states.successors, self._adaptive[slot : slot + len(stamps)],
-            walk_kernels.key_of(walked.seed), walked.first_draw + first, (self._state, int(before[0])), stamps, readings[:, 0],
-        )  # fmt: skip
-
-    def _expose(self, exposure: int, lit: bool, before: U8) -> U8:
-        return self._walked.click(exposure, self._light_now(exposure, lit), before)
-
-    def _walk_light(self, light: F64) -> float:
-        from . import walk_kernels
-
-        chances = walk_kernels.chances(self._walked.model, light)
-        return float(walk_kernels.expected_light(chances, light, self._states.successors))
-
-    def _thresholds(self, number: int) -> U64:
-        """What a number must be below to click, uint64 (2, states + 1): without and with a click before, the last column in the dark."""
-        kept = self._kept.get(number)
-        if kept is None:
-            from . import walk_kernels
-
-            light = np.append(self._light(number), 0.0)
-            kept = walk_kernels.thresholds(self._walked.model, light)
-            if len(self._kept) * kept.size > MAX_THRESHOLDS:
-                self._kept.clear()
-            self._kept[number] = kept
-        return kept
+                light = self._reader.light(first + place, int(states.pattern[node]), float(states.light[node]))
+            readings[place] = before = self._reader.read(first + place, light[None, :], before)[0]
+            if lit:
+                stamps[place] = node
+                self._state = int(states.successors[node, before[0]])

@@ -1,7 +1,7 @@
-"""Shells around the device: in process and in virtual time, pseudo-terminal, TCP, pyserial, pyusb, and faults on the way.
+"""The simulated instrument behind links: in virtual time, a pseudo-terminal, TCP, pyserial, pyusb, with faults on the way.
 
-Owns device URLs of the simulator, file descriptors, threads and child processes; never looks into a message further than a fault needs.
-`open_sim` returns an ordinary link.
+A device URL comes in, an ordinary link goes out. Start with `serve` (the URL and what is made from it); `shell` is the loop at real pace,
+`virtual` the link in virtual time, `faulty` a bad link between.
 
 >>> from pans.firmware_sim.ports import open_sim, parse_faults
 >>> open_sim("sim:ideal?pace=fast&scene=uniform").virtual

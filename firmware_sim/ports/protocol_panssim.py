@@ -14,8 +14,7 @@ from serial.urlhandler import protocol_socket
 from pans.runtime.errors import PansError
 from pans.runtime.link.base import Link, open_link
 
-from .inprocess import ThreadedInstrument
-from .serve import SimOptions, parse_sim_url
+from .serve import SimOptions, ThreadedInstrument, parse_sim_url
 
 PACKAGE = __package__
 

@@ -8,9 +8,11 @@ process the interpreter's lock would let the instrument disturb the host that it
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
@@ -32,6 +34,7 @@ from pans.runtime.link.base import Link, descriptor_of, open_link
 
 from .faults import NO_FAULTS, check_possible, parse_faults
 from .faulty import FaultyDevice
+from .shell import TcpPort, serve
 from .virtual import START_NS, VirtualLink
 
 if TYPE_CHECKING:
@@ -39,7 +42,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SCENE = "fashion200"
 MAX_DRIFT_PPM = 1000.0
-CHILD_GOODBYE_S = 2.0
+GOODBYE_S = 2.0
 MAX_BUFFER_MESSAGES = 1 << 16
 
 
@@ -121,8 +124,7 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
     With faults, the instrument stands behind a bad link.
     """
     from pans.firmware_sim.device.instrument import Instrument  # only where the instrument is: a host waits for it
-
-    from .on_table import scene_on_table
+    from pans.firmware_sim.scene.scene_file import scene_on_table
 
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
@@ -213,7 +215,7 @@ class ChildLink:
         assert self._child.stdout is not None
         line = self._child.stdout.readline().decode("utf-8", "replace").strip()
         if not line:
-            code = self._child.wait(CHILD_GOODBYE_S)
+            code = self._child.wait(GOODBYE_S)
             raise LinkError(f"the simulator of {self.name} did not start (exit code {code})")
         return line
 
@@ -222,7 +224,7 @@ class ChildLink:
             if pipe is not None:
                 pipe.close()
         try:
-            self._child.wait(CHILD_GOODBYE_S)
+            self._child.wait(GOODBYE_S)
         except subprocess.TimeoutExpired:
             self._child.kill()
             self._child.wait()
@@ -230,7 +232,7 @@ class ChildLink:
 
 def _check_scene(options: SimOptions, profile: Profile) -> None:
     """Raise what is wrong with the scene here, where it is better told than by the child."""
-    from .on_table import scene_on_table
+    from pans.firmware_sim.scene.scene_file import scene_on_table
 
     scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach, options.seed)
     _optics(options.optics)
@@ -255,3 +257,30 @@ def _value(url: str, key: str, text: str, kind: str) -> Any:
     except ValueError:
         noun = "a whole number" if kind == "int" else "a number"
         raise UsageError(f"{url!r}: {key} must be {noun}, found {text!r}") from None
+
+
+class ThreadedInstrument:
+    """An instrument in a thread of this process, until `close`, for drivers that need a device; one host at a time.
+
+    Python's lock lets it disturb the host, so that latencies measured this way are upper bounds.
+    """
+
+    def __init__(self, options: SimOptions) -> None:
+        self._device, clock = build_instrument(options, time.perf_counter_ns())
+        self._port = TcpPort("127.0.0.1", 0)
+        self._stopped = threading.Event()
+        args = (self._device, clock, self._port, self._stopped.is_set)
+        self._thread = threading.Thread(target=serve, args=args, name="pans-sim", daemon=True)
+        self._thread.start()
+
+    def connect(self) -> socket.socket:
+        """Return a socket to the instrument."""
+        connection = socket.create_connection(self._port.address, timeout=GOODBYE_S)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return connection
+
+    def close(self) -> None:
+        """Switch off; idempotent."""
+        self._stopped.set()
+        self._thread.join(GOODBYE_S)
+        self._port.close()

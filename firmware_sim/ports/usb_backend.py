@@ -20,8 +20,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.link.base import Link
 from pans.runtime.link.usb import UsbLink
 
-from .inprocess import GOODBYE_S, ThreadedInstrument
-from .serve import parse_sim_url
+from .serve import GOODBYE_S, ThreadedInstrument, parse_sim_url
 
 VENDOR_ID, PRODUCT_ID = 0x1209, 0x0001  # the pair that pid.codes sets aside for tests
 SERIAL_NUMBER = "SIM-USB"

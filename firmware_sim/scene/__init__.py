@@ -1,7 +1,7 @@
 """From what stands or moves before the detector to photoelectrons and clicks.
 
-Owns scenes and their files, the light that they pass through patterns, the detector's law and the random numbers behind each click.
-Everything is a function of a seed and the number of the exposure; never knows messages, sessions or clocks of the host.
+Scene files, patterns and exposures come in; photoelectrons and clicks go out, as functions of a seed and the exposure's number. Start with
+`scene_file` (what a scene is), `light` (its light through patterns) and `drawing` (the clicks).
 
 >>> from pans.firmware_sim.scene import open_scene
 >>> open_scene("cells-in-flow").moves

@@ -11,10 +11,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.firmware_sim.program import Exposures
+
 from .changes import Changes
 from .detector import sample_clicks
 from .detector_model import DetectorModel, first_click_probability
-from .exposure_times import Exposures
 from .light import RunLight
 
 U8 = NDArray[np.uint8]

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.firmware_sim.program import Program
+from pans.firmware_sim.program import Exposures, Program
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.commands import PARALLEL
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, Mark
 
 from .changes import Changes
 from .detector_model import detector_model, first_click_probability, stream_key
-from .exposure_times import Exposures
 from .marks import mark_rows
 from .moving import Cells, SceneFile, Tape
 from .optics import expected_photoelectrons

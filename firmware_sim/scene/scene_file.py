@@ -1,7 +1,7 @@
 """Scene files in TOML: `kind = "still"`, `"cells"` or `"tape"`, and `[[change]]` tables; docs/reference/simulator.md explains every key.
 
-Owns the keys, their limits and the words of the errors, which start with file:line:col; never computes anything. `read_scene_file`
-returns a `SceneFile`. Names of other files in it are relative to it. What the simulator cannot do is refused here.
+`open_scene` returns a `SceneFile`; errors start with file:line:col. Names of other files in it are relative to it. `scene_on_table` puts
+the scene behind the optics that the profile or `--optics` states.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import ConfigError
+from pans.runtime.imaging import bleaching_of, imaging_of, is_spec
 from pans.runtime.instrument.checked_toml import (
     Key,
     KeyPath,
@@ -26,8 +27,11 @@ from pans.runtime.instrument.checked_toml import (
     read_toml,
     type_remedy,
 )
+from pans.runtime.instrument.profile import Profile
 
 from . import moving
+from .detector import uniform_numbers
+from .detector_model import TELEGRAPH_STREAM
 from .moving import ALL_CHANNELS, CHANGE_KINDS, Cells, Change, SceneFile, Tape
 from .still import SCENE_FOLDER, TARGETS, Scene, load_images, load_scene
 
@@ -241,3 +245,60 @@ class _Check:
         if len(data) > MAX_TAPE_BITS or not len(digits) or not np.isin(digits, (48, 49)).all():
             raise self.fault(("file",), f"{path}: must hold 1 to {MAX_TAPE_BITS} digits 0 and 1, and nothing else")
         return digits - np.uint8(48)
+
+
+def scene_on_table(
+    name: str, changes: str, optics: str, profile: Profile, bleach: str = "", seed: int = 0
+) -> SceneFile:
+    """Open the scene `name` with `changes` where `profile` says, or where `optics` does; ConfigError for one that moves.
+
+    `optics` is as of `--optics`; keys that it does not name are as the profile states them. `bleach` is as of `--bleach`; `seed` chooses
+    the pixels that jump.
+    """
+    scene = _bleaching(open_scene(name, changes), bleach)
+    imaging = profile.imaging()
+    if is_spec(optics):
+        imaging = imaging_of(optics, imaging)
+    scene = _drifting(scene, profile)
+    scene = replace(scene, changes=(*scene.changes, *reading_changes(profile, seed)))
+    if imaging.is_identity:
+        return scene
+    if not isinstance(scene.what, Scene):
+        raise ConfigError(
+            f"scene {scene.name!r} moves: optics other than perfect ones are simulated for still objects",
+            remedy="leave the optics out, or choose a scene of still objects",
+        )
+    return replace(scene, what=replace(scene.what, imaging=imaging))
+
+
+def _bleaching(scene: SceneFile, bleach: str) -> SceneFile:
+    if not bleach:
+        return scene
+    if not isinstance(scene.what, Scene):
+        raise ConfigError(
+            f"scene {scene.name!r} moves: bleaching is simulated for still objects",
+            remedy="leave bleach= out, or choose a scene of still objects",
+        )
+    return replace(scene, what=replace(scene.what, bleaching=bleaching_of(bleach)))
+
+
+def _drifting(scene: SceneFile, profile: Profile) -> SceneFile:
+    """Let the source drift as the profile states, for as long as a run may last."""
+    drift = 0.0 if profile.optics is None else profile.optics.source_drift_percent_per_hour
+    if not drift:
+        return scene
+    return replace(scene, changes=(*scene.changes, Change("drift", 0.0, math.inf, ALL_CHANNELS, drift / 3600)))
+
+
+def reading_changes(profile: Profile, seed: int) -> tuple[Change, ...]:
+    """Return what the profile states of readings that shift: a threshold that drifts, and pixels that jump between two levels."""
+    detector, changes = profile.detector, []
+    if detector.threshold_drift_e_per_hour:
+        changes.append(Change("threshold", 0.0, math.inf, ALL_CHANNELS, detector.threshold_drift_e_per_hour / 3600))
+    jumping = round(detector.telegraph_share * detector.channels)
+    order = np.argsort(uniform_numbers(seed, 0, detector.channels, 1, TELEGRAPH_STREAM)[:, 0])
+    for channel in np.sort(order[:jumping]).tolist():
+        changes.append(
+            Change("telegraph", float(seed % 2**32), detector.telegraph_time_s, channel, detector.telegraph_offset_e)
+        )
+    return tuple(changes)

@@ -16,13 +16,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pans.firmware_sim.program import Exposures
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.messages import NO_OBJECT
 
 from .cells import MAX_HALF_EXPOSURES
 from .changes import Changes
 from .detector import uniform_numbers
-from .exposure_times import Exposures
 from .marks import MARK_TICK, mark_rows, no_marks, split_marks
 from .moving import Tape
 from .optics import photons_per_level

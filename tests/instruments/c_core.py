@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from pans.firmware_sim.device import walk_kernels
+from pans.firmware_sim.device import readings
 from pans.firmware_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES
 from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, MAX_SLOTS, MAX_UPLOAD_BYTES, PatternMemory, Refused
@@ -40,11 +40,10 @@ from pans.firmware_sim.scene.light import LightTable
 from pans.firmware_sim.scene.scene_file import open_scene
 from pans.runtime.instrument.dead_time import STEP, counted_table
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.wire.automata import MaskChunk
-from pans.runtime.wire.commands import MODES, PatternChunk
+from pans.runtime.wire.commands import MODES, MaskChunk, PatternChunk
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, MAX_PAYLOAD_BYTES
 
-FOLDER = Path(walk_kernels.__file__).parents[1] / "reference"
+FOLDER = Path(readings.__file__).parents[1] / "reference"
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra")
 COMPILER = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), "")
 MAGIC, HEADER_WORDS = 0x31474C534E4150, 16  # "PANSLG1"
@@ -165,10 +164,11 @@ class Light:
         elif len(rows):
             states = States(rows[:, 0].astype(np.int64), rows[:, 1] / rows[:, 2], rows[:, 3:].astype(np.int64))
             lit = [np.asarray(light.of(number)[states.pattern] * states.light) for number in objects]
-            both = [walk_kernels.chances(model, np.append(one, 0.0)) for one in lit]
+            both = [readings.click_chances(model, np.append(one, 0.0)) for one in lit]
             probability = np.stack([one[0] for one in both])
             photons = np.array([
-                walk_kernels.expected_light(chance[:, :-1], one, states.successors) for chance, one in zip(both, lit)
+                readings.expected_light(np.stack([1 - chance[:, :-1], chance[:, :-1]], axis=1), one, states.successors)
+                for chance, one in zip(both, lit)
             ])  # fmt: skip
         else:  # the host names states: what they show is known when it does, so the expected photoelectrons go along
             mean = np.stack([light.of(number) for number in objects])
@@ -213,7 +213,7 @@ class CDevice:
         scene = scene or open_scene("uniform")
         view = View(profile, scene, None, seed)
         view.check_and_warm_up()
-        walk_kernels.warm_up()
+        readings.warm_up()
         self._folder = tempfile.TemporaryDirectory(prefix="pans-c-core-")
         self._light, self._library = Light(view, Path(self._folder.name)), _load(library or build_library())
         self._answer = _ANSWER(self._ask)  # kept: the library calls it

@@ -10,7 +10,6 @@ from pans.runtime.commands import one_run as one_run
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.link import serial as serial
-from pans.runtime.live import view as view
 from pans.runtime.record import Recorder
 from pans.runtime.report import summary as summary
 from pans.runtime.report import summary_page as summary_page

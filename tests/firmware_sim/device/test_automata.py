@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instrument_bench import IDEAL, Bench, of_type, plan
 
-from pans.firmware_sim.device import walk_kernels
+from pans.firmware_sim.device import readings
 from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.scene.moving import Change, SceneFile
 from pans.firmware_sim.scene.still import scene_from_arrays
@@ -280,7 +280,7 @@ def test_many_objects_and_patterns_need_little_memory(monkeypatch: pytest.Monkey
     whole = run(*bright(six_states()), cycles=40)[:2]
     monkeypatch.setattr("pans.firmware_sim.device.walking.BLOCK_ENTRIES", 6)  # two objects at a time
     monkeypatch.setattr("pans.firmware_sim.device.walking.MAX_BLOCKS", 1)
-    monkeypatch.setattr("pans.firmware_sim.device.walking.MAX_THRESHOLDS", 1)
+    monkeypatch.setattr("pans.firmware_sim.device.readings.MAX_THRESHOLDS", 1)
     bench, made = bright(six_states())
     assert np.array_equal(np.stack(whole), np.stack(run(bench, made, 40)[:2]))
     assert len(bench.device._light[1]._blocks) == 1
@@ -296,15 +296,16 @@ def test_the_kernels_walk_as_the_oracle_does() -> None:
     successors = automaton.successors.astype(np.int64)
     stamps, clicks, before = np.zeros((40, 5), np.uint16), np.zeros((40, 5), np.uint8), 0
     for walk in range(40):
-        walk_kernels.follow(
-            np.stack([limits, limits]), successors, np.array(slots) == ADAPTIVE_PATTERN, walk_kernels.key_of(3),
+        readings.follow(
+            np.stack([limits, limits])[:, :, None], successors, np.array(slots) == ADAPTIVE_PATTERN, readings.click_key(3),
             5 * walk, (0, before), stamps[walk], clicks[walk],
         )  # fmt: skip
         before = int(clicks[walk, -1])
     assert (stamps.ravel().tolist(), clicks.ravel().tolist()) == wanted
     for p_ap in (0.0, 0.3):
         p = -np.expm1(-light)
-        expected = walk_kernels.expected_light(np.stack([p, p + p_ap * (1 - p)]), light, successors)
+        click = np.stack([p, p + p_ap * (1 - p)])
+        expected = readings.expected_light(np.stack([1 - click, click], axis=1), light, successors)
         assert expected == pytest.approx(naive_walks.expected_light(states, lambda pattern: light[pattern], 0.0, p_ap))
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.exposure_times import Exposures
+from pans.firmware_sim.program import Exposures, Program
 from pans.runtime.wire.commands import SEQUENTIAL
 from pans.runtime.wire.fields import LARGEST_TICK
 

@@ -31,13 +31,12 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun
 from pans.firmware_sim.device.sequential import Measurement
 from pans.firmware_sim.device.view import View
-from pans.firmware_sim.program import Program
+from pans.firmware_sim.program import Exposures, Program
 from pans.firmware_sim.scene import cells as cells_module
 from pans.firmware_sim.scene import shifts
 from pans.firmware_sim.scene.cells import CellFlow
 from pans.firmware_sim.scene.changes import Changes
 from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
-from pans.firmware_sim.scene.exposure_times import Exposures
 from pans.firmware_sim.scene.marks import MARK_PHOTONS
 from pans.firmware_sim.scene.moving import Cells, Change, SceneFile, Tape
 from pans.firmware_sim.scene.optics import expected_photoelectrons, photons_per_level

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from lab_readout import crosstalk, jittered, telegraph
 
-from pans.firmware_sim.ports.on_table import reading_changes, scene_on_table
 from pans.firmware_sim.scene.changes import Changes, Telegraph
 from pans.firmware_sim.scene.detector import sample_clicks
 from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
 from pans.firmware_sim.scene.drawing import moved_parts
 from pans.firmware_sim.scene.moving import Change
+from pans.firmware_sim.scene.scene_file import reading_changes, scene_on_table
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.instrument.profile import Profile, load_profile

@@ -22,9 +22,8 @@ from tree import ROOT
 
 import pans
 from pans.firmware_sim.ports import usb_backend
-from pans.firmware_sim.ports.inprocess import ThreadedInstrument
 from pans.firmware_sim.ports.protocol_panssim import register
-from pans.firmware_sim.ports.serve import SimOptions, build_instrument
+from pans.firmware_sim.ports.serve import SimOptions, ThreadedInstrument, build_instrument
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
