@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from instrument_bench import IDEAL, Bench, of_type, plan
 
 from pans.firmware_sim.device import readings
-from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.scene.moving import Change, SceneFile
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.runtime.bundle.automaton import Automaton
@@ -258,12 +257,6 @@ def test_work_that_is_done_ahead_changes_nothing_and_ends() -> None:
     assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
 
 
-def test_two_runs_of_a_session_walk_differently() -> None:
-    bench, made = bright(six_states())
-    first, second = (run(bench, made, 50)[1] for _ in range(2))
-    assert not np.array_equal(first, second)
-
-
 def test_a_broken_off_walk_is_sent_as_far_as_it_went() -> None:
     bench, made = bright(six_states())
     start = bench.device.tick + 100
@@ -320,62 +313,12 @@ def hosted() -> tuple[Bench, Plan, int]:
     return bench, made, start
 
 
-def test_what_is_named_late_is_refused_and_dark() -> None:
-    bench, made, start = hosted()
-    bench.done(Opcode.SHOW, pack_show(show(six_states(), 0, 1)))
-    begins = start + made.slot_period_ticks
-    bench.run_to(begins - 1)
-    bench.done(Opcode.SHOW, pack_show(show(six_states(), 0, 1)))  # again, just in time
-    bench.run_to(begins + made.slot_period_ticks)
-    status, text = bench.refused(Opcode.SHOW, pack_show(show(six_states(), 1, 2)))
-    assert (status, text) == (AckStatus.TOO_LATE, "exposure 2 has begun: 3 have")
-    bench.run_to(start + 2 * made.cycle_ticks)
-    stamps, _ = joined([message for _, message in bench.got])
-    assert stamps.tolist() == [DARK_PATTERN, 0, *[DARK_PATTERN] * 8]
-
-
 def test_the_latest_name_of_an_exposure_counts() -> None:
     bench, made, start = hosted()
     for state in (0, 1, 4):
         bench.done(Opcode.SHOW, pack_show(show(six_states(), state, 1)))
     bench.run_to(start + made.cycle_ticks)
     assert joined([message for _, message in bench.got])[0].tolist() == [DARK_PATTERN, 4, *[DARK_PATTERN] * 3]
-
-
-@pytest.mark.parametrize(
-    ("shown", "text"),
-    [
-        (Show(0, 0, 0, 1, 1), "exposure 0 is dark"),
-        (Show(10, 0, 0, 1, 1), "exposure 10: the run has 10"),
-        (Show(1, 0, 3, 1, 1), "pattern 3: the plan has 3"),
-        (Show(1, 0, 0, 0, 4), "dwell 0: allowed 1..4"),
-        (Show(1, 0, 0, 5, 4), "dwell 5: allowed 1..4"),
-        (Show(1, 0, 0, 1, 3), "dwell in 3 steps: the device has 4"),
-        (Show(1, 0, 0, 1, 0), "dwell in 0 steps"),
-        (Show(1, 65533, 0, 1, 1), "state 65533: allowed 0..65532"),
-    ],
-)
-def test_an_impossible_name_is_refused(shown: Show, text: str) -> None:
-    bench, _, _ = hosted()
-    status, found = bench.refused(Opcode.SHOW, pack_show(shown))
-    assert status == AckStatus.OUT_OF_RANGE
-    assert found.startswith(text)
-
-
-def test_names_need_a_run_that_the_host_drives_and_are_limited() -> None:
-    bench, made = bright(six_states(), "host")
-    assert bench.refused(Opcode.SHOW, pack_show(show(six_states(), 0, 1)))[0] == AckStatus.WRONG_STATE
-    start = bench.device.tick + 1000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, 1000, 100_000)))
-    adaptive = np.flatnonzero(np.tile(made.slot_pattern, 1000) == ADAPTIVE_PATTERN)
-    for exposure in adaptive[:MAX_SHOWS]:
-        bench.done(Opcode.SHOW, pack_show(show(six_states(), 0, int(exposure))))
-    full = bench.refused(Opcode.SHOW, pack_show(show(six_states(), 0, int(adaptive[MAX_SHOWS]))))
-    assert full == (AckStatus.OUT_OF_RANGE, f"{MAX_SHOWS} exposures are named already")
-    bench.done(Opcode.STOP)
-    driven, made = bright(six_states())
-    driven.done(Opcode.ARM, pack_arm(Arm(driven.device.tick + 100, 1, 100_000)))
-    assert driven.refused(Opcode.SHOW, pack_show(show(six_states(), 0, 1)))[0] == AckStatus.WRONG_STATE
 
 
 # -- uploads -----------------------------------------------------------------------------------------------------------
@@ -392,34 +335,6 @@ def with_plan(slots: int = 2, profile: Profile | None = None) -> Bench:
     bench.done(Opcode.LOAD_MASKS, pack_masks(MaskChunk(0, 0, 6, 6, np.ones((2, 1), np.uint8))))
     bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [ADAPTIVE_PATTERN] * slots)))
     return bench
-
-
-@pytest.mark.parametrize(
-    ("chunk", "text"),
-    [
-        (states((2, 1, 1, 2)), "a state shows pattern 2: the plan has 2"),
-        (states((0, 0, 1, 2)), "dwell 0..0: allowed 1..1"),
-        (states((0, 2, 1, 2)), "dwell 2..2: allowed 1..1"),
-        (states((0, 1, 0, 2)), "state 0 leads to 0: allowed 1..2"),
-        (states((0, 1, 1, 2), (0, 1, 2, 1)), "state 1 leads to 1: allowed 2..3"),
-        (states((0, 1, 1, 3)), "state 0 leads to 3: allowed 1..2"),
-        (states((0, 1, 1, 2), dwell_steps=3), "dwell in 3 steps: the device has 4"),
-        (states((0, 1, 1, 2), dwell_steps=0), "dwell in 0 steps"),
-        (states((0, 1, 1, 2), n_leaves=0), "0 leaves: allowed 1..1048576"),
-        (states((0, 1, 1, 2), n_leaves=1 << 21), "2097152 leaves"),
-        (states((0, 1, 1, 2), n_states=101), "101 states: the device follows 100"),
-        (states((0, 1, 3, 4), n_states=2, first_state=1), "state 1 continues no states"),
-        (states((0, 1, 1, 2), (0, 1, 2, 3), (0, 1, 3, 4)), "walks of 3 exposures: a cycle has 2 adaptive slots"),
-    ],
-)
-def test_impossible_states_are_refused_and_none_are_stored(chunk: StateChunk, text: str) -> None:
-    bench = with_plan()
-    status, found = bench.refused(Opcode.LOAD_STATES, pack_states(chunk))
-    assert status == AckStatus.OUT_OF_RANGE
-    assert found.startswith(text)
-    assert bench.device._states.states is None
-    bench.done(Opcode.LOAD_STATES, pack_states(states((0, 1, 1, 2))))
-    bench.done(Opcode.ARM, pack_arm(Arm(bench.device.tick + 100, 1, 1000)))
 
 
 def test_states_in_pieces_and_a_plan_that_forgets_them() -> None:
@@ -439,43 +354,12 @@ def test_states_in_pieces_and_a_plan_that_forgets_them() -> None:
     bench.done(Opcode.ARM, arm)  # without states: the host drives
 
 
-def test_states_need_a_plan_with_adaptive_slots() -> None:
-    bench = Bench(instrument(), SCENE)
-    bench.hello()
-    body = pack_states(states((0, 1, 1, 2)))
-    assert bench.refused(Opcode.LOAD_STATES, body)[0] == AckStatus.WRONG_STATE
-    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(1, [0])))
-    assert bench.refused(Opcode.LOAD_STATES, body)[0] == AckStatus.WRONG_STATE
-
-
-@pytest.mark.parametrize(
-    ("slots", "text"),
-    [
-        ([ADAPTIVE_PATTERN, 0], "1 slots with a fixed pattern beside adaptive ones"),
-        ([ADAPTIVE_PATTERN, 2], "a slot shows pattern 2"),
-    ],
-)
-def test_adaptive_slots_stand_beside_dark_ones_alone(slots: list[int], text: str) -> None:
-    bench = Bench(instrument(), SCENE)
-    bench.hello()
-    status, found = bench.refused(Opcode.LOAD_PLAN, pack_plan(plan(2, slots)))
-    assert (status, found.startswith(text)) == (AckStatus.OUT_OF_RANGE, True)
-
-
 def test_adaptive_slots_may_not_follow_faster_than_the_projector_changes_its_pattern() -> None:
     slow = replace(instrument(), projector=replace(instrument().projector, pattern_rate_max_hz=1000.0))
     bench = Bench(slow, SCENE)
     bench.hello()
     status, text = bench.refused(Opcode.LOAD_PLAN, pack_plan(plan(1, [ADAPTIVE_PATTERN] * 3)))
     assert (status, text) == (AckStatus.OUT_OF_RANGE, "patterns change after 100 ticks: the projector needs 999")
-
-
-def test_arming_needs_every_pattern_of_the_plan() -> None:
-    bench = with_plan()
-    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(3, [ADAPTIVE_PATTERN] * 2)))
-    bench.done(Opcode.LOAD_STATES, pack_states(states((2, 1, 1, 2))))
-    status, text = bench.refused(Opcode.ARM, pack_arm(Arm(bench.device.tick + 100, 1, 1000)))
-    assert (status, text) == (AckStatus.WRONG_STATE, "1 of 3 patterns are not loaded")
 
 
 def test_masks_are_patterns_of_two_levels() -> None:
@@ -505,35 +389,6 @@ def test_large_masks_go_in_pieces_and_small_ones_together() -> None:
     small = list(mask_chunks(np.zeros((12_000, 784), np.uint16)))
     assert sum(len(chunk.rows) for chunk in small) == 12_000
     assert len(small) == 145  # of 83 masks each
-
-
-@pytest.mark.parametrize(
-    ("chunk", "status"),
-    [
-        (MaskChunk(43_690 - 1, 0, 6, 6, np.ones((2, 1), np.uint8)), AckStatus.OUT_OF_RANGE),
-        (MaskChunk(0, 0, 1 << 22, 8, np.ones((1, 1), np.uint8)), AckStatus.OUT_OF_RANGE),
-        (MaskChunk(0, 8, 16, 8, np.ones((1, 1), np.uint8)), AckStatus.OUT_OF_RANGE),
-        (MaskChunk(0, 0, 16, 8, np.ones((2, 1), np.uint8)), AckStatus.MALFORMED),
-        (MaskChunk(0, 8, 15, 8, np.ones((1, 1), np.uint8)), AckStatus.MALFORMED),
-        (MaskChunk(0, 0, 6, 0, np.ones((1, 0), np.uint8)), AckStatus.MALFORMED),
-        (MaskChunk(0, 0, 6, 6, np.ones((0, 1), np.uint8)), AckStatus.MALFORMED),
-        (MaskChunk(0, 0, 6, 6, np.ones((1, 2), np.uint8)), AckStatus.MALFORMED),
-    ],
-)
-def test_impossible_masks_are_refused_and_none_are_stored(chunk: MaskChunk, status: int) -> None:
-    bench = Bench(instrument(), SCENE)
-    bench.hello()
-    assert bench.refused(Opcode.LOAD_MASKS, pack_masks(chunk))[0] == status
-    assert bench.device._patterns.held_bytes == 0
-
-
-def test_uploads_need_idle() -> None:
-    bench, _, _ = hosted()
-    for opcode, body in (
-        (Opcode.LOAD_MASKS, pack_masks(MaskChunk(0, 0, 6, 6, np.ones((1, 1), np.uint8)))),
-        (Opcode.LOAD_STATES, pack_states(states((0, 1, 1, 2)))),
-    ):
-        assert bench.refused(opcode, body)[0] == AckStatus.WRONG_STATE
 
 
 @settings(max_examples=200, deadline=None)

@@ -19,16 +19,13 @@ from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.core.plan_codec import plan_commands
-from pans.runtime.errors import DeviceError
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.link.fit import check_automaton
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import (
     Arm,
     PatternChunk,
     Show,
     announced_counts,
-    count_announcement,
     mask_chunks,
     pack_arm,
     pack_masks,
@@ -38,7 +35,6 @@ from pans.runtime.wire.commands import (
     pack_show,
 )
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
-from pans.runtime.wire.schema import AUTOMATON_SCHEMA
 
 IMAGES = np.random.default_rng(3).integers(0, 256, (5, 2, 3)).astype(np.uint8)
 SCENE = scene_from_arrays("five", IMAGES, np.arange(5) % 3, ("c0", "c1", "c2"))
@@ -230,30 +226,3 @@ def test_clicks_alone_are_announced_by_who_does_not_count() -> None:
     bench.hello()
     for opcode in (Opcode.READ_COUNTS, Opcode.LOAD_COUNT_STATES):
         assert bench.refused(opcode, pack_read_counts(2))[0] == AckStatus.UNKNOWN_OPCODE
-
-
-def test_a_device_that_cannot_count_is_refused_with_the_reason() -> None:
-    automaton = random_automaton(5, slots=4, width=3, outcomes=4)
-    made = build_plan(instrument(), automaton_bundle(automaton, photons=LIGHT), shots_per_object=1)
-    facts = {"automaton_schema": AUTOMATON_SCHEMA, "automaton_states": 100, "dwell_steps": 8}
-    check_automaton(facts | count_announcement(3), made)
-    for told, words in (
-        ({}, "announces no photon numbers, needed 0xeef01ce1"),
-        ({"count_schema": 1, "photon_number_max": 9}, "photon numbers of schema 0x00000001, needed 0xeef01ce1"),
-        (count_announcement(2), "photon numbers up to 2, needed 3"),
-    ):
-        with pytest.raises(DeviceError, match=words):
-            check_automaton(facts | told, made)
-
-
-def test_what_belongs_together_must_come_together() -> None:
-    automaton = random_automaton(5, slots=4, width=3, patterns=6, outcomes=3)
-    bench, made = set_up(automaton, "device")
-    (*_, states) = [body for opcode, body in plan_commands(made) if opcode == Opcode.LOAD_COUNT_STATES]
-    bench.done(Opcode.READ_COUNTS, pack_read_counts(3))  # forgets the states, and asks for other outcomes
-    assert bench.refused(Opcode.LOAD_COUNT_STATES, states)[0] == AckStatus.WRONG_STATE
-    bench.done(Opcode.READ_COUNTS, pack_read_counts(2))
-    bench.done(Opcode.LOAD_COUNT_STATES, states)
-    for opcode, body in plan_commands(made)[:1]:
-        bench.done(opcode, body)
-    assert bench.refused(Opcode.LOAD_COUNT_STATES, states)[0] == AckStatus.WRONG_STATE

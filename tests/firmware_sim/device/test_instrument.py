@@ -95,26 +95,6 @@ def uncobs(data: bytes) -> bytes:
     return bytes(out[:-1])
 
 
-def test_ping_is_answered_with_the_tick_of_its_arrival() -> None:
-    bench = greeted()
-    bench.run_to(5000)
-    assert bench.send(wire.encode_ping(7, 123456789, NONCE)) == [wire.Pong(7, 123456789, 5000, 5000)]
-
-
-def test_status_comes_once_per_second() -> None:
-    bench = greeted()
-    bench.got.clear()
-    bench.run_to(POWER_ON + 3_500_000)
-    assert [tick for tick, _ in bench.got] == [POWER_ON + 1_000_000 * second for second in (1, 2, 3)]
-
-
-def test_before_a_session_the_device_is_silent() -> None:
-    bench = Bench()
-    assert bench.device.next_event_tick() is None
-    assert bench.device.step(10_000_000, wire.encode_ping(1, 1, NONCE)) == b""
-    assert bench.device.counters.foreign_session == 1
-
-
 def test_an_object_lasts_its_cycles() -> None:
     scene = scene_from_arrays("three", np.zeros((3, 2, 2), np.uint8), np.array([5, 6, 7]), tuple("abcdefgh"))
     bench = Bench(scene=scene).ready(cycles_per_object=2).arm(cycles=9).granted()
@@ -180,19 +160,6 @@ def test_another_seed_gives_other_clicks_and_the_same_seed_the_same() -> None:
 
     assert bits(1) == bits(1)
     assert bits(1) != bits(2)
-
-
-def test_two_runs_of_a_session_draw_different_clicks() -> None:
-    bench = Bench().ready(np.full((2, 4), 20_000, np.uint16))
-    runs = []
-    for start in (2000, 60_000):
-        bench.arm(start=start, cycles=50)
-        bench.grant()
-        blocks = of_type(bench.run_to(start + 20_000), wire.ClickBlock)
-        assert blocks[0].seq == 1
-        assert blocks[0].exposure_index == 0
-        runs.append(np.concatenate([block.bits for block in blocks]).tolist())
-    assert runs[0] != runs[1]
 
 
 def parallel_bench(n_channels: int = 10, **options: Any) -> Bench:
@@ -268,53 +235,8 @@ def test_time_does_not_go_back() -> None:
 # -- commands ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_repeated_command_is_acknowledged_and_not_executed_again() -> None:
-    bench = Bench().ready().arm(start=2000, cycles=0).granted()
-    bench.run_to(2500)
-    arm_id = bench.command_id
-    bench.done(Opcode.STOP)
-    assert bench.command(Opcode.ARM, pack_arm(Arm(5000, 0, 100)), command_id=arm_id).last_id == bench.command_id
-    assert bench.device.state is DeviceState.IDLE
-    assert bench.device.counters.repeated_commands == 1
-
-
-def test_a_command_after_a_lost_one_waits_for_its_turn() -> None:
-    bench = greeted()
-    body = pack_pattern(PatternChunk(0, 0, 1, np.array([1], np.uint16)))
-    assert bench.command(Opcode.LOAD_PATTERN, body, command_id=2).last_id == 0
-    assert bench.command(Opcode.LOAD_PATTERN, body, command_id=1).last_id == 1
-    assert bench.command(Opcode.LOAD_PATTERN, body, command_id=2).last_id == 2
-    assert bench.device.counters.commands_out_of_order == 1
-
-
-def test_the_latest_refusal_stays_in_later_acknowledgements() -> None:
-    bench = greeted()
-    bench.refused(0x77)
-    ack = bench.command(Opcode.STOP)
-    assert (ack.last_id, ack.refused_id, ack.status, ack.refused_mask) == (2, 1, AckStatus.UNKNOWN_OPCODE, 2)
-    bench.refused(0x78)
-    ack = bench.command(Opcode.STOP)
-    assert (ack.last_id, ack.refused_id, ack.refused_mask) == (4, 3, 0b1010)
-    assert [ack.refuses(command_id) for command_id in (1, 2, 3, 4)] == [True, False, True, False]
-
-
 def pattern_body(**changes: Any) -> bytes:
     return pack_pattern(PatternChunk(0, 0, 2, np.array([1, 2], np.uint16))._replace(**changes))
-
-
-PATTERN_FAULTS = [
-    ({"pattern": 65535}, "memory holds 65535"),
-    ({"n_pixels": (1 << 22) + 1}, "allowed 4194304"),
-    ({"first_pixel": 1, "n_pixels": 3}, "expected 0"),
-]
-
-
-@pytest.mark.parametrize(("changes", "text"), PATTERN_FAULTS)
-def test_an_impossible_pattern_is_refused(changes: dict[str, Any], text: str) -> None:
-    bench = greeted()
-    status, said = bench.refused(Opcode.LOAD_PATTERN, pattern_body(**changes))
-    assert status == AckStatus.OUT_OF_RANGE
-    assert text in said
 
 
 def test_levels_above_the_projector_are_refused() -> None:
@@ -331,32 +253,6 @@ def test_pattern_memory_is_limited_in_bytes() -> None:
         ack = bench.command(Opcode.LOAD_PATTERN, pattern_body(pattern=index, n_pixels=1 << 22))
         statuses.append(ack.refused_id == ack.last_id)
     assert statuses == [False] * 32 + [True]
-
-
-PLAN_FAULTS = [
-    ({"mode": 1}, "this instrument is sequential"),
-    ({"n_patterns": 0}, "0 patterns"),
-    ({"n_patterns": 1}, "shows pattern 1"),
-    ({"exposure_ticks": 8}, "10..1000000 ticks"),
-    ({"exposure_ticks": 102}, "exposures 100 ticks apart"),
-    ({"cycle_ticks": 250}, "exposures 50 ticks apart"),
-    ({"cycle_ticks": 200}, "exposure at 200"),
-    ({"cycle_ticks": 1 << 60}, "cycle of"),
-    ({"block_exposures": 0}, "0 exposures per block"),
-    ({"block_exposures": 40_000}, "40000 exposures per block"),
-    ({"cycles_per_object": 0}, "0 cycles per object"),
-    ({"n_slots": (1 << 20) + 1}, "slots: allowed"),
-    ({"first_slot": 1, "n_slots": 4}, "does not continue"),
-    ({"slots": slots_at([0, 1, 0])[::-1]}, "apart"),
-]
-
-
-@pytest.mark.parametrize(("changes", "text"), PLAN_FAULTS)
-def test_an_impossible_plan_is_refused(changes: dict[str, Any], text: str) -> None:
-    bench = Bench().ready()
-    status, said = bench.refused(Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 1, DARK_PATTERN])._replace(**changes)))
-    assert status == AckStatus.OUT_OF_RANGE
-    assert text in said
 
 
 def test_patterns_may_not_change_faster_than_the_projector() -> None:
@@ -379,46 +275,11 @@ def test_a_plan_in_two_chunks() -> None:
     assert len(of_type(bench.run_to(3000), wire.ClickBlock)[0].bits) == 4
 
 
-ARM_FAULTS = [
-    (Arm(POWER_ON, 1, 100), AckStatus.TOO_LATE, "has passed"),
-    (Arm(1 << 63, 1, 100), AckStatus.OUT_OF_RANGE, "ahead"),
-    (Arm(2000, 1, 0), AckStatus.OUT_OF_RANGE, "lease of 0 ms"),
-    (Arm(2000, (1 << 64) - 1, 100), AckStatus.OUT_OF_RANGE, "beyond tick"),
-]
-
-
-@pytest.mark.parametrize(("arm", "status", "text"), ARM_FAULTS)
-def test_an_impossible_arm_is_refused(arm: Arm, status: int, text: str) -> None:
-    found, said = Bench().ready().refused(Opcode.ARM, pack_arm(arm))
-    assert found == status
-    assert text in said
-
-
-def test_arming_needs_a_plan_and_all_its_patterns() -> None:
-    bench = greeted()
-    arm = pack_arm(Arm(2000, 1, 100))
-    assert bench.refused(Opcode.ARM, arm) == (AckStatus.WRONG_STATE, "no complete plan is loaded")
-    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 1])))
-    bench.done(Opcode.LOAD_PATTERN, pattern_body())
-    assert bench.refused(Opcode.ARM, arm) == (AckStatus.WRONG_STATE, "1 of 2 patterns are not loaded")
-    bench.done(Opcode.LOAD_PATTERN, pattern_body(pattern=1, n_pixels=3))
-    assert bench.refused(Opcode.ARM, arm)[0] == AckStatus.WRONG_STATE  # two of its three pixels
-    last = PatternChunk(1, 2, 3, np.array([4], np.uint16))
-    bench.done(Opcode.LOAD_PATTERN, pack_pattern(last))
-    assert bench.refused(Opcode.ARM, arm)[1] == "patterns have different sizes: 2 and 3 pixels"
-
-
 def test_a_scene_of_another_shape_is_refused_with_the_numbers() -> None:
     scene = scene_from_arrays("small", np.zeros((1, 5, 5), np.uint8), None, ())
     status, said = Bench(scene=scene).ready().refused(Opcode.ARM, pack_arm(Arm(2000, 1, 100)))
     assert status == AckStatus.OUT_OF_RANGE
     assert "4 pixels, scene 'small' has 25" in said
-
-
-def test_uploads_need_idle() -> None:
-    bench = Bench().ready().arm()
-    for opcode, body in [(Opcode.LOAD_PATTERN, pattern_body()), (Opcode.ARM, pack_arm(Arm(9000, 1, 9)))]:
-        assert bench.refused(opcode, body)[0] == AckStatus.WRONG_STATE
 
 
 @given(st.binary(max_size=200), st.sampled_from([*Opcode, 0, 200]))
@@ -459,42 +320,6 @@ def test_an_expired_lease_latches_the_device_dark() -> None:
     assert bench.device.state is DeviceState.SAFE  # it outlives the session
     bench.done(Opcode.RESET)
     assert bench.device.state is DeviceState.IDLE
-
-
-def test_a_renewed_lease_keeps_the_run_going() -> None:
-    bench = Bench().ready().arm(start=2000, cycles=0, lease_ms=10)
-    for tick in range(10_000, 100_000, 9_000):
-        bench.run_to(tick)
-        bench.grant(lease_ms=10)
-        assert bench.device.state is DeviceState.RUNNING
-    bench.run_to(109_000)
-    assert bench.device.state is DeviceState.SAFE
-
-
-def test_the_lease_runs_while_armed() -> None:
-    bench = Bench().ready().arm(start=500_000, lease_ms=10)
-    bench.run_to(11_000)
-    assert bench.device.state is DeviceState.SAFE
-
-
-def test_hello_ends_a_run_and_forgets_uploads() -> None:
-    bench = Bench().ready().arm(cycles=0)
-    bench.run_to(2100)
-    bench.send(wire.encode_hello(NONCE))  # a repetition changes nothing
-    assert bench.device.state is DeviceState.RUNNING
-    bench.hello()
-    assert (bench.device.state, bench.device.reason) == (DeviceState.IDLE, StateReason.STOPPED)
-    assert bench.refused(Opcode.ARM, pack_arm(Arm(5000, 1, 100)))[1] == "no complete plan is loaded"
-
-
-def test_stop_sends_what_was_exposed() -> None:
-    bench = Bench().ready().arm(start=2000, cycles=0).granted()
-    bench.run_to(2190)  # two exposures have ended, the third has not begun
-    answers = bench.send(wire.encode_command(bench.command_id + 1, Opcode.STOP, b"", NONCE))
-    block, status, ack = answers
-    assert block.patterns.tolist() == [0, 1]
-    assert (status.state, status.reason, status.next_exposure) == (DeviceState.IDLE, StateReason.STOPPED, 2)
-    assert ack.last_id == bench.command_id + 1
 
 
 def test_an_exposure_broken_off_is_no_exposure() -> None:
@@ -561,14 +386,6 @@ def test_pending_gates_are_limited() -> None:
 # -- receive window ----------------------------------------------------------------------------------------------------
 
 
-def test_nothing_is_streamed_without_a_grant() -> None:
-    bench = Bench().ready().arm(cycles=3)
-    assert of_type(bench.run_to(5000), wire.ClickBlock) == []
-    released = bench.grant(limit=3)
-    assert [message.seq for message in released] == [0, 1, 2]
-    assert [message.seq for message in bench.grant(limit=100)] == [3, 4, 5]
-
-
 def test_a_grant_just_before_arm_counts() -> None:
     bench = Bench().ready()
     bench.grant(limit=2)
@@ -591,22 +408,6 @@ def test_a_full_buffer_drops_whole_blocks_and_says_so() -> None:
     assert of_type([message for _, message in bench.got], wire.Status)[-1].drops == 9
 
 
-def test_every_exposure_is_delivered_or_counted() -> None:
-    bench = Bench(buffer_messages=3).ready().arm(cycles=40)
-    rng = np.random.default_rng(0)
-    limit, delivered = 0, 0
-    messages = []
-    while bench.device.state is not DeviceState.IDLE:
-        messages += bench.run_to(bench.device.tick + int(rng.integers(100, 2000)))
-        limit += int(rng.integers(0, 4))
-        messages += bench.grant(limit, lease_ms=100)
-    messages += bench.grant(1 << 20)
-    delivered = sum(len(block.bits) for block in of_type(messages, wire.ClickBlock))
-    drops = of_type(messages, wire.Status)[-1].drops
-    assert drops > 0
-    assert delivered + drops == 40 * 3
-
-
 def test_the_window_compares_modulo_2_to_the_32() -> None:
     bench = Bench().ready().arm(cycles=0)
     bench.device.stream.sequence = 0xFFFFFFFE
@@ -616,27 +417,3 @@ def test_the_window_compares_modulo_2_to_the_32() -> None:
 
 
 # -- sessions ----------------------------------------------------------------------------------------------------------
-
-
-def test_frames_of_another_session_are_counted_and_ignored() -> None:
-    bench = Bench().ready()
-    bench.device.step(1500, wire.encode_command(bench.command_id + 1, Opcode.STOP, b"", NONCE + 1))
-    assert bench.device.counters.foreign_session == 1
-    assert bench.command(Opcode.STOP).last_id == bench.command_id
-
-
-def test_another_schema_is_answered_and_goes_no_further() -> None:
-    bench = Bench()
-    body = struct.pack("<IHH", 0xDEADBEEF, 2, 0)
-    sent = bench.device.step(1500, wire.encode_frame(MessageType.HELLO, body, NONCE))
-    frames = bench.decoder.feed(sent)
-    assert [frame.type for frame in frames] == [MessageType.WELCOME]
-    assert wire.decode_welcome(frames[0].payload).schema == wire.SCHEMA
-    assert bench.device.step(1600, wire.encode_ping(1, 1, NONCE)) == b""
-
-
-def test_a_session_without_a_nonce_is_malformed() -> None:
-    bench = Bench()
-    body = struct.pack("<IHH", wire.SCHEMA, 1, 0)
-    assert bench.device.step(1500, wire.encode_frame(MessageType.HELLO, body, 0)) == b""
-    assert bench.device.counters.malformed == 1

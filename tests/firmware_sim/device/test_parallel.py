@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from moving_scenes import CELLS, FLOW, PICTURES, TAPE, TICK_HZ, light_and_clicks, program, started, view_of
 
-from pans.firmware_sim.commands import bench_flow
 from pans.firmware_sim.device import frame_writer
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
@@ -23,12 +22,25 @@ from pans.firmware_sim.ports.faults import parse_faults
 from pans.firmware_sim.ports.faulty import FaultyDevice
 from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.marks import MARK_PHOTONS, Stamp
-from pans.firmware_sim.scene.moving import Change
+from pans.firmware_sim.scene.moving import Cells, Change
+from pans.firmware_sim.scene.scene_file import open_scene
+from pans.runtime.instrument.profile import load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
-from pans.runtime.wire.messages import DeviceState, Opcode
+from pans.runtime.wire.commands import (
+    PARALLEL,
+    Arm,
+    Gate,
+    PatternChunk,
+    PlanChunk,
+    pack_arm,
+    pack_gate,
+    pack_pattern,
+    pack_plan,
+)
+from pans.runtime.wire.messages import SLOT_DTYPE, DeviceState, Opcode
 
 RNG = np.random.default_rng(5)
+SESSION = 7
 PROFILE = replace(FLOW, detector=replace(FLOW.detector, crosstalk_probability=0.1, afterpulse_probability=0.1))
 CHANGES = (Change("dark", 0.0, 1.0, -1, 90.0), Change("drift", 0.0, 1.0, -1, -50.0))
 
@@ -163,7 +175,7 @@ def story(device: Any, seed: int, ahead: Callable[[], int]) -> tuple[bytes, list
     def command(opcode: Opcode, body: bytes) -> None:
         nonlocal number
         number += 1
-        step(wire.encode_command(number, opcode, body, bench_flow.SESSION))
+        step(wire.encode_command(number, opcode, body, SESSION))
 
     for run in range(2):
         command(Opcode.STOP, b"")
@@ -173,26 +185,37 @@ def story(device: Any, seed: int, ahead: Callable[[], int]) -> tuple[bytes, list
             tick += dice.choice([1, 50, 777, 5000, 30_000, 200_000])
             what = dice.random()
             if what < 0.2:
-                step(wire.encode_ping(tick & 0xFFFF, 5, bench_flow.SESSION))
+                step(wire.encode_ping(tick & 0xFFFF, 5, SESSION))
             elif what < 0.6:
                 limit = limit + dice.randrange(60) if closed else 1 << 30
-                step(wire.encode_grant(wire.Grant(limit, 5), bench_flow.SESSION))
+                step(wire.encode_grant(wire.Grant(limit, 5), SESSION))
             elif what < 0.7:
                 command(Opcode.GATE, pack_gate(Gate(tick + dice.choice([-5, 0, 1, 9999]), 10, 1)))
             else:
                 step(b"")
         tick += dice.choice([1, 2_000_000])  # beyond the lease, or not
-    step(wire.encode_grant(wire.Grant(1 << 30, 0), bench_flow.SESSION))
+    step(wire.encode_grant(wire.Grant(1 << 30, 0), SESSION))
     return b"".join(out), [tick, limit]
 
 
 def instrument(name: str, capacity: int, one_by_one: bool, changes: tuple[Change, ...] = ()) -> Instrument:
-    """The bench's instrument, its run stopped; command 100 was the last one."""
-    device = bench_flow._armed(name, 10, 5.0, 40)
+    """An instrument with ten patterns and a plan of blocks of 40 frames; command 100 was the last one."""
+    profile, scene, rng = load_profile("flow-snspd"), open_scene(name), np.random.default_rng(1)
+    device = Instrument(profile, scene, seed=1)
+    device.step(0, wire.encode_hello(SESSION))
+    n_pixels = scene.what.objects.n_pixels if isinstance(scene.what, Cells) else 80
+    rows = rng.integers(1, 30, (10, n_pixels)) * (rng.random((10, n_pixels)) < max(0.02, 5 / n_pixels))
+    chunks = [PatternChunk(index, 0, n_pixels, row.astype(np.uint16)) for index, row in enumerate(rows)]
+    ticks, slots = round(5e-6 * profile.clock.tick_hz), np.zeros(40, SLOT_DTYPE)
+    slots["offset_ticks"] = np.arange(40) * ticks
+    plan = PlanChunk(PARALLEL, 10, 40, 0, ticks, ticks, ticks * 40, 40, 1, slots)
+    bodies = [(Opcode.LOAD_PATTERN, pack_pattern(chunk)) for chunk in chunks] + [(Opcode.LOAD_PLAN, pack_plan(plan))]
+    for number, (opcode, body) in enumerate(bodies, start=1):
+        device.step(0, wire.encode_command(number, opcode, body, SESSION))
     device.view = replace(device.view, scene=replace(device.view.scene, changes=changes))
     device.stream = (OneByOne if one_by_one else StreamBuffer)(capacity)
     for number in range(device._ack.last_id + 1, 101):
-        device.step(0, wire.encode_command(number, Opcode.STOP, b"", bench_flow.SESSION))
+        device.step(0, wire.encode_command(number, Opcode.STOP, b"", SESSION))
     assert device.state is DeviceState.IDLE
     return device
 

@@ -25,7 +25,6 @@ from moving_scenes import (
 )
 from naive_moving import mean_light, shifted, tape_field
 
-from pans.firmware_sim.commands import bench_flow
 from pans.firmware_sim.device import parallel
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun
@@ -413,18 +412,6 @@ def test_bars_that_do_not_fit_the_patterns_are_refused() -> None:
 
 
 # -- the whole device --------------------------------------------------------------------------------------------------------
-
-
-def test_the_same_run_is_the_same_bytes_however_it_is_stepped() -> None:
-    def run(name: str, ticks: list[int]) -> bytes:
-        device = bench_flow._armed(name, 10, 5.0, 40)
-        return b"".join(device.step(tick, b"") for tick in ticks)
-
-    end = 2_000_000  # 20 ms
-    for name in ("clothes-in-flow", "bar-tape"):
-        coarse = run(name, [end])
-        assert len(coarse) > 10_000
-        assert coarse == run(name, [end]) == run(name, [*range(77_777, end, 77_777), end])
 
 
 def test_clicks_follow_the_light_that_the_scene_passes() -> None:
