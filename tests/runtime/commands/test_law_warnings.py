@@ -51,10 +51,8 @@ def test_a_run_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_an_evaluation_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("torch", reason="needs the train extra")
     profile = microled(tmp_path, blinded=blinded)
-    assert main(["evaluate", str(ADAPTIVE), "--profile", profile, "--objects", "5", "--task", "fashion-mnist"]) in (
-        0,
-        1,
-    )
+    words = ["evaluate", str(ADAPTIVE), "--profile", profile, "--objects", "5", "--task", "fashion-mnist"]
+    assert main(words) in (0, 1)
     assert (REACHES in capsys.readouterr().err) is blinded
 
 
@@ -62,16 +60,13 @@ def test_an_evaluation_warns(blinded: bool, tmp_path: Path, capsys: pytest.Captu
 def test_a_training_warns(encoder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("torch", reason="needs the train extra")
     size = ("--exposures", "3", "--states", "4") if encoder == "automaton" else ("--features", "3")
-    words = (
+    words = [
         "train",
         "barcode",
         "--profile",
         microled(tmp_path, blinded=True),
-        "--photons",
-        "4",
-        "--epochs",
-        "1",
+        *["--photons", "4", "--epochs", "1"],
         *size,
-    )
+    ]
     assert main([*words, "--encoder", encoder, "-o", str(tmp_path / "out.pans")]) == 0
     assert REACHES in capsys.readouterr().err

@@ -122,14 +122,7 @@ def test_what_a_file_cannot_mean(line: str, wrong: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=wrong) as caught:
         parsed(*NEEDED, "--config", str(path))
     assert caught.value.message.startswith(str(path))
-
-
-def test_the_nearest_name_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "lab.toml"
-    path.write_text("no_realtime = true\n")
-    with pytest.raises(ConfigError) as caught:
-        parsed(*NEEDED, "--config", str(path))
-    assert caught.value.remedy == "did you mean no-realtime?"
+    assert line != "no_realtime = true" or caught.value.remedy == "did you mean no-realtime?"
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
