@@ -6,7 +6,6 @@ import argparse
 import hashlib
 import io
 import math
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,11 +77,8 @@ def _info(args: argparse.Namespace) -> int:
 
     facts = file_facts(args.path)
     rows = list(_flat(facts))
-    if not args.json and sys.stdout.isatty():
-        _print_table(rows)
-    else:
-        width = max(len(key) for key, _ in rows)
-        emit(args, facts, "\n".join(f"{key:<{width}}  {value}" for key, value in rows))
+    width = max(len(key) for key, _ in rows)
+    emit(args, facts, "\n".join(f"{key:<{width}}  {value}" for key, value in rows))
     return EXIT_USAGE if facts.get("damage") else EXIT_FINE
 
 
@@ -98,19 +94,6 @@ def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str
             yield name, "SIMULATED"
         elif value is not None and value != "":
             yield name, one_line(value, VALUE_CHARACTERS)
-
-
-def _print_table(rows: list[tuple[str, str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for key, value in rows:
-        table.add_row(Text(key), Text(value))  # Text: brackets in a value are not markup
-    Console().print(table)
 
 
 # ---- bundle ----

@@ -7,11 +7,8 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 from pans.runtime import SHIPPED
@@ -22,8 +19,8 @@ from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import checked_scheme
 from pans.runtime.live.run_options import DARK, DAYS, FLOW, RunOptions
 from pans.runtime.operate.option_file import add_option_file, prepare_options, write_options
+from pans.runtime.outputs import RUNS
 from pans.runtime.ranges import Range
-from pans.runtime.run_folder import RUNS
 
 DEMO_BUNDLE = "fashion-adaptive.pans"
 DEMO_SCENE = "fashion200"
@@ -47,19 +44,6 @@ def _configure_demo(parser: argparse.ArgumentParser) -> None:
     add_options(parser, RunOptions, defaults=DEMO_DEFAULTS, omit=NOT_OF_DEMO)
 
 
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Leave out the search for garbage while all that a run needs is loaded, a sixth of that time; the run's end switches it on again."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
-@_uncollected()
 def _run(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path
 
@@ -78,7 +62,6 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_FINE
 
 
-@_uncollected()
 def _demo(args: argparse.Namespace) -> int:
     from .one_run import run_and_report
 

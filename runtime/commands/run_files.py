@@ -23,10 +23,9 @@ from pans.runtime.container import MIB
 from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.live.run_options import RunOptions
-from pans.runtime.outputs import check_outputs, make_folder, refuse_existing
+from pans.runtime.outputs import check_outputs, locked, make_folder, new_run_folder, refuse_existing
 from pans.runtime.record.part_names import files_of_parts
 from pans.runtime.record.recorder import PartLimits
-from pans.runtime.run_folder import locked, new_run_folder
 
 if TYPE_CHECKING:
     from pans.runtime.core.plan import Plan

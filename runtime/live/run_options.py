@@ -13,8 +13,8 @@ from pans.runtime.cli.option_fields import option
 from pans.runtime.container import MIB
 from pans.runtime.decide.backends import backend_names
 from pans.runtime.instrument.calibration import MAX_AGE_H
+from pans.runtime.outputs import RUNS
 from pans.runtime.ranges import Range
-from pans.runtime.run_folder import RUNS
 
 AUTOMATA = "automata (docs/how-to/automata.md)"
 LIVE_PAGE = "live page (docs/how-to/live-view.md)"

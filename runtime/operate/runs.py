@@ -21,9 +21,9 @@ from typing import Any
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, warn
 from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block
 from pans.runtime.errors import PansError, UsageError
+from pans.runtime.outputs import LATEST, RUNS, locked
 from pans.runtime.ranges import Range
 from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
-from pans.runtime.run_folder import LATEST, RUNS, locked
 from pans.runtime.safe_text import one_line
 
 OURS = re.compile(r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock")

@@ -30,9 +30,8 @@ from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
 from pans.runtime.container import read_file
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import check_outputs, make_folder, write_file
+from pans.runtime.outputs import RUNS, check_outputs, make_folder, write_file
 from pans.runtime.ranges import Range
-from pans.runtime.run_folder import RUNS
 from pans.runtime.timing.ledger import FIFO_PRIORITY
 
 MARK = "# Written by `pans service install`; change the file of options, not this one."

@@ -9,8 +9,7 @@ import pytest
 
 from pans.runtime import outputs
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import check_outputs, file_identity, place_new, whole_file, write_file
-from pans.runtime.run_folder import locked, new_run_folder
+from pans.runtime.outputs import check_outputs, file_identity, locked, new_run_folder, place_new, whole_file, write_file
 
 
 @pytest.fixture

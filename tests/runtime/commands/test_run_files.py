@@ -11,8 +11,8 @@ from commands import json_of
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import EXIT_DEVICE, main
+from pans.runtime.outputs import locked
 from pans.runtime.record import read_recording
-from pans.runtime.run_folder import locked
 
 DEVICE = "sim:oled-qcmos?pace=fast&scene=fashion200"
 RUN = ["run", "self.pans", "--device", DEVICE, "--decisions", "5"]

@@ -12,7 +12,7 @@ from commands import fixed_run, json_of
 
 from pans.runtime.cli import main
 from pans.runtime.operate.runs import Run, duration_s, prunable, run_of, size_bytes
-from pans.runtime.run_folder import locked
+from pans.runtime.outputs import locked
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
 
