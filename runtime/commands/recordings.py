@@ -1,0 +1,295 @@
+"""The commands on recordings: `pans replay`, `pans export`, `pans report`, `pans compare`; export and report accept bundles too.
+
+A cut recording is exported as far as it goes, and the answer says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pans.runtime.bundle.model import Bundle, load_bundle
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit
+from pans.runtime.errors import UsageError
+from pans.runtime.operate.parquet import need_pyarrow, write_decisions
+from pans.runtime.operate.pattern_files import about, array_parts, head_with_facts, pattern_pngs
+from pans.runtime.outputs import check_outputs, make_folder, write_file
+from pans.runtime.record import Recording, read_recording, replay
+from pans.runtime.record.exposures import click_list
+from pans.runtime.record.part_names import is_of_parts, parts_in
+from pans.runtime.record.parts import open_recording
+from pans.runtime.record.pictures import PictureLog
+from pans.runtime.record.replaying import Replayed
+from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.report.csv_files import FILES, write_csv
+from pans.runtime.report.verify import file_kind
+from pans.runtime.report.words import passage_words
+
+OF_RECORDINGS = ("csv", "photon-hdf5", "parquet")
+OF_BUNDLES = ("onnx", "npy", "png")
+FORMATS = (*OF_RECORDINGS, *OF_BUNDLES)
+EITHER = "a recording (file, folder or index of its parts), or a bundle"
+
+
+# ---- replay ----
+
+
+def _configure_replay(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recording", type=Path, help="a recording (.pansrec), a folder with one in parts, or the index of its parts"
+    )
+    parser.add_argument("--bundle", type=Path, help="decide with this bundle instead of the recorded one")
+    parser.add_argument("--pictures", type=Path, metavar="OUT.npz", help="write the pictures that the head returns")
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="SCENE.npz",
+        help="compare these pictures with the scene's images (SSIM, squared error)",
+    )
+    add_force(parser)
+
+
+def _replay(args: argparse.Namespace) -> int:
+
+    if args.pictures is not None:
+        check_outputs([args.pictures], inputs=[args.recording, args.bundle, args.truth], force=args.force)
+    of_parts, pictures = is_of_parts(args.recording), PictureLog() if args.pictures or args.truth else None
+    if of_parts and pictures is not None:
+        raise UsageError("--pictures and --truth take one recording", remedy="name one of its parts")
+    rows: list[dict[str, Any]] = []
+    lines: list[str] = []
+    for path in parts_in(args.recording) if of_parts else [args.recording]:
+        recording, found = _replayed(args, path, pictures)
+        rows.append({"decisions": found.decisions, "sha256": found.sha256, **_facts(recording, found)})
+        of_one = f"{found.decisions} decisions, SHA-256 {found.sha256}"
+        head = f"{path.name}: {found.decisions} decisions" if of_parts else of_one
+        lines += [
+            f"{head}: {_agreement_words(recording, found)}",
+            *([] if found.passages is None else passage_words(found.passages)),
+        ]
+        if of_parts:
+            rows[-1]["part"] = path.name
+        else:
+            rows[-1]["recorded_sha256"] = recording.decisions_sha256
+    identical, payload = all(row["identical"] for row in rows), rows[0] if rows else {}
+    if of_parts:
+        payload = {"decisions": sum(row["decisions"] for row in rows), "identical": identical, "parts": rows}
+    if pictures is not None and args.pictures:
+        pictures.write(args.pictures, force=args.force)
+    if pictures is not None and args.truth:
+        payload |= pictures.compare(args.truth)
+    emit(args, payload, "\n".join(lines))
+    return EXIT_FINE if identical else EXIT_ALERT
+
+
+def _replayed(args: argparse.Namespace, path: Path, pictures: PictureLog | None = None) -> tuple[Recording, Replayed]:
+
+    recording = read_recording(path)
+    bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
+    return recording, replay(recording, bundle, pictures)
+
+
+def _facts(recording: Recording, found: Replayed) -> dict[str, Any]:
+    return {
+        "identical": found.as_recorded,
+        "complete": recording.complete,
+        "decisions_recorded": found.recorded,
+        "decisions_more": found.more,
+        "contradictions": found.contradictions,
+        **({} if found.passages is None else found.passages.as_json()),
+    }
+
+
+def _agreement_words(recording: Recording, found: Replayed) -> str:
+    if not found.as_recorded:
+        return f"DIFFERENT from the recorded log ({found.recorded} decisions)"
+    if recording.complete:
+        return "identical"
+    more = f", {found.more} more can be decided" if found.more else ""
+    return f"identical as far as recorded: {found.recorded} of {found.recorded}{more}"
+
+
+REPLAY = Command(
+    "recompute a recording's decisions and compare",
+    _configure_replay,
+    _replay,
+    examples=(
+        "pans replay pans-runs/latest/run.pansrec",
+        "pans replay run.pansrec --bundle other.pans",
+    ),
+)
+
+
+# ---- export ----
+
+
+def _configure_export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, metavar="FILE", help=EITHER)
+    parser.add_argument(
+        "--format",
+        required=True,
+        choices=FORMATS,
+        help="of a recording: csv (a folder), photon-hdf5, parquet (decisions); of a bundle: onnx, npy or png (a folder)",
+    )
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT", help="the folder, or the file")
+    add_force(parser)
+
+
+def _export(args: argparse.Namespace) -> int:
+    if args.format in OF_BUNDLES:
+        return _export_bundle(args)
+    is_folder = args.format == "csv"
+    outputs = [args.out / name for name in FILES] if is_folder else [args.out]
+    check_outputs(outputs, inputs=[args.recording], force=args.force, makes_folders=is_folder)
+    if args.format == "parquet":
+        need_pyarrow()
+    recording = open_recording(args.recording)
+    plan = recorded_plan(recording)
+    clicks = click_list(recording, plan)
+    written = [args.out]
+    if is_folder:
+        written = write_csv(args.out, recording, plan, clicks, force=args.force)
+    elif args.format == "parquet":
+        write_decisions(args.out, recording, force=args.force)
+    else:
+        from pans.runtime.report.photon_hdf5 import write_photon_hdf5
+
+        write_photon_hdf5(args.out, recording, plan, clicks, force=args.force)
+    payload = {
+        "format": args.format,
+        "files": [str(path) for path in written],
+        "decisions": recording.n_decisions,
+        "clicks": len(clicks.start_tick),
+        "exposures": clicks.exposures,
+        "complete": recording.complete,
+        "simulated": recording.simulated,
+    }
+    banner = "SIMULATED: " if payload["simulated"] else ""
+    names = ", ".join(payload["files"])
+    emit(args, payload, f"{banner}{payload['decisions']} decisions, {payload['clicks']} clicks in {names}")
+    return EXIT_FINE
+
+
+def _export_bundle(args: argparse.Namespace) -> int:
+    is_folder, inputs = args.format != "onnx", [args.recording]
+    if file_kind(args.recording) != "bundle":
+        remedy = f"a recording goes to {', '.join(OF_RECORDINGS)}"
+        raise UsageError(f"{args.recording}: --format {args.format} is for bundles", remedy=remedy)
+    first = args.out / "about.json" if is_folder else args.out
+    check_outputs([first], inputs=inputs, force=args.force, makes_folders=is_folder)
+    bundle, digest = load_bundle(args.recording)
+    files = dict(_bundle_files(bundle, args.format, args.out))
+    check_outputs(files, inputs=inputs, force=args.force, makes_folders=True)
+    if is_folder:
+        make_folder(args.out)
+    for path, data in files.items():
+        write_file(path, data, force=args.force)
+    payload = {"format": args.format, "files": [str(path) for path in files], "sha256": digest, **about(bundle)}
+    emit(
+        args, payload, f"{bundle.name}: {len(files)} files in {args.out}" if is_folder else f"{bundle.name}: {args.out}"
+    )
+    return EXIT_FINE
+
+
+def _bundle_files(bundle: Bundle, form: str, out: Path) -> Iterator[tuple[Path, bytes]]:
+    """Yield paths and contents; of a folder about.json comes last."""
+    if form == "onnx":
+        yield out, head_with_facts(bundle)
+        return
+    if form == "png":
+        yield from ((out / name, data) for name, data in pattern_pngs(bundle))
+    else:
+        for name, array in array_parts(bundle):
+            stream = io.BytesIO()
+            np.save(stream, array, allow_pickle=False)
+            yield out / name, stream.getvalue()
+        if bundle.head_onnx is not None:
+            yield out / "head.onnx", head_with_facts(bundle)
+    yield out / "about.json", (json.dumps(about(bundle), indent=1, sort_keys=True) + "\n").encode()
+
+
+EXPORT = Command(
+    "write a recording or a bundle in a format of other tools",
+    _configure_export,
+    _export,
+    (
+        "pans export run.pansrec --format csv -o tables",
+        "pans export run.pansrec --format parquet -o decisions.parquet",
+        "pans export fashion10.pans --format onnx -o head.onnx",
+    ),
+)
+
+
+# ---- report and compare ----
+
+
+def _configure_report(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", type=Path, metavar="FILE", help=EITHER)
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.html", help="the page to write")
+    add_force(parser)
+
+
+def _report(args: argparse.Namespace) -> int:
+    check_outputs([args.out], inputs=[args.path], force=args.force)
+    from pans.runtime.pages import page_of
+
+    page = page_of(args.path)
+    kind = file_kind(args.path)
+    write_file(args.out, page, force=args.force)
+    emit(args, {"report": str(args.out), "kind": kind, "bytes": len(page)}, str(args.out))
+    return EXIT_FINE
+
+
+REPORT = Command(
+    "one self-contained page of a recording or a bundle",
+    _configure_report,
+    _report,
+    examples=(
+        "pans report pans-runs/latest/run.pansrec -o run.html",
+        "pans report my.pans -o bundle.html",
+    ),
+)
+
+
+def _configure_compare(parser: argparse.ArgumentParser) -> None:
+    side = "a run's folder, a recording (.pansrec), or a summary as `pans run --json` prints it (.json)"
+    for name, metavar in (("first", "A"), ("second", "B")):
+        parser.add_argument(name, type=Path, metavar=metavar, help=side)
+    parser.add_argument(
+        "--objects",
+        default="auto",
+        choices=("auto", "same", "different"),
+        help="whether objects of the same number are the same (default auto: of the same simulated scene)",
+    )
+    parser.add_argument("-o", "--out", type=Path, metavar="OUT.html", help="also write a page")
+    add_force(parser)
+
+
+def _compare(args: argparse.Namespace) -> int:
+    if args.out is not None:
+        check_outputs([args.out], inputs=[args.first, args.second], force=args.force)
+    from pans.runtime.compare import compare, read_side
+    from pans.runtime.compare.words import comparison_words
+
+    found = compare(read_side(args.first), read_side(args.second), args.objects)
+    if args.out is not None:
+        from pans.runtime.compare.page import comparison_page
+
+        write_file(args.out, comparison_page(found), force=args.force)
+    report = {"report": None if args.out is None else str(args.out)}
+    emit(args, found.as_json() | report, comparison_words(found))
+    return EXIT_FINE
+
+
+COMPARE = Command(
+    "compare two runs: what changed, and is it significant",
+    _configure_compare,
+    _compare,
+    examples=("pans compare pans-runs/2026-11-22T1412-fashion10 pans-runs/latest -o compared.html",),
+)
