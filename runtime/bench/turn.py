@@ -31,8 +31,7 @@ from pans.runtime.flow.settings import FlowSettings
 from pans.runtime.link.base import Link, descriptor_of, open_link
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.turn import rings as ring
-from pans.runtime.turn.engine import Limits, Turn
-from pans.runtime.turn.streaming import StreamCore
+from pans.runtime.turn.engine import Limits, StreamCore, Turn
 from pans.runtime.turn.system import now_ns, offered, read_now, wait_for, write_now
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.frame import unpack_body

@@ -47,9 +47,10 @@ if TYPE_CHECKING:
     from pans.runtime.bundle.automaton import DoseCap
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.decision import Output
+    from pans.runtime.core.follower import Follower
     from pans.runtime.core.plan import Plan
     from pans.runtime.link.base import Link
-    from pans.runtime.live import LiveCore, LiveRun, RunResult
+    from pans.runtime.live import LiveRun, RunResult
     from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.monitor import Monitor
@@ -103,7 +104,7 @@ class _Prepared:
     bundle: Bundle  # with the patterns that are displayed
     dark: DarkRun
     plan: Plan
-    core: LiveCore
+    core: Follower
     flow_run: FlowRun | None
     frames: int  # of a decision: shots, times the windows of a flow that are added
     options: RunOptions  # as `run_live` takes them
@@ -273,7 +274,7 @@ def _prepare(options: RunOptions, profile: Profile) -> _Prepared:
         bundle = placed.shown
     dark = DarkRun.of(options, placed.profile if placed and not options.calibration else profile)
     n_objects, flow_run, seconds = -(-options.decisions // options.trials), None, options.seconds
-    core: LiveCore
+    core: Follower
     if flow is not None:
         plan, flow_core, n_cycles = plan_flow(dark.profile, bundle, decider, flow, shots, seconds)
         seconds = 0.0  # the end of a flow is in its plan

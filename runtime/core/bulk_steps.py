@@ -19,9 +19,8 @@ from pans.runtime.wire.messages import Mark
 from . import stream_kernels as kernels
 from .decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
 from .plan import Plan
-from .stream_arrays import DecisionTables, FrameWalkArrays, IdleArrays, MarkArrays, WalkArrays
-from .window import DecisionWindows
-from .window_kernels import WindowArrays
+from .stream_kernels import DecisionTables, FrameWalkArrays, IdleArrays, MarkArrays, WalkArrays
+from .window import DecisionWindows, WindowArrays
 
 ROWS_PER_CALL = 65536  # decisions of one call, beside those of a block; a megabyte per 18 000
 WORD_FEATURES = 24  # of tables by word: what stream_kernels.py looks up at once

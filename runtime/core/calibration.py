@@ -186,12 +186,17 @@ class CalibrationCore(Follower):
         super().__init__(plan, n_cycles)
         self.parallel, self.channels = plan.mode == "parallel", plan.n_channels
         n_shown = plan.n_patterns // self.channels  # patterns, or states with one for each detector
-        self.tallies: I64 = np.zeros(N_TALLIES, np.int64)
+        self._tallies: I64 = np.zeros(N_TALLIES, np.int64)
         # channel, pattern (the last is dark; in parallel mode 0 is lit), was there a click before, exposures and clicks
         self.sums: I64 = np.zeros((self.channels, n_shown + 1, 2, 2), np.int64)
         self._slot_pattern = shown_in_slots(plan)
         self._before: NDArray[np.uint8] | None = None  # clicks of the exposure before, (channels,), where it is known
         self._next = 0
+
+    @property
+    def tallies(self) -> I64:
+        """See Follower."""
+        return self._tallies
 
     def warm_up(self) -> None:
         """Nothing here is compiled."""
@@ -231,9 +236,9 @@ class CalibrationCore(Follower):
             np.add.at(self.sums[channel, :, :, 0], where, 1)
             np.add.at(self.sums[channel, :, :, 1], where, bits[known, channel])
         self._before, self._next = bits[-1].copy(), block.exposure_index + n_exposures
-        self.tallies[DARK_EXPOSURES] += int((dark & right).sum()) * self.channels
-        self.tallies[DARK_CLICKS] += int(bits[dark & right].sum())
-        self.tallies[WRONG_PATTERNS] += int((~right).sum())
+        self._tallies[DARK_EXPOSURES] += int((dark & right).sum()) * self.channels
+        self._tallies[DARK_CLICKS] += int(bits[dark & right].sum())
+        self._tallies[WRONG_PATTERNS] += int((~right).sum())
 
     def _skip_to(self, exposure_index: int, tick: int) -> Output:
         if exposure_index != self._next:

@@ -29,7 +29,7 @@ from pans.runtime.wire.commands import (
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MalformedMessage, Opcode
 from pans.runtime.wire.schema import STATE_DTYPE
 
-from .layout import Plan
+from .plan import Plan
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.automaton import Automaton

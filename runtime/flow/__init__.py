@@ -6,8 +6,7 @@ settings (`read_flow`) ask for, `build_flow_plan` its plan.
 """
 
 from .core import FlowCore
-from .make import make_flow_core
-from .plan import build_flow_plan
+from .make import build_flow_plan, make_flow_core
 from .settings import FlowSettings, read_flow
 
 __all__ = ["FlowCore", "FlowSettings", "build_flow_plan", "make_flow_core", "read_flow"]

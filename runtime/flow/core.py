@@ -31,7 +31,7 @@ from pans.runtime.core.decision import (
 )
 from pans.runtime.core.follower import Follower
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.stream_arrays import DecisionTables
+from pans.runtime.core.stream_kernels import DecisionTables
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
 from pans.runtime.decide.backends import Decider
 from pans.runtime.decide.verdict import Verdict, log_evidence, softmax_winner

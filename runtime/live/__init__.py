@@ -7,7 +7,7 @@ no file (report) and reads no argument (commands). `run_live` takes an open link
 from .config import RunResult
 from .loop import Observers, run_live
 from .reconnect import Recovery
-from .run import LiveCore, LiveRun
+from .run import LiveRun
 from .run_options import RunOptions
 
-__all__ = ["LiveCore", "LiveRun", "Observers", "Recovery", "RunOptions", "RunResult", "run_live"]
+__all__ = ["LiveRun", "Observers", "Recovery", "RunOptions", "RunResult", "run_live"]

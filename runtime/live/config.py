@@ -8,17 +8,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections import Counter
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from pans.runtime.core.decision import Output
-    from pans.runtime.core.follower import Place
     from pans.runtime.instrument.channel_health import DarkReport
     from pans.runtime.timing.ledger import TimingLedger
-    from pans.runtime.wire.messages import Frame, Mark
-    from pans.runtime.wire.tracker import StreamTracker
 
     from .tally import RunTally
 
@@ -53,45 +47,6 @@ class RunResult:
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
     page_faults: dict[str, int] = field(default_factory=dict)  # of the loop's thread while armed; its switches too
-
-
-class LiveCore(Protocol):
-    """What a live run needs of a core (core.Core is one): stream frames in, outputs out, deterministic, no clock.
-
-    `tracker` accounts for the stream, `marks` are the objects' marks by number, `tallies` int64 (window.N_TALLIES,) the dark
-    exposures, dark clicks and wrong patterns, in that order.
-    """
-
-    start_tick: int
-    completed: bool
-    n_decisions: int
-    jitter_ticks: int
-    tracker: StreamTracker
-    contradictions: Counter[str]
-
-    @property
-    def marks(self) -> Mapping[int, Mark]: ...
-
-    @property
-    def tallies(self) -> NDArray[np.int64]: ...
-
-    def warm_up(self) -> None: ...
-
-    def begin(self, start_tick: int, n_cycles: int) -> Output: ...
-
-    def step(self, frame: Frame) -> Output: ...
-
-    def steps(self, session: int) -> Any: ...
-
-    def remember(self, mark: Mark) -> None: ...
-
-    def end(self) -> Output: ...
-
-    def begin_later(self, start_tick: int) -> None: ...
-
-    def cycles_left(self, n_cycles: int) -> int: ...
-
-    def part(self) -> Place | None: ...
 
 
 class Receives(Protocol):

@@ -20,9 +20,8 @@ from pans.runtime.turn.engine import Turn
 from pans.runtime.wire.messages import Mark, MessageType, decode_frames, decode_mark
 from pans.runtime.wire.schema import HEADER
 
-from .gates import Actuator
+from .gates import Actuator, SecondInstrument
 from .receiver import Receiver
-from .second_device import SecondInstrument
 
 if TYPE_CHECKING:
     from .run import LiveRun

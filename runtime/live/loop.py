@@ -21,6 +21,7 @@ import numpy as np
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard
+from pans.runtime.core.follower import Follower
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
@@ -41,7 +42,7 @@ from .config import RunResult
 from .continuous import INTERRUPTED, REFUSED, Stop
 from .receiver import Receiver, StillReceiver, why_fed
 from .reconnect import Recovery, Refusals, reconnect_run
-from .run import LiveCore, LiveRun, Watcher
+from .run import LiveRun, Watcher
 from .run_options import RunOptions
 
 NS_PER_S = 1_000_000_000
@@ -71,7 +72,7 @@ def run_live(
     profile: Profile,
     bundle: Bundle,
     plan: Plan,
-    core: LiveCore,
+    core: Follower,
     config: RunOptions,
     recorder: Recorder | None = None,
     recovery: Recovery | None = None,
@@ -88,7 +89,7 @@ def running(
     profile: Profile,
     bundle: Bundle,
     plan: Plan,
-    core: LiveCore,
+    core: Follower,
     config: RunOptions,
     recorder: Recorder | None = None,
     recovery: Recovery | None = None,
@@ -127,10 +128,12 @@ def _warm_up(run: LiveRun, *, prompt: bool) -> None:
     run.receiver.prepare()  # before the heap is touched: loading kernels takes memory
 
 
-def receiver_of(run: LiveRun, core: LiveCore, *, prompt: bool) -> Receiver:
+def receiver_of(run: LiveRun, core: Follower, *, prompt: bool) -> Receiver:
     """Return the receiver for `core`."""
     if isinstance(core, Core):
         return StillReceiver(run, core, prompt=prompt)
+    if not core.moving:  # it takes every message itself
+        return Receiver(run, core, prompt=prompt)
     from .flow_run import FlowReceiver
 
     return FlowReceiver(run, core, prompt=prompt)

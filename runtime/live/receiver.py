@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.decision import Output, RowDecisions
+from pans.runtime.core.follower import Follower
 from pans.runtime.core.still import Core
 from pans.runtime.errors import LinkError
 from pans.runtime.link.base import Link, descriptor_of
@@ -33,7 +34,7 @@ from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES, Refusal
 
 if TYPE_CHECKING:
-    from .run import LiveCore, LiveRun
+    from .run import LiveRun
 
 I64 = npt.NDArray[np.int64]
 
@@ -64,7 +65,7 @@ class Receiver:
     With `prompt`, a call ends behind the first bytes that gave a decision, for a watcher that acts.
     """
 
-    def __init__(self, run: LiveRun, core: LiveCore, *, prompt: bool) -> None:
+    def __init__(self, run: LiveRun, core: Follower, *, prompt: bool) -> None:
         self._run, self._core, self._prompt = run, core, prompt
         self._turn: Turn | None = None
         self._attached: Connection | None = None

@@ -1,7 +1,7 @@
 """One live run in progress, turn by turn: wait for bytes, decide on them, judge the time, record, renew the lease.
 
 Owns the state of a run while it lives and what is due in a turn; the order of a whole run is loop.py's, its outages are reconnect.py's, and
-what a frame means is the core's. Any core with the shape of `LiveCore` can be driven. `turn` sets `ended` when the run is over.
+what a frame means is the core's. Any `Follower` can be driven. `turn` sets `ended` when the run is over.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.decision import DECISION_DTYPE, Output
+from pans.runtime.core.follower import Follower
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.errors import DeviceError, LinkError
@@ -32,7 +33,6 @@ from pans.runtime.wire.messages import DeviceState, MessageType, Opcode, StateRe
 from pans.runtime.wire.schema import MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
-from .config import LiveCore as LiveCore
 from .config import Receives
 from .drive import HostDriver, WalkPlace
 from .gates import GateQueue
@@ -66,7 +66,7 @@ class LiveRun(Reconciled):
         self,
         connection: Connection,
         plan: Plan,
-        core: LiveCore,
+        core: Follower,
         n_classes: int,
         config: RunOptions,
         recorder: Recorder | None,

@@ -26,7 +26,7 @@ from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import recorded_flow_core, replayed_figures
 from pans.runtime.flow.matching import PassageFigures
 from pans.runtime.ranges import Range
-from pans.runtime.turn.streaming import StreamCore
+from pans.runtime.turn.engine import StreamCore
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 

@@ -6,7 +6,7 @@ link does. Costs a block two multiplications.
 
 from __future__ import annotations
 
-from pans.runtime.core.plausible import Contradiction
+from pans.runtime.core.follower import Contradiction
 
 from .clock import STEP_MARGIN_NS, ClockModel
 

@@ -1,14 +1,17 @@
-"""The system's calls that a compiled turn makes itself, without the interpreter: time, waiting, reading and writing a descriptor.
+"""The system's calls that the kernel makes itself, without the interpreter: time, waiting, reading and writing a descriptor.
 
-Owns how libc is reached from compiled code: by symbols that the just-in-time compiler's linker resolves when a kernel is loaded, so that
-kernels can be cached. errno is read at once, in the thread that made the call. Where there is no POSIX system, a turn is only fed
-(`offered` says so) and these calls fail; without the compiler they are Python's (system_plain.py).
+Compiled code reaches libc by symbols that the just-in-time compiler's linker resolves when a kernel is loaded, so that
+kernels can be cached. errno is read at once, in the thread that made the call. Where there is no POSIX system, the kernel is only fed
+(`offered` says so) and these calls fail; without the compiler they are Python's.
 """
 
 from __future__ import annotations
 
 import errno
+import os
+import select
 import sys
+import time
 from typing import Any
 
 import numba
@@ -16,6 +19,8 @@ import numpy as np
 from numba import types
 
 from pans.runtime.wire.inner import inner, outer
+
+from .rings import I64, U8
 
 # perf_counter_ns, which stamps everything else, reads the same clock: CLOCK_MONOTONIC, on macOS CLOCK_UPTIME_RAW
 _CLOCK = np.int32(8 if sys.platform == "darwin" else 1)
@@ -25,17 +30,43 @@ NS_PER_S = 1_000_000_000
 
 
 def offered() -> str:
-    """Return "" where compiled turns can be made, else why not."""
+    """Return "" where the kernel can read descriptors, else why not."""
     if sys.platform not in ("linux", "darwin"):
-        return "this system has no poll on descriptors: the turn is Python's"
-    return "numba's compiler is switched off" if numba.config.DISABLE_JIT else ""
+        return "this system has no poll on descriptors"
+    return ""
 
 
 if numba.config.DISABLE_JIT:
-    from .system_plain import now_ns as now_ns
-    from .system_plain import read_now as read_now
-    from .system_plain import wait_for as wait_for
-    from .system_plain import write_now as write_now
+
+    def now_ns(scratch: I64) -> int:
+        """The host's clock in ns."""
+        return time.perf_counter_ns()
+
+    def wait_for(fd: Any, wait_ns: Any, to_write: Any, scratch: I64) -> int:
+        """Wait at most `wait_ns` until `fd` can be read (or written): above 0 when it can or is gone, 0 when not, else minus errno."""
+        wanted, none = [int(fd)], []  # type: ignore[var-annotated]
+        try:
+            found = select.select(none if to_write else wanted, wanted if to_write else none, [], max(wait_ns, 0) / 1e9)
+        except OSError as error:
+            return -(error.errno or 1)
+        return len(found[0]) + len(found[1])
+
+    def read_now(fd: int, buffer: U8, at: int, size: int) -> int:
+        """Read at most `size` bytes to buffer[at:]: how many, 0 at the end (or of a terminal without data), else minus errno."""
+        try:
+            data = os.read(int(fd), int(size))
+        except OSError as error:
+            return -(error.errno or 1)
+        buffer[at : at + len(data)] = memoryview(data)
+        return len(data)
+
+    def write_now(fd: int, buffer: U8, at: int, size: int) -> int:
+        """Write buffer[at : at + size]: how many bytes were taken, else minus errno."""
+        try:
+            return os.write(int(fd), buffer[at : at + size].tobytes())
+        except OSError as error:
+            return -(error.errno or 1)
+
 
 elif sys.platform not in ("linux", "darwin"):
 

@@ -26,7 +26,7 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.turn.streaming import StreamCore
+from pans.runtime.turn.engine import StreamCore
 from pans.runtime.turn.system import offered
 from pans.runtime.wire.framing import FrameDecoder
 

@@ -18,7 +18,7 @@ from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdict, Verdicts
-from pans.runtime.turn.streaming import StreamCore
+from pans.runtime.turn.engine import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock
 

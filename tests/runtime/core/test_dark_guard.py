@@ -15,9 +15,9 @@ from tree import ROOT
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
-from pans.runtime.core.dark_guard import DarkGuard
-from pans.runtime.core.dark_tables import (
+from pans.runtime.core.dark_guard import (
     MAX_MIXED,
+    DarkGuard,
     HeadAdapter,
     TableAdapter,
     adapted_scores,

@@ -18,7 +18,7 @@ from pans.runtime.core.bulk_steps import count_crc_tables
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdicts
-from pans.runtime.turn.streaming import StreamCore
+from pans.runtime.turn.engine import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
 

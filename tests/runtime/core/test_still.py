@@ -10,7 +10,7 @@ from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
 from pans.runtime.core.follower import MAX_MARKS
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DecisionWindows
-from pans.runtime.decide.backends import Verdict, softmax_winner
+from pans.runtime.decide.verdict import Verdict, softmax_winner
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock, DeviceState, Frame, FrameDecoder, Mark, StateReason, Status
 

@@ -15,7 +15,7 @@ from heads import onnx_chain, random_layers
 from pans import decide
 from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.core.dark_tables import make_adapter
+from pans.runtime.core.dark_guard import make_adapter
 from pans.runtime.decide import backends, make_decider
 from pans.runtime.decide.verdict import choice_of
 from pans.runtime.errors import UsageError

@@ -16,8 +16,7 @@ from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import ConfigError, PlanError, UsageError
-from pans.runtime.flow.make import plan_flow
-from pans.runtime.flow.plan import build_flow_plan
+from pans.runtime.flow.make import build_flow_plan, plan_flow
 from pans.runtime.flow.settings import FlowSettings, flow_of_header, read_flow
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.live import LiveRun, Observers, RunOptions, run_live

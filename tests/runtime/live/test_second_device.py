@@ -19,9 +19,8 @@ from pans.runtime.errors import DeviceError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import open_link
 from pans.runtime.link.connection import Connection
-from pans.runtime.live.gates import GateQueue, open_actuator
+from pans.runtime.live.gates import GateQueue, SecondInstrument, idle_plan, open_actuator
 from pans.runtime.live.journal import Journal
-from pans.runtime.live.second_device import SecondInstrument, idle_plan
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire.messages import DeviceState
 
@@ -174,7 +173,7 @@ def test_a_second_instrument_that_is_gone_does_not_end_the_run(serve_one: Callab
 
 
 def test_a_lease_that_ran_out_is_taken_again(serve_one: Callable[..., Served], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pans.runtime.live.second_device.LEASE_MS", 100)
+    monkeypatch.setattr("pans.runtime.live.gates.LEASE_MS", 100)
     other = serve_one("ideal", "tcp:127.0.0.1:0", 0, 0.0)
     second = connected(other)
     until = time.perf_counter_ns() + round(PATIENCE_S * 1e9)

@@ -44,8 +44,7 @@ from pans.runtime.live.loop import NO_OBSERVERS
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.turn import kernels, shows
 from pans.runtime.turn import rings as ring
-from pans.runtime.turn.engine import Limits, Turn
-from pans.runtime.turn.streaming import StreamCore
+from pans.runtime.turn.engine import Limits, StreamCore, Turn
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.commands import unpack_show
 from pans.runtime.wire.framing import FrameDecoder
