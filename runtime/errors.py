@@ -85,7 +85,7 @@ class TimingError(PansError):
 
 @contextmanager
 def as_usage_error() -> Iterator[None]:
-    """Turn a ValueError of numeric code into a UsageError of the same words, where what a user gave is at fault.
+    """Kernel a ValueError of numeric code into a UsageError of the same words, where what a user gave is at fault.
 
     >>> with as_usage_error():
     ...     raise ValueError("levels is 1, allowed: 2 to 65536")

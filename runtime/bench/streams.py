@@ -17,7 +17,7 @@ from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.plan import ADAPTIVE_PATTERN, NO_SHOT, Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.verdict import Decider
-from pans.runtime.turn.engine import StreamCore
+from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import (
     DARK_PATTERN,

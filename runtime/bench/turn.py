@@ -28,11 +28,11 @@ from pans.runtime.errors import LinkError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import make_flow_core
 from pans.runtime.flow.settings import FlowSettings
+from pans.runtime.kernel import state as ring
+from pans.runtime.kernel.calls import Kernel, Limits, StreamCore
+from pans.runtime.kernel.system import now_ns, offered, read_now, wait_for, write_now
 from pans.runtime.link.base import Link, descriptor_of, open_link
 from pans.runtime.live.drive import HostDriver, WalkPlace
-from pans.runtime.turn import rings as ring
-from pans.runtime.turn.engine import Limits, StreamCore, Turn
-from pans.runtime.turn.system import now_ns, offered, read_now, wait_for, write_now
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.frame import unpack_body
 from pans.runtime.wire.framing import FrameDecoder
@@ -143,7 +143,7 @@ def flow_row(bundle: Bundle, quick: bool) -> Row:
     plain.begin(0, 0)
     wanted = np.array([one for data in reads for frame in decoder.feed(data) for one in plain.step(frame).decisions],
                       DECISION_DTYPE)  # fmt: skip
-    turn = Turn(core.steps(SESSION), BulkDecoder())
+    turn = Kernel(core.steps(SESSION), BulkDecoder())
 
     def compiled() -> Rows:
         core.begin(0, 0)
@@ -264,7 +264,7 @@ def _framed(trips: Trips) -> tuple[NDArray[np.int64], int, int, float]:
     steps = core.steps(SESSION)
     assert plan.automaton is not None
     driver = HostDriver(core, WalkPlace(plan, plan.automaton))
-    turn = Turn(steps, BulkDecoder(), driver.arrays(SESSION))
+    turn = Kernel(steps, BulkDecoder(), driver.arrays(SESSION))
     turn.warm_up()
     control = turn.control
     first = encode_command(1, Opcode.SHOW, driver.body(0, 0), SESSION)
@@ -288,7 +288,7 @@ def _framed(trips: Trips) -> tuple[NDArray[np.int64], int, int, float]:
     return all_times[len(all_times) // 10 :], len(first), answer, wrong
 
 
-def _called(turn: Turn, link: Link, n: int) -> Iterator[NDArray[np.int64]]:
+def _called(turn: Kernel, link: Link, n: int) -> Iterator[NDArray[np.int64]]:
     """Call again and again what reads and writes the descriptor itself, for `n` round trips; yield the times of those of each call."""
     done, fd = 0, descriptor_of(link)
     assert fd is not None
@@ -302,7 +302,7 @@ def _called(turn: Turn, link: Link, n: int) -> Iterator[NDArray[np.int64]]:
         yield np.diff(blocks[:, ring.DECIDED]) + kept
 
 
-def _read_and_fed(turn: Turn, link: Link, n: int) -> Iterator[NDArray[np.int64]]:
+def _read_and_fed(turn: Kernel, link: Link, n: int) -> Iterator[NDArray[np.int64]]:
     """Read, decide and send what is decided, as a live run does where compiled code cannot read the link; `n` times.
 
     A time is from one decision to the next and to what is kept of it. The rest is settled while the answer is on its way.

@@ -233,7 +233,7 @@ class Follower:
     def steps(self, session: int) -> Any:
         """Return what the kernel continues of this core (turn/engine.Steps), ready for messages of `session`."""
         if self._idle_steps is None:
-            from .bulk_steps import IdleSteps  # numba is loaded only by who receives
+            from .kernel_state import IdleSteps  # numba is loaded only by who receives
 
             self._idle_steps = IdleSteps(self)
         return self._idle_steps.begin(session)

@@ -16,10 +16,10 @@ from pans.runtime.decide.backends import Decider
 from pans.runtime.instrument.channel_health import Finding
 from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark
 
-from .bulk_steps import BulkSteps, IdleSteps
 from .dark_guard import DarkGuard
 from .decision import NO_LABEL, Decision, DecisionFlag, Output
 from .follower import ANY_CLASS, Follower, Place
+from .kernel_state import CoreState, IdleSteps
 from .plan import Plan
 from .window import DecisionWindows, Window
 
@@ -37,7 +37,7 @@ class Core(Follower):
         self.shots = shots
         self._decider = decider
         self._visits_before = 0  # in streams that have ended
-        self._bulk: BulkSteps | None = None
+        self._bulk: CoreState | None = None
         self._session_known = False  # to it
 
     @property
@@ -56,12 +56,12 @@ class Core(Follower):
         """Whether the kernel may take messages: exposures are clicks, not numbers, and no guard changes decisions."""
         return self._plan.largest == 1 and (self.guard is None or self.guard.policy == "warn")
 
-    def steps(self, session: int) -> BulkSteps | IdleSteps:
+    def steps(self, session: int) -> CoreState | IdleSteps:
         """See Follower."""
         if not self.takes:
             return super().steps(session)
         if self._bulk is None:
-            self._bulk = BulkSteps(self, self.windows, self._plan, self._decider, self.shots)
+            self._bulk = CoreState(self, self.windows, self._plan, self._decider, self.shots)
         if not self._session_known:
             self._bulk.begin(session)
             self._session_known = True

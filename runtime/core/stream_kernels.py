@@ -1,7 +1,7 @@
 """The kernel of the core: decoded CLICKS, FRAMES and MARK bodies in, rows of the decision log out.
 
 It takes the ordinary case: messages in order, nothing lost, blocks that fit the plan. Any other message it leaves untouched: its caller
-gives it to `still.Core`, whose state this kernel continues (bulk_steps.py joins them). It never allocates.
+gives it to `still.Core`, whose state this kernel continues (kernel_state.py joins them). It never allocates.
 """
 
 from __future__ import annotations

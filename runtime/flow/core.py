@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core import stream_kernels as columns
-from pans.runtime.core.bulk_steps import decision_tables
 from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.decision import (
     DECISION_DTYPE,
@@ -30,6 +29,7 @@ from pans.runtime.core.decision import (
     joined,
 )
 from pans.runtime.core.follower import Follower
+from pans.runtime.core.kernel_state import decision_tables
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.stream_kernels import DecisionTables
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES

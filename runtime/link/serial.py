@@ -116,7 +116,7 @@ def _not_opened(name: str, target: str, error: BaseException) -> LinkError:
 
 
 def port_of(target: str) -> str:
-    """Turn VID:PID[:SERIAL] into the port that carries it; leave every other target as it is."""
+    """Kernel VID:PID[:SERIAL] into the port that carries it; leave every other target as it is."""
     fields = target.split(":")
     if "://" in target or "/" in target or not 2 <= len(fields) <= 3:
         return target

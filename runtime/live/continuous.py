@@ -75,7 +75,7 @@ def _outlives_its_terminal(number: int) -> bool:
 
 @contextmanager
 def stop_signals(*, continuous: bool) -> Iterator[Stop]:
-    """Turn SIGTERM, SIGINT and SIGHUP into a `Stop`, and put the handlers back afterwards; in the main thread only, else none comes."""
+    """Kernel SIGTERM, SIGINT and SIGHUP into a `Stop`, and put the handlers back afterwards; in the main thread only, else none comes."""
     stop = Stop(continuous=continuous)
     if threading.current_thread() is not threading.main_thread():
         yield stop

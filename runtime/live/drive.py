@@ -14,9 +14,9 @@ from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import ADAPTIVE_PATTERN, Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DecisionWindows
+from pans.runtime.kernel.state import Drive
 from pans.runtime.link.connection import Connection
 from pans.runtime.timing.ledger import LatencyHistogram
-from pans.runtime.turn.rings import Drive
 from pans.runtime.wire.commands import Show, pack_show
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.schema import HEADER, STRUCTS

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from pans.runtime.core.decision import Output
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.matching import PassageFigures
-from pans.runtime.turn import rings as ring
-from pans.runtime.turn.engine import Turn
+from pans.runtime.kernel import state as ring
+from pans.runtime.kernel.calls import Kernel
 from pans.runtime.wire.messages import Mark, MessageType, decode_frames, decode_mark
 from pans.runtime.wire.schema import HEADER
 
@@ -99,11 +99,11 @@ class FlowReceiver(Receiver):
 
     _outputs: Sequence[Output] = ()
 
-    def _settle_marks(self, turn: Turn) -> None:
+    def _settle_marks(self, turn: Kernel) -> None:
         if not turn.counts.steps:
             super()._settle_marks(turn)
 
-    def _record(self, turn: Turn) -> None:
+    def _record(self, turn: Kernel) -> None:
         """Record decisions, too, and send the pulses that they ask for: before all else, since their time runs."""
         super()._record(turn)
         run, steps = self._run, turn.steps
@@ -117,7 +117,7 @@ class FlowReceiver(Receiver):
             run.gates.take(pulses)
             run.pulse()
 
-    def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
+    def _settle_blocks(self, turn: Kernel, outputs: list[Output]) -> None:
         run, blocks, rows, steps = self._run, turn.blocks, turn.rows, turn.steps
         assert isinstance(steps, FlowCore)
         for output in settled_blocks(turn) if steps.decides else self._outputs:
@@ -134,7 +134,7 @@ class FlowReceiver(Receiver):
             run.account_times(int(rows["index"][0]), np.ones(len(rows), np.int64), ends_ns, unsure_ns, stamps)
 
 
-def settled_blocks(turn: Turn) -> Iterator[Output]:
+def settled_blocks(turn: Kernel) -> Iterator[Output]:
     """Let the core of a flow see what a call brought; yield what came of each block of which something came."""
     steps, blocks = turn.steps, turn.blocks
     assert isinstance(steps, FlowCore)
@@ -163,7 +163,7 @@ def settled_blocks(turn: Turn) -> Iterator[Output]:
         core.remember(marks.pop()[1])
 
 
-def _blocks_behind(turn: Turn) -> npt.NDArray[np.int64]:
+def _blocks_behind(turn: Kernel) -> npt.NDArray[np.int64]:
     """Return the exposure that follows each block of a call, int64 (n,)."""
     begins = turn.rings.messages[turn.blocks[:, ring.MESSAGES] - 1, ring.BEGIN] + HEADER.size
     first = turn.kept[begins[:, None] + np.arange(16, 24)].view("<u8")[:, 0]
@@ -171,11 +171,11 @@ def _blocks_behind(turn: Turn) -> npt.NDArray[np.int64]:
     return first.astype(np.int64) + count
 
 
-def _marks_of(turn: Turn) -> list[tuple[int, Mark]]:
+def _marks_of(turn: Kernel) -> list[tuple[int, Mark]]:
     """Return the marks of a call, the first one last, each with its place among the ring's messages."""
     places = np.flatnonzero(turn.messages[:, ring.WHAT] == int(MessageType.MARK))
     return [(place, decode_mark(_payload(turn, place))) for place in places[::-1].tolist()]
 
 
-def _payload(turn: Turn, place: int) -> bytes:
+def _payload(turn: Kernel, place: int) -> bytes:
     return turn.bytes_of(turn.rings.messages[place])[HEADER.size :]

@@ -14,21 +14,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.decision import Output, RowDecisions
 from pans.runtime.core.follower import Follower
+from pans.runtime.core.kernel_state import CoreState
 from pans.runtime.core.still import Core
 from pans.runtime.errors import LinkError
+from pans.runtime.kernel import state as ring
+from pans.runtime.kernel.calls import Kernel, Limits
+from pans.runtime.kernel.receive import QUIET_NS, unpack_blocks
+from pans.runtime.kernel.system import offered
 from pans.runtime.link.base import Link, descriptor_of
 from pans.runtime.link.connection import Connection
 from pans.runtime.link.reader import count_delimiters
 from pans.runtime.record.format import Kind
 from pans.runtime.timing.clock import STEP_MARGIN_NS
 from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
-from pans.runtime.turn import rings as ring
-from pans.runtime.turn.engine import Limits, Turn
-from pans.runtime.turn.kernels import QUIET_NS, unpack_blocks
-from pans.runtime.turn.system import offered
 from pans.runtime.wire.messages import MessageType, Opcode, decode_ack, decode_frames
 from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES, Refusal
@@ -67,7 +67,7 @@ class Receiver:
 
     def __init__(self, run: LiveRun, core: Follower, *, prompt: bool) -> None:
         self._run, self._core, self._prompt = run, core, prompt
-        self._turn: Turn | None = None
+        self._turn: Kernel | None = None
         self._attached: Connection | None = None
         self._fd: int | None = None
         self._stamps_itself = True  # whether the kernel's times are the link's
@@ -90,14 +90,14 @@ class Receiver:
         nonce, bulk = run.connection.session.nonce, run.connection.decoder.bulk
         assert bulk is not None
         drive = None if run.driver is None else run.driver.arrays(nonce)
-        self._turn = Turn(self._core.steps(nonce), bulk, drive)
+        self._turn = Kernel(self._core.steps(nonce), bulk, drive)
         self._turn.warm_up()
         self._warm_up(self._turn)
         link = run.connection.link
         self._fd = None if why_fed(link) else descriptor_of(link)
         self._stamps_itself = has_host_clock(link)
 
-    def _warm_up(self, turn: Turn) -> None:
+    def _warm_up(self, turn: Kernel) -> None:
         """Compile or load what settles a call."""
 
     def receive(self, poll_s: float) -> list[Output]:
@@ -154,7 +154,7 @@ class Receiver:
         patience_ns = run.lateness.patience_ns
         return Limits(due_ns, patience_ns, EAGER_NS if eager else 0, budget, run.lateness.evidence.floor_ns)
 
-    def _load(self, turn: Turn) -> None:
+    def _load(self, turn: Kernel) -> None:
         """Put what Python knows of the stream, the session and the driver where the kernel looks for it."""
         run, control, driver = self._run, turn.control, self._run.driver
         next_id, oldest_id, oldest_ns, waiting = run.connection.session.window
@@ -178,7 +178,7 @@ class Receiver:
 
     # -- after a call --------------------------------------------------------------------------------------------------
 
-    def _feed(self, turn: Turn, chunks: Sequence[tuple[int, bytes]], outputs: list[Output]) -> None:
+    def _feed(self, turn: Kernel, chunks: Sequence[tuple[int, bytes]], outputs: list[Output]) -> None:
         """Take what Python has read."""
         self._load(turn)
         ended = self._sent(turn, turn.feed(chunks))
@@ -187,7 +187,7 @@ class Receiver:
             self._note(turn)
         self._continue(turn, ended, outputs, turn.feed_on)
 
-    def _continue(self, turn: Turn, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
+    def _continue(self, turn: Kernel, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
         """Deal with what ended a call until nothing that was read is left; no more is read."""
         while ended in (ring.ODD, ring.FULL, ring.BROKEN):
             if ended == ring.ODD:
@@ -197,7 +197,7 @@ class Receiver:
             ended = self._sent(turn, again())
             self._settle(turn, outputs)
 
-    def _take_odd(self, turn: Turn, outputs: list[Output]) -> None:
+    def _take_odd(self, turn: Kernel, outputs: list[Output]) -> None:
         """Let Python take one message that is not ordinary."""
         run, arrival_ns = self._run, turn.arrival_ns
         connection, frame = run.connection, turn.take_odd()
@@ -208,7 +208,7 @@ class Receiver:
         elif connection.sort(frame, arrival_ns):
             run.take_frame(arrival_ns, frame, outputs)
 
-    def _sent(self, turn: Turn, ended: int) -> int:
+    def _sent(self, turn: Kernel, ended: int) -> int:
         """Send what is left of a command that the kernel could not send whole, all of it without a descriptor; return `ended`."""
         if ended == ring.BROKEN:
             last, unsent = turn.shows[-1], turn.counts.unsent
@@ -221,7 +221,7 @@ class Receiver:
                 self._run.note_broken(error)
         return ended
 
-    def _ask_why(self, turn: Turn) -> None:
+    def _ask_why(self, turn: Kernel) -> None:
         """The descriptor says that the other end is gone: the link says it in its words."""
         link, errno = self._run.connection.link, turn.counts.errno
         try:
@@ -230,7 +230,7 @@ class Receiver:
         except LinkError as error:
             self._run.note_broken(error)
 
-    def _note(self, turn: Turn) -> None:
+    def _note(self, turn: Kernel) -> None:
         """Give what a call has waited for, and long decisions, to the evidence of what makes work late, in the order of time."""
         evidence, blocks = self._run.lateness.evidence, turn.blocks
         worked = blocks[blocks[:, ring.DECIDED] - blocks[:, ring.DECODED] >= evidence.floor_ns]
@@ -243,7 +243,7 @@ class Receiver:
                 evidence.waited(began, (asked - began) / NS_PER_S, ended)
         evidence.arrived(*turn.arrivals.tolist())
 
-    def _settle(self, turn: Turn, outputs: list[Output]) -> None:
+    def _settle(self, turn: Kernel, outputs: list[Output]) -> None:
         """Account for what a call took and sent: session, driver, marks, recording, decisions."""
         run, counts = self._run, turn.counts
         if not counts.kept:
@@ -262,7 +262,7 @@ class Receiver:
         if counts.steps:
             self._settle_blocks(turn, outputs)
 
-    def _stamp(self, turn: Turn) -> None:
+    def _stamp(self, turn: Kernel) -> None:
         """Set the times of the blocks where the kernel has another clock than the link; in virtual time none passes in between."""
         if not self._stamps_itself:
             blocks, link = turn.blocks, self._run.connection.link
@@ -270,7 +270,7 @@ class Receiver:
                 blocks[:, ring.ARRIVAL, None] if link.virtual else link.now_ns()
             )
 
-    def _record(self, turn: Turn) -> None:
+    def _record(self, turn: Kernel) -> None:
         """Record what a call took and sent."""
         recorder, counts = self._run.recorder, turn.counts
         if recorder is not None:
@@ -280,12 +280,12 @@ class Receiver:
             if counts.shows:
                 recorder.add_stamped(Kind.COMMANDS, turn.kept, turn.shows)
 
-    def _settle_marks(self, turn: Turn) -> None:
+    def _settle_marks(self, turn: Kernel) -> None:
         """Let the core know of the marks of a call."""
         for mark in turn.marks():
             self._core.remember(mark)
 
-    def _settle_commands(self, turn: Turn) -> None:
+    def _settle_commands(self, turn: Kernel) -> None:
         """Bring the session and the driver to where the kernel has them."""
         run, control, shows = self._run, turn.control, turn.shows
         first = int(control[ring.NEXT_ID]) - len(shows)
@@ -301,11 +301,11 @@ class Receiver:
             exposure, state = control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1].tolist()
             run.driver.account((exposure, state), shows[:, ring.TIME] - shows[:, ring.WHAT])
 
-    def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
+    def _settle_blocks(self, turn: Kernel, outputs: list[Output]) -> None:
         """Account for the blocks of a call and their decisions."""
         raise NotImplementedError
 
-    def _ends_of(self, turn: Turn) -> tuple[I64, I64]:
+    def _ends_of(self, turn: Kernel) -> tuple[I64, I64]:
         """Return when each block ended on the host's clock and how uncertain that is; what lies in the future is noted."""
         run, blocks = self._run, turn.blocks
         ends_ns, unsure_ns = run.connection.known_clock().to_host_ns_many(blocks[:, ring.END_TICK])
@@ -325,14 +325,14 @@ class StillReceiver(Receiver):
             exposures = ring.KEPT_BYTES // 2  # two bytes each
             self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
 
-    def _warm_up(self, turn: Turn) -> None:
+    def _warm_up(self, turn: Kernel) -> None:
         unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits)
         if self._run.recorder is not None:
             self._run.recorder.add_stamped(Kind.MESSAGES, turn.kept, turn.messages)
 
-    def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
+    def _settle_blocks(self, turn: Kernel, outputs: list[Output]) -> None:
         run, blocks, steps = self._run, turn.blocks, turn.steps
-        assert isinstance(steps, BulkSteps)
+        assert isinstance(steps, CoreState)
         rows = turn.rows  # a back end that is not the kernel's decides here
         if not steps.decides and not run.connection.link.virtual:
             blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
@@ -351,7 +351,7 @@ class StillReceiver(Receiver):
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
         outputs.append(Output(RowDecisions(rows), events, self._still.last_tick))
 
-    def _watch(self, turn: Turn, rows: npt.NDArray[np.void]) -> list[Any]:
+    def _watch(self, turn: Kernel, rows: npt.NDArray[np.void]) -> list[Any]:
         """Let the guard of the dark counts see the exposures of a call."""
         core = self._still
         if core.guard is None:

@@ -62,8 +62,8 @@ def load_ahead() -> None:
     """Load what a run needs besides, while its port opens: nothing of it has to be loaded between there and ARM."""
     import numpy as np
 
+    from pans.runtime.kernel.receive import unpack_blocks
     from pans.runtime.record.recorder import load_kernels
-    from pans.runtime.turn.kernels import unpack_blocks
     from pans.runtime.wire.bulk import BulkDecoder
 
     load_kernels()

@@ -25,8 +25,8 @@ from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import recorded_flow_core, replayed_figures
 from pans.runtime.flow.matching import PassageFigures
+from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.ranges import Range
-from pans.runtime.turn.engine import StreamCore
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 

@@ -33,7 +33,7 @@ from numba.core.runtime import rtsys
 
 TRIED = ((0, 68),)  # versions of numba
 # packages of runtime whose files hold kernels, or constants that are compiled into them
-SOURCES = ("core", "decide", "flow", "instrument", "record", "timing", "turn", "wire")
+SOURCES = ("core", "decide", "flow", "instrument", "kernel", "record", "timing", "wire")
 
 
 def outer(function: Any) -> Any:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.still import Core
-from pans.runtime.turn.engine import Limits, StreamCore
+from pans.runtime.kernel.calls import Limits, StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import ClickBlock, DeviceState, FrameBlock, Mark, MessageType, StateReason, Status

@@ -254,7 +254,7 @@ class _Run:
 
     @torch.no_grad()
     def start_showing(self) -> None:
-        """Turn grey patterns into what the projector shows: one bit and a brightness, or whole levels."""
+        """Kernel grey patterns into what the projector shows: one bit and a brightness, or whole levels."""
         if self.stage != "grey":
             return
         low, high = top_limits(self.profile)

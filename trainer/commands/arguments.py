@@ -109,7 +109,7 @@ def stated_tolerance(profile: Profile) -> str | None:
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Turn a ValueError of the numeric code into a UsageError: what the user asked for cannot be computed."""
+    """Kernel a ValueError of the numeric code into a UsageError: what the user asked for cannot be computed."""
     try:
         yield
     except ValueError as error:
@@ -118,7 +118,7 @@ def usage_errors() -> Iterator[None]:
 
 @contextmanager
 def needing(option: str, extra: str) -> Iterator[None]:
-    """Turn a missing package into a UsageError that names the `option` which needs it, and the `extra` that holds it."""
+    """Kernel a missing package into a UsageError that names the `option` which needs it, and the `extra` that holds it."""
     try:
         yield
     except ModuleNotFoundError as error:

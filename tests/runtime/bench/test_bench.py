@@ -26,8 +26,8 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.turn.engine import StreamCore
-from pans.runtime.turn.system import offered
+from pans.runtime.kernel.calls import StreamCore
+from pans.runtime.kernel.system import offered
 from pans.runtime.wire.framing import FrameDecoder
 
 compiled = pytest.mark.skipif(bool(offered()), reason="no compiled turn here")

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from plans import parallel, pattern_major, shot_major, walk_plan, walked
 from streams import SESSION, click_frames, compare, spoilt
 
-from pans.runtime.core import bulk_steps
+from pans.runtime.core import kernel_state
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdict, Verdicts
-from pans.runtime.turn.engine import StreamCore
+from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock
 
@@ -107,7 +107,7 @@ def test_any_faults_any_cuts(data: st.DataObject) -> None:
 
 @pytest.mark.uncompiled
 def test_more_rows_than_a_call_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bulk_steps, "ROWS_PER_CALL", 5)
+    monkeypatch.setattr(kernel_state, "ROWS_PER_CALL", 5)
     rng = np.random.default_rng(4)
     for plan, decider, shots in (CASES[2](), CASES[7]()):
         clean = click_frames(plan, sent_exposures(plan, rng, 0.0), rng, 16)

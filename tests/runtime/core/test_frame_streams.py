@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from plans import parallel
 from streams import SESSION, compare, spoilt
 
-from pans.runtime.core import bulk_steps
-from pans.runtime.core.bulk_steps import count_crc_tables
+from pans.runtime.core import kernel_state
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
+from pans.runtime.core.kernel_state import count_crc_tables
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdicts
-from pans.runtime.turn.engine import StreamCore
+from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
 
@@ -80,7 +80,7 @@ def test_any_faults_any_cuts(data: st.DataObject) -> None:
 
 @pytest.mark.uncompiled
 def test_more_rows_than_a_call_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bulk_steps, "ROWS_PER_CALL", 5)
+    monkeypatch.setattr(kernel_state, "ROWS_PER_CALL", 5)
     plan, decider = parallel(10, 8), decider_for(10, 1, "table")
     clean = frames(plan, 10, 5, np.random.default_rng(4), 3)
     assert len(compare(plan, decider, 1, [b"".join(clean)])) == 40

@@ -21,8 +21,8 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.kernels import winner
 from pans.runtime.decide.verdict import log_evidence, softmax_winner, softmax_winners
 from pans.runtime.intervals import binomial_tail, wilson_interval
+from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.timing.clock import ClockModel
-from pans.runtime.turn.engine import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import FrameBlock

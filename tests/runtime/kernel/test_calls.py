@@ -36,15 +36,15 @@ from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
+from pans.runtime.kernel import answer, receive
+from pans.runtime.kernel import state as ring
+from pans.runtime.kernel.calls import Kernel, Limits, StreamCore
 from pans.runtime.link.base import open_link
 from pans.runtime.link.connection import Connection
 from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.live.loop import NO_OBSERVERS
 from pans.runtime.record import Recorder, read_recording, replay
-from pans.runtime.turn import kernels, shows
-from pans.runtime.turn import rings as ring
-from pans.runtime.turn.engine import Limits, StreamCore, Turn
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.commands import unpack_show
 from pans.runtime.wire.framing import FrameDecoder
@@ -115,7 +115,7 @@ def test_a_run_at_real_pace(mode: str, listen: str, tmp_path: Path) -> None:
 def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It has its time when it is made: a wait before it is sent would count as its way to the device."""
     told: list[str] = []
-    for owner, name in ((HostSession, "probe"), (Connection, "flush"), (Turn, "run")):
+    for owner, name in ((HostSession, "probe"), (Connection, "flush"), (Kernel, "run")):
         original = getattr(owner, name)
 
         def noted(*arguments: Any, name: str = name, original: Any = original) -> Any:
@@ -182,7 +182,7 @@ def streaming() -> tuple[StreamCore, list[bytes]]:
 
 def test_the_refusal_of_a_name_is_taken_in_the_call_that_sent_it() -> None:
     """One late name must not make the next one late; any other refusal is Python's."""
-    taken = called(shows.take_ack)
+    taken = called(answer.take_ack)
     control = np.zeros(ring.N_CONTROL, np.int64)
     control[[ring.NEXT_ID, ring.OLDEST_ID, ring.FIRST_ID, ring.ARRIVAL_NS]] = 12, 9, 9, 55
 
@@ -191,13 +191,13 @@ def test_the_refusal_of_a_name_is_taken_in_the_call_that_sent_it() -> None:
         body = np.frombuffer(pack_body(frame), np.uint8).copy()
         return int(taken(body, np.uint64(0), np.uint64(len(body)), control))
 
-    assert told(11, 11, 5, 1) == shows.IS_ODD  # three at once
-    assert told(9, 9, 0, 1) == shows.IS_ODD  # without a reason
-    assert told(9, 9, 5, 3) == shows.IS_REFUSED
+    assert told(11, 11, 5, 1) == answer.IS_ODD  # three at once
+    assert told(9, 9, 0, 1) == answer.IS_ODD  # without a reason
+    assert told(9, 9, 5, 3) == answer.IS_REFUSED
     assert control[[ring.OLDEST_ID, ring.OLDEST_NS]].tolist() == [10, 55]
-    assert told(10, 9, 5, 2) == shows.IS_DONE  # the refusal before it stays named
+    assert told(10, 9, 5, 2) == answer.IS_DONE  # the refusal before it stays named
     control[ring.FIRST_ID] = 12
-    assert told(11, 11, 5, 1) == shows.IS_ODD  # sent by another call, or by Python
+    assert told(11, 11, 5, 1) == answer.IS_ODD  # sent by another call, or by Python
     assert control[ring.OLDEST_ID] == 11
 
 
@@ -250,7 +250,7 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
     core.begin(0, 0)
     steps = core.steps(SESSION)
     drive = HostDriver(core, WalkPlace(setup.plan, setup.plan.automaton)).arrays(SESSION)
-    turn = Turn(steps, BulkDecoder(), drive)
+    turn = Kernel(steps, BulkDecoder(), drive)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         ours.setblocking(False)
@@ -260,7 +260,7 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
         turn.control[ring.FD], turn.control[ring.NEXT_ID], turn.control[ring.OLDEST_ID] = ours.fileno(), 5, 5
         steps.load()
         scratch = np.zeros(4, np.int64)
-        assert not called(shows.send_show)(steps.walk, drive, turn.rings, turn.control, scratch)
+        assert not called(answer.send_show)(steps.walk, drive, turn.rings, turn.control, scratch)
         size = int(turn.rings.shows[0, ring.END])
         assert 0 < turn.control[ring.UNSENT] <= size
         frame = FrameDecoder().feed(turn.rings.kept[:size].tobytes())[0]
@@ -271,11 +271,11 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
 
 def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:
     """After this module's runs: the turn once for each kind of walk. A fresh process finds it in the cache, though it calls libc."""
-    kinds = [kind for one in kernels.turn.signatures for kind in re.findall(r"\b(?:Frame)?WalkArrays\b", str(one))]
+    kinds = [kind for one in receive.turn.signatures for kind in re.findall(r"\b(?:Frame)?WalkArrays\b", str(one))]
     assert sorted(kinds) == ["FrameWalkArrays", "WalkArrays"]
     code = (
-        "import test_turn as t; s, c = t.streaming(); n = sum(len(b.rows) for b in s.feed(b''.join(c)));"
-        "print(n, sum(t.kernels.turn.stats.cache_hits.values()), sum(t.kernels.turn.stats.cache_misses.values()))"
+        "import test_calls as t; s, c = t.streaming(); n = sum(len(b.rows) for b in s.feed(b''.join(c)));"
+        "print(n, sum(t.receive.turn.stats.cache_hits.values()), sum(t.receive.turn.stats.cache_misses.values()))"
     )
     here = Path(__file__).parent
     paths = [here, *(ROOT / "tests" / name for name in ("support", "oracles"))]

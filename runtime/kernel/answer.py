@@ -16,7 +16,7 @@ from pans.runtime.wire.kernels import crc32_span
 from pans.runtime.wire.schema import HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS
 from pans.runtime.wire.session import COMMAND_WINDOW
 
-from . import rings as ring
+from . import state as ring
 from .system import AGAIN, INTERRUPTED, now_ns, wait_for, write_now
 
 ACK_BYTES = STRUCTS["ACK"].size

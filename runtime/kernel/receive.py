@@ -24,8 +24,8 @@ from pans.runtime.wire.bare import bare, copy_span, load4
 from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, MessageType
 
-from . import rings as ring
-from .shows import IS_ODD, IS_REFUSED, send_show, take_ack
+from . import state as ring
+from .answer import IS_ODD, IS_REFUSED, send_show, take_ack
 from .system import AGAIN, INTERRUPTED, now_ns, read_now, wait_for
 
 

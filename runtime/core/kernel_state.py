@@ -30,7 +30,7 @@ _LARGEST = (1 << 62) - 1
 Rows = npt.NDArray[np.void]
 
 
-class BulkSteps:
+class CoreState:
     """What the kernel continues of `core` (a still.Core), whose windows are `windows`; all memory is allocated here, before arming."""
 
     def __init__(self, core: Any, windows: DecisionWindows, plan: Plan, decider: Decider, shots: int) -> None:

@@ -4,6 +4,6 @@ Owns the kernels that wait, read, decide and answer by themselves, and their mem
 (live/run.py), whose decisions they give bit for bit. live/compiled.py uses it.
 """
 
-from .engine import StreamCore, Turn
+from .calls import Kernel, StreamCore
 
-__all__ = ["StreamCore", "Turn"]
+__all__ = ["Kernel", "StreamCore"]

@@ -1,6 +1,6 @@
 """The memory of a compiled turn: what goes into a call, what both ends keep, and the rings that a call fills.
 
-Owns the shapes and what their columns mean; kernels.py fills the rings, `Turn` (engine.py) reads them.
+Owns the shapes and what their columns mean; kernels.py fills the rings, `Kernel` (engine.py) reads them.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from numba import types
 
 from pans.runtime.wire.inner import inner, outer
 
-from .rings import I64, U8
+from .state import I64, U8
 
 # perf_counter_ns, which stamps everything else, reads the same clock: CLOCK_MONOTONIC, on macOS CLOCK_UPTIME_RAW
 _CLOCK = np.int32(8 if sys.platform == "darwin" else 1)

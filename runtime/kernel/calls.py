@@ -1,4 +1,4 @@
-"""`Turn`: one connection's compiled turns, from bytes to rows, for a core whose steps are compiled.
+"""`Kernel`: one connection's compiled turns, from bytes to rows, for a core whose steps are compiled.
 
 Owns the arrays between Python and the kernels, and the hand-over of the core's state in each call; never opens, records or judges. `run`
 says why it ended; what came stands in properties that are valid until the next `run`.
@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core import stream_kernels as core_kernels
-from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.decision import DECISION_DTYPE, CoreEvent, Output
+from pans.runtime.core.kernel_state import CoreState
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.stream_kernels import DecisionTables
@@ -25,8 +25,8 @@ from pans.runtime.wire.messages import Mark, MessageType, decode_mark
 from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES
 
-from . import rings as ring
-from .rings import I64, U8, Decoder, Drive, Rings, make_rings, no_drive
+from . import state as ring
+from .state import I64, U8, Decoder, Drive, Rings, make_rings, no_drive
 
 NO_END = 1 << 62
 Bytes = bytes | bytearray | memoryview | U8
@@ -58,7 +58,7 @@ class Counts(NamedTuple):
 
 
 class Steps(Protocol):
-    """The compiled steps of a core (core.bulk_steps.BulkSteps, flow.core.FlowCore): they lend its state to kernels and take it back.
+    """The compiled steps of a core (core.kernel_state.CoreState, flow.core.FlowCore): they lend its state to kernels and take it back.
 
     `walk` is a tuple of arrays of its own class, for which kinds.py has the kernels; its `state` begins with the columns of
     core/stream_kernels.py, its `rows` are decisions. `block_rows` are most of one block. `takes`: messages may be
@@ -89,11 +89,11 @@ _NOTHING = Counts(*[0] * len(Counts._fields))
 _MARK = int(MessageType.MARK)
 
 
-class Turn:
+class Kernel:
     """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming."""
 
     def __init__(self, steps: Steps, decoder: BulkDecoder, drive: Drive | None = None) -> None:
-        from .kernels import turn  # numba is loaded only by who decides in bulk
+        from .receive import turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
         self.rings: Rings = make_rings()
@@ -262,13 +262,13 @@ class StreamCore:
 
     def _take_over(self, core: Core, session: int) -> None:
         self.core, self.decoder, self.wrong_session, self._session = core, BulkDecoder(), 0, session
-        self.turn = Turn(core.steps(session), self.decoder)
+        self.turn = Kernel(core.steps(session), self.decoder)
 
     @property
     def tables(self) -> DecisionTables:
         """What decides without asking the back end."""
         steps = self.core.steps(self._session)
-        assert isinstance(steps, BulkSteps)
+        assert isinstance(steps, CoreState)
         return steps.tables
 
     def warm_up(self) -> None:
