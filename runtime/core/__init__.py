@@ -1,8 +1,8 @@
-"""The deterministic core for objects that stand still: plan, windows of shots, one frame in, decisions out.
+"""The decisions on objects that stand still: a plan, its windows of shots, one message in, decisions and events out.
 
-Owns what is exposed when, which exposures belong to which decision, what a gap does to it, and what the state of the detector does to it.
-It does no input or output, reads no clock and draws no random number, so that a live run, a replay and a simulation give the same
-decisions bit for bit. Objects in flow are handled by the package flow, which builds on this package.
+In come a profile, a bundle and stream messages; out come a `Plan` (`build_plan`) and the outputs of a `Core`. There is no input or
+output, no clock and no random number, so that a live run, a replay and a simulation give the same decisions bit for bit. Start with
+plan.py, then follower.py (what every core does with a stream) and still.py. Objects in flow are in the package flow.
 
 >>> from importlib.resources import files
 >>> from pans.runtime.bundle import load_bundle

@@ -1,7 +1,6 @@
 """What a calibration shows, counts and says: random binary patterns on a clear field, dark slots, the core that adds up their clicks.
 
-Owns the design (exposure, lit pixels, plan), the sums, and the choice of what is reported and when patterns are taken to differ; the
-session is live/loop.py's, the estimate instrument/estimate.py's, the file instrument/calibration.py's. Two stages: a
+The estimate is instrument/estimate.py's, the file instrument/calibration.py's. Two stages: a
 short ladder of drives from far too dim to far too bright, then drives around 1.6 expected photoelectrons, where clicks tell
 most of the level per exposure (the information `n lambda^2 / (exp(lambda) - 1)` is greatest at 1.59).
 

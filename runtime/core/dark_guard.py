@@ -1,11 +1,10 @@
 """From dark exposures to consequences: the watch, what it means, and what the policy does about it, for one core.
 
-Owns the policies; never counts (instrument/cusum.py), names (instrument/channel_health.py) or computes tables (dark_tables.py). The
-same blocks give the same findings and the same decisions, live and in a replay. A core gives it every block, asks `flags` and
-`decider` for every decision, and passes its findings on.
+Changes are found by instrument/cusum.py and named by instrument/channel_health.py. The same blocks give the same findings and the same
+decisions, live and in a replay. A core gives it every block, asks `flags` and `decider` for every decision, and passes its findings on.
 
 Policies: `warn` tells and changes no decision; `tables` decides with a table for the present dark rates, without dead channels; `mask`
-leaves channels out that are hot, quiet or dead; both abstain where all are left out, or more than can be done (dark_tables.py);
+leaves channels out that are hot, quiet or dead; both abstain where all are left out, or more than can be done;
 `abstain` gives no label while a warning or an alarm lasts. Decisions made meanwhile carry DARK_ALARM, but for `warn`.
 """
 

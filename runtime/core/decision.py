@@ -1,8 +1,4 @@
-"""What a core says: decisions with their flags, the passages and pulses that belong to them, and the output of one step.
-
-Owns the vocabulary that cores, recordings, reports and the live run share, the row of the decision log, and the run and the verdict that it
-is made of; never decides.
-"""
+"""What a core gives: decisions with their flags, passages and pulses, the output of one step, and the rows of the decision log."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What every core does with a stream: order, gaps, marks, the end.
+"""What every core does with a stream: order, gaps, marks, contradictions with the plan, the end.
 
-Owns one stream from ARM to its end and what is remembered of it; never decides: `core.Core` does so for objects that stand still and
-`flow.FlowCore` for those that pass by. `step` returns an `Output` for one frame, `begin` and `end` for what a stream leaves open.
+`step` takes one message and returns an `Output`; `begin` and `end` settle what a stream leaves open. `core.Core` decides on objects that
+stand still, `flow.FlowCore` on those that pass by.
 """
 
 from __future__ import annotations

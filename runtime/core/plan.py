@@ -1,13 +1,12 @@
 """Plan: what is exposed when, in device ticks, and whether this hardware can do it at all.
 
-Owns the order and times of the exposures of one cycle and the refusal of what the profile cannot do, with the numbers; never talks
-to a device. `build_plan` returns a `Plan` or raises PlanError. A plan repeats one *cycle* of slots, one exposure each:
+`build_plan` returns a `Plan` or raises PlanError. A plan repeats one *cycle* of slots, one exposure each:
 
 - **shot-major** (sequential): every pattern once, one exposure each; a cycle is one shot, an object takes `shots_per_object` cycles.
 - **pattern-major** (sequential, the paper's protocol): every pattern is displayed once and exposed `shots_per_object` times in a
   row, within a whole number of refresh periods of the projector; a cycle is one object.
 - **parallel**: all patterns shine at once, a slot exposes all channels (its pattern index is 0); a cycle is one object, its
-  frames are the shots. For objects in flow, flow/plan.py lays out frames without end.
+  frames are the shots. For objects in flow, flow/make.py lays out frames without end.
 
 - **walks** (sequential, of an automaton): one exposure for each step of the longest walk, its pattern chosen by the clicks before it;
   a cycle is one walk, an object takes `shots_per_object` walks. What is left of a cycle behind a leaf is dark.

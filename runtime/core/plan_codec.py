@@ -1,7 +1,4 @@
-"""A plan as the commands that a device is sent, and back: LOAD_PLAN, READ_COUNTS, and LOAD_STATES or LOAD_COUNT_STATES.
-
-Owns the conversion; never sends anything. The bodies are laid out in wire/commands.py.
-"""
+"""A plan as the commands that a device is sent, and back: LOAD_PLAN, READ_COUNTS, and LOAD_STATES or LOAD_COUNT_STATES."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Exposures -> windows: the K-shot click counts of each object, complete or reported incomplete, in a fixed order.
 
-Owns which exposure belongs to which window; never decides. `DecisionWindows.push` returns the windows that a block completes or
-that can no longer become complete; each exposure is counted once, in a kernel of window_kernels.py, and dark slots are tallied apart.
+`DecisionWindows.push` returns the windows that a block completes or
+that can no longer become complete; each exposure is counted once, and dark slots are tallied apart.
 
 A *visit* is the time one object stands before the detector (`cycles_per_object` cycles); its shots are grouped by K into windows. With an
 automaton a window is one walk, and a cycle holds one: its clicks so far say which state each exposure must have shown.

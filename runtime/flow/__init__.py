@@ -1,8 +1,8 @@
-"""The core for objects in flow, cells or a tape of bars: onset, best window, release, and the pulses asked for.
+"""The decisions on objects in flow, cells or a tape of bars: onset, best window, release, and the pulses that are asked for.
 
-Owns the search for passages in a stream of frames, one decision for each, and the comparison of decisions with the device's marks
-afterwards. Like core it does no input or output and reads no clock; pulses are sent by live. `make_flow_core` makes the core that a flow's
-settings (`read_flow`) ask for, `build_flow_plan` its plan.
+In come settings (`read_flow`), a bundle and stream messages; out come a plan (`build_flow_plan`), a core (`make_flow_core`) and its
+outputs. Like core it does no input or output and reads no clock; live sends the pulses. Start with core.py; kernels.py has the loops over
+frames.
 """
 
 from .core import FlowCore

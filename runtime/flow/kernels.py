@@ -1,8 +1,8 @@
 """The kernels of a flow: frames into a ring, onsets and releases, the windows that are decided on, rows of the decision log out.
 
-`take_message` is the kernel's case for a flow (turn/kinds.py); `settle` does the same for frames that `FlowCore` has put into the ring by
-itself, behind a gap, say. Whatever is not ordinary, `take_message` leaves untouched. A table decides here; of any other back end the
-clicks of the window are kept, and the row waits for its verdict. Nothing is allocated.
+`take_message` is the kernel's case for a flow (kernel/receive.py); `settle` does the same for frames that `FlowCore` has put into the
+ring by itself, behind a gap, say. Whatever is not ordinary, `take_message` leaves untouched. A table decides here; of any other back end
+the clicks of the window are kept, and the row waits for its verdict. Nothing is allocated.
 
 The ring holds the last frames by exposure number modulo its length, a power of two: `words` uint64 (ring,) (bit c is channel c) and
 `counts` int16 (ring,) clicks, -1 for a dark frame and -2 for one that never came. tests/oracles/naive_flow.py has the loops in plain words.

@@ -1,6 +1,6 @@
-"""From settings to the core of a flow: cells or a tape.
+"""From the settings of a flow to its plan and its core, with the checks against hardware and bundle.
 
-Owns the choice and the checks against the bundle; `make_flow_core` returns a core with the shape of core.Core.
+A cycle of the plan is one block of frames of all channels; frames run without end, and the device ends a block at the end of a cycle.
 """
 
 from __future__ import annotations

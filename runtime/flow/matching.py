@@ -1,7 +1,6 @@
 """What the decisions about passing objects were worth: they are matched with the MARKs that tell the truth, afterwards.
 
-Owns counts of marks that were decided, missed, doubled, in coincidence or in a gap, and of pulses that met their target; never takes part
-in a decision. `PassageMatcher.figures` returns the figures with 95 % Wilson intervals. Memory is bounded: a mark is settled when no
+`PassageMatcher.figures` returns the figures with 95 % Wilson intervals. Memory is bounded: a mark is settled when no
 decision can reach it any more.
 
 A mark's object is in the field from `half_exposures` before its centre to as many after it. Two marks whose times in the field overlap

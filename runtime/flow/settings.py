@@ -1,7 +1,7 @@
-"""How objects in flow are told apart and acted upon: the settings of a flow, checked, as TOML or as a recording's header holds them.
+"""The settings of a flow, checked, as TOML or a recording's header holds them.
 
-Owns the names, limits and defaults; never decides. `read_flow` returns `FlowSettings` from a TOML file or a shipped name; `flow_limits`
-turns them, a plan and a dark rate into the whole numbers that the kernels count with.
+`read_flow` returns `FlowSettings` from a TOML file or a shipped name; `flow_limits` turns them, a plan and a dark rate into the whole
+numbers that the kernels count with.
 """
 
 from __future__ import annotations

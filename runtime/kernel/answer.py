@@ -1,7 +1,7 @@
-"""The host's answer to a block, compiled: where the walk goes on, the SHOW command that names it, its bytes, its acknowledgement.
+"""The host's answer to a block: where the walk continues, the SHOW command that names it, its bytes, its acknowledgement.
 
-Owns the compiled twins of live/drive.py (which state follows), wire/framing.py (COBS and CRC of one short frame) and of the ordinary case
-of an acknowledgement in wire/session.py. Never allocates.
+The kernel's form of live/drive.py (which state follows), of wire/framing.py for one short frame and of the ordinary acknowledgement in
+wire/session.py. It never allocates.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""`Kernel`: one connection's compiled turns, from bytes to rows, for a core whose steps are compiled.
+"""`Kernel`: the calls of one connection's kernel, from bytes to rows; `StreamCore` does without a live run.
 
-Owns the arrays between Python and the kernels, and the hand-over of the core's state in each call; never opens, records or judges. `run`
-says why it ended; what came stands in properties that are valid until the next `run`.
+`run` and `feed` say why a call ended; what came stands in properties that are valid until the next call. A replay, the benches and the
+tests drive a core by `StreamCore`.
 """
 
 from __future__ import annotations

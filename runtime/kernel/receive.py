@@ -1,7 +1,8 @@
-"""The turn as one compiled call: wait, read, resynchronise, check, decide, name the next state, keep what came.
+"""One call of the kernel: wait, read, resynchronise, check, decide, name the next state, keep what came.
 
 It continues by itself with all that is ordinary and leaves the rest, untouched and in its place, to the caller. Bytes are decoded by
-wire/kernels.py, messages taken by core/stream_kernels.py, commands written by shows.py. It never allocates.
+wire/kernels.py, messages taken by the kernel of the core's kind (core/stream_kernels.py, flow/kernels.py), commands written by answer.py.
+It never allocates.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The memory of a compiled turn: what goes into a call, what both ends keep, and the rings that a call fills.
-
-Owns the shapes and what their columns mean; kernels.py fills the rings, `Kernel` (engine.py) reads them.
-"""
+"""The arrays of the kernel: what goes into a call, what both ends keep, and the rings that a call fills."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The shell around the core while a device runs: one turn after the other, what is late and why, and how a run ends.
+"""A run on a device that is open: it receives, decides, acts, records and ends; it reconnects when the device is lost.
 
-Owns the live loop, reconnection and pulses. It decides nothing itself (core, flow), judges
-no file (report) and reads no argument (commands). `run_live` takes an open link and a core and returns a `RunResult`.
+In come a link, a plan, a core and `RunOptions`; out comes a `RunResult` (`run_live`). Start with loop.py (the whole run), then run.py (one
+iteration) and receiver.py (what a call of the kernel brought). Decisions are the core's, verdicts the report's.
 """
 
 from .config import RunResult

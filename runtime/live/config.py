@@ -1,4 +1,4 @@
-"""What comes out of a live run, and the calls that a run makes of a core and of what takes its turns. What goes in is run_options.py."""
+"""What comes out of a live run, and what a run needs of its receiver. What goes in is run_options.py."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""Running for days: recordings in parts, and how a signal ends the run.
+"""How a signal ends a run, and the recorder of a run for days.
 
-Owns the handlers of signals while a run lives; who watches it is watch's. A signal becomes a word that the loop reads at the end of its
-turn, so that nothing is cut in its middle; while the loop does not look (setting up, waiting for a lost device, the second time) the signal
-interrupts as Ctrl-C does.
+A signal becomes a word that the loop reads at the end of an iteration, so that nothing is cut in its middle; while the loop does not look
+(setting up, waiting for a lost device, the second time) the signal interrupts as Ctrl-C does.
 """
 
 from __future__ import annotations

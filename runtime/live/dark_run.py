@@ -1,8 +1,4 @@
-"""Calibration and dark counts of one run: the guard that its settings ask for, what the recording and the summary say.
-
-Owns the joining alone: the file is calibration.py's, the watch cusum.py's, consequences dark_guard.py's. A replay makes the same guard
-from the recording's header (`recorded_guard`).
-"""
+"""Calibration and dark counts of one run: the guard that its options ask for, what the recording and the summary say."""
 
 from __future__ import annotations
 

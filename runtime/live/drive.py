@@ -1,8 +1,6 @@
-"""The host's turn in a run that it drives: after each exposure the next state's name leaves at once.
+"""What a host that drives an automaton sends: after each exposure the name of the next state (SHOW), at once.
 
-Owns which exposure comes next, what is sent (SHOW) and how long each turn takes; where a walk stands the core says, and what is late the
-stamps say. All bodies but
-their exposure are packed before arming, so that a turn is one look at the walk, one pack and one write.
+All bodies but their exposure are packed before arming, so that an answer is one look at the walk, one pack and one write.
 """
 
 from __future__ import annotations

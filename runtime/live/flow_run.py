@@ -1,7 +1,4 @@
-"""A run with passing objects: core and gates joined, what compiled turns brought of it, and what came of it all.
-
-`FlowReceiver` settles what a call of the kernel brought of a flow; `FlowRun` holds the actuator and makes the flow's part of the summary.
-"""
+"""A run with passing objects: what a call of the kernel brought of a flow, the actuator, and the flow's part of the summary."""
 
 from __future__ import annotations
 
@@ -99,32 +96,32 @@ class FlowReceiver(Receiver):
 
     _outputs: Sequence[Output] = ()
 
-    def _settle_marks(self, turn: Kernel) -> None:
-        if not turn.counts.steps:
-            super()._settle_marks(turn)
+    def _settle_marks(self, kernel: Kernel) -> None:
+        if not kernel.counts.steps:
+            super()._settle_marks(kernel)
 
-    def _record(self, turn: Kernel) -> None:
+    def _record(self, kernel: Kernel) -> None:
         """Record decisions, too, and send the pulses that they ask for: before all else, since their time runs."""
-        super()._record(turn)
-        run, steps = self._run, turn.steps
-        if turn.counts.steps and not steps.decides:
-            self._outputs = list(settled_blocks(turn))  # the back end decides
-            turn.blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
+        super()._record(kernel)
+        run, steps = self._run, kernel.steps
+        if kernel.counts.steps and not steps.decides:
+            self._outputs = list(settled_blocks(kernel))  # the back end decides
+            kernel.blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
         assert isinstance(steps, FlowCore)
-        if turn.counts.steps and run.recorder is not None:
-            run.recorder.add_decisions(turn.rows)
-        if turn.counts.steps and (pulses := steps.pulses(len(turn.rows))):
+        if kernel.counts.steps and run.recorder is not None:
+            run.recorder.add_decisions(kernel.rows)
+        if kernel.counts.steps and (pulses := steps.pulses(len(kernel.rows))):
             run.gates.take(pulses)
             run.pulse()
 
-    def _settle_blocks(self, turn: Kernel, outputs: list[Output]) -> None:
-        run, blocks, rows, steps = self._run, turn.blocks, turn.rows, turn.steps
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
+        run, blocks, rows, steps = self._run, kernel.blocks, kernel.rows, kernel.steps
         assert isinstance(steps, FlowCore)
-        for output in settled_blocks(turn) if steps.decides else self._outputs:
+        for output in settled_blocks(kernel) if steps.decides else self._outputs:
             for event in output.events:
                 run.journal.take(event)
             outputs.append(output)
-        self._ends_of(turn)
+        self._ends_of(kernel)
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
         if len(rows):
             run.tally.add_rows(rows, np.full(len(rows), np.nan, np.float32))  # a passage's number is no mark's
@@ -134,15 +131,15 @@ class FlowReceiver(Receiver):
             run.account_times(int(rows["index"][0]), np.ones(len(rows), np.int64), ends_ns, unsure_ns, stamps)
 
 
-def settled_blocks(turn: Kernel) -> Iterator[Output]:
+def settled_blocks(kernel: Kernel) -> Iterator[Output]:
     """Let the core of a flow see what a call brought; yield what came of each block of which something came."""
-    steps, blocks = turn.steps, turn.blocks
+    steps, blocks = kernel.steps, kernel.blocks
     assert isinstance(steps, FlowCore)
     core = steps
     by_block = core.guard is not None and not core.watches_empty  # it wants to see every block
-    behind, row = _blocks_behind(turn), 0
+    behind, row = _blocks_behind(kernel), 0
     empty = {told[0]: told for told in core.told_empty()}
-    marks = _marks_of(turn)
+    marks = _marks_of(kernel)
     decided = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
     some = decided | np.isin(behind, list(empty)) | by_block
     decided[-1] = some[-1] = True
@@ -152,7 +149,7 @@ def settled_blocks(turn: Kernel) -> Iterator[Output]:
             core.remember(marks.pop()[1])
         following = int(behind[block])
         if decided[block] or by_block:
-            frames = decode_frames(_payload(turn, place - 1)) if by_block else None
+            frames = decode_frames(_payload(kernel, place - 1)) if by_block else None
             yield core.account(slice(row, stop), following, end_tick, empty.get(following), frames)
             row = stop
             continue
@@ -163,19 +160,19 @@ def settled_blocks(turn: Kernel) -> Iterator[Output]:
         core.remember(marks.pop()[1])
 
 
-def _blocks_behind(turn: Kernel) -> npt.NDArray[np.int64]:
+def _blocks_behind(kernel: Kernel) -> npt.NDArray[np.int64]:
     """Return the exposure that follows each block of a call, int64 (n,)."""
-    begins = turn.rings.messages[turn.blocks[:, ring.MESSAGES] - 1, ring.BEGIN] + HEADER.size
-    first = turn.kept[begins[:, None] + np.arange(16, 24)].view("<u8")[:, 0]
-    count = turn.kept[begins[:, None] + np.arange(28, 30)].view("<u2")[:, 0]
+    begins = kernel.rings.messages[kernel.blocks[:, ring.MESSAGES] - 1, ring.BEGIN] + HEADER.size
+    first = kernel.kept[begins[:, None] + np.arange(16, 24)].view("<u8")[:, 0]
+    count = kernel.kept[begins[:, None] + np.arange(28, 30)].view("<u2")[:, 0]
     return first.astype(np.int64) + count
 
 
-def _marks_of(turn: Kernel) -> list[tuple[int, Mark]]:
+def _marks_of(kernel: Kernel) -> list[tuple[int, Mark]]:
     """Return the marks of a call, the first one last, each with its place among the ring's messages."""
-    places = np.flatnonzero(turn.messages[:, ring.WHAT] == int(MessageType.MARK))
-    return [(place, decode_mark(_payload(turn, place))) for place in places[::-1].tolist()]
+    places = np.flatnonzero(kernel.messages[:, ring.WHAT] == int(MessageType.MARK))
+    return [(place, decode_mark(_payload(kernel, place))) for place in places[::-1].tolist()]
 
 
-def _payload(turn: Kernel, place: int) -> bytes:
-    return turn.bytes_of(turn.rings.messages[place])[HEADER.size :]
+def _payload(kernel: Kernel, place: int) -> bytes:
+    return kernel.bytes_of(kernel.rings.messages[place])[HEADER.size :]

@@ -1,12 +1,11 @@
 """Acting on decisions: pulses at absolute device ticks, on time or not at all.
 
-Owns the queue of pulses that wait for room in the session, what became of each, and the actuators other than the instrument's own output.
-Never decides. A pulse whose tick has passed, or will have before the command can be there, is not sent: it expires, as an event. What is
-acted upon is on record before its command leaves. The instrument refuses what comes too late; that is an event too.
+A pulse whose tick has passed, or will have before the command can be there, is not sent: it expires, as an event. What is acted upon is on
+record before its command leaves. The instrument refuses what comes too late; that is an event too.
 
-`--act` may name a second instrument (second_device.py): a pulse's tick is then converted to the host's time and on to the other
-clock's tick, and what both conversions may be off stands in the event beside it. An actuator of a laboratory's own is found by
-entry point (`pans.actuators`): a function from the URL's rest to an object with `fire` and `close`, see docs/how-to/flow.md.
+`--act` may name a second instrument: a pulse's tick is then converted to the host's time and on to the other clock's tick, and what both
+conversions may be off stands in the event beside it. An actuator of a laboratory's own is found by entry point (`pans.actuators`): a
+function from the URL's rest to an object with `fire` and `close`, see docs/how-to/flow.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """What a live run notes beside its clicks: events, the session it belongs to, the clock's probes and jumps, refused gates.
 
-Owns the short list of events that a summary shows and the way of all of them into the recording; never judges one. Without a
-recorder only the list is kept.
+A short list of events is for the summary; all of them go into the recording, where there is one.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """The live loop: from an open device to timed, recorded decisions. One screen, in the order in which data flows.
 
-    handshake -> check -> upload -> clock -> [arm] -> pump -> core.step -> judge the timing -> record -> show -> ... -> stop -> close
+    handshake -> check -> upload -> clock -> [arm] -> kernel -> settle: tally, clock, record -> act -> report -> ... -> stop -> close
                      ^----------- reconnect (bounded) <---- the link broke, the device fell silent or went dark
 
-Owns the order of things and the ends of a run; a turn is run.py's, an outage reconnect.py's, and the physics, the protocol and the
-decisions live in the modules that they call. `run_live` returns a `RunResult`, also when the link is lost for good (`link_lost`); a
+An iteration is run.py's, an outage reconnect.py's. `run_live` returns a `RunResult`, also when the link is lost for good (`link_lost`); a
 device that cannot be armed raises LinkError. However a run ends, the device is told to stop; one that cannot be told goes dark when
 its lease runs out.
 """
@@ -206,7 +205,7 @@ def _until_ended(
     while not run.ended:
         try:
             stop.polled = True
-            run.turn(observers.watch)
+            run.iterate(observers.watch)
             run.ended = run.ended or stop.word
             stop.polled = False
         except LinkError as error:

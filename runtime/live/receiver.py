@@ -1,4 +1,4 @@
-"""Receives the bytes of a run: calls the kernel (turn/), then settles what came in the call, once its commands have left.
+"""Receives the bytes of a run: calls the kernel (package kernel), then settles what came in the call, once its commands have left.
 
 `Receiver.receive` returns the outputs of what came: decisions in rows, events, the tick at which the last exposure ended. The kernel takes
 what is ordinary; any other message is given to `LiveRun.take_frame`, which continues the same state.
@@ -67,7 +67,7 @@ class Receiver:
 
     def __init__(self, run: LiveRun, core: Follower, *, prompt: bool) -> None:
         self._run, self._core, self._prompt = run, core, prompt
-        self._turn: Kernel | None = None
+        self._kernel: Kernel | None = None
         self._attached: Connection | None = None
         self._fd: int | None = None
         self._stamps_itself = True  # whether the kernel's times are the link's
@@ -76,10 +76,10 @@ class Receiver:
 
     def next_id(self) -> int:
         """Let a call that is under way end, from any thread; return the id that follows those of the commands that it has sent."""
-        if self._turn is None:
+        if self._kernel is None:
             return 0
-        self._turn.stop()
-        return int(self._turn.control[ring.NEXT_ID])
+        self._kernel.stop()
+        return int(self._kernel.control[ring.NEXT_ID])
 
     def prepare(self) -> None:
         """Attach the kernel to the run's present connection, once; kernels are compiled or loaded."""
@@ -90,36 +90,36 @@ class Receiver:
         nonce, bulk = run.connection.session.nonce, run.connection.decoder.bulk
         assert bulk is not None
         drive = None if run.driver is None else run.driver.arrays(nonce)
-        self._turn = Kernel(self._core.steps(nonce), bulk, drive)
-        self._turn.warm_up()
-        self._warm_up(self._turn)
+        self._kernel = Kernel(self._core.steps(nonce), bulk, drive)
+        self._kernel.warm_up()
+        self._warm_up(self._kernel)
         link = run.connection.link
         self._fd = None if why_fed(link) else descriptor_of(link)
         self._stamps_itself = has_host_clock(link)
 
-    def _warm_up(self, turn: Kernel) -> None:
+    def _warm_up(self, kernel: Kernel) -> None:
         """Compile or load what settles a call."""
 
     def receive(self, poll_s: float) -> list[Output]:
         """Wait for bytes, decide on them and answer until something is due; return what came of it."""
         run, outputs = self._run, list[Output]()
-        connection, turn = run.connection, self._turn
-        assert turn is not None
+        connection, kernel = run.connection, self._kernel
+        assert kernel is not None
         if self._fd is not None and connection.reader.lend():
             try:
                 asked = connection.send_due()
-                self._load(turn)
-                ended = self._sent(turn, turn.run(self._fd, self._limits(eager=asked)))
+                self._load(kernel)
+                ended = self._sent(kernel, kernel.run(self._fd, self._limits(eager=asked)))
             finally:
                 connection.reader.take_back()
-            self._settle(turn, outputs)
-            if turn.counts.notes or turn.counts.arrivals:
-                self._note(turn)
-            self._continue(turn, ended, outputs, turn.run)
+            self._settle(kernel, outputs)
+            if kernel.counts.notes or kernel.counts.arrivals:
+                self._note(kernel)
+            self._continue(kernel, ended, outputs, kernel.run)
             if ended == ring.GONE:
-                self._ask_why(turn)
+                self._ask_why(kernel)
         elif chunks := self._gathered(poll_s):
-            self._feed(turn, chunks, outputs)
+            self._feed(kernel, chunks, outputs)
         connection.take_pongs()
         run.raise_broken()
         if not outputs:
@@ -135,13 +135,13 @@ class Receiver:
 
     def rest(self) -> None:
         """Take what has arrived on a connection that is given up; nothing is sent."""
-        run, turn = self._run, self._turn
-        if turn is None or self._attached is not run.connection or run.connection is not run.armed:
+        run, kernel = self._run, self._kernel
+        if kernel is None or self._attached is not run.connection or run.connection is not run.armed:
             run.connection.rest()
             return
         if chunks := run.connection.reader.rest():
             self._gives_up = True
-            self._feed(turn, chunks, [])
+            self._feed(kernel, chunks, [])
             self._gives_up = False
 
     # -- before a call -------------------------------------------------------------------------------------------------
@@ -154,9 +154,9 @@ class Receiver:
         patience_ns = run.lateness.patience_ns
         return Limits(due_ns, patience_ns, EAGER_NS if eager else 0, budget, run.lateness.evidence.floor_ns)
 
-    def _load(self, turn: Kernel) -> None:
+    def _load(self, kernel: Kernel) -> None:
         """Put what Python knows of the stream, the session and the driver where the kernel looks for it."""
-        run, control, driver = self._run, turn.control, self._run.driver
+        run, control, driver = self._run, kernel.control, self._run.driver
         next_id, oldest_id, oldest_ns, waiting = run.connection.session.window
         drives = driver is not None and not run.stops and not run.is_broken and not self._gives_up
         control[ring.DRIVES : ring.WAITING + 1] = (drives, waiting)
@@ -178,29 +178,29 @@ class Receiver:
 
     # -- after a call --------------------------------------------------------------------------------------------------
 
-    def _feed(self, turn: Kernel, chunks: Sequence[tuple[int, bytes]], outputs: list[Output]) -> None:
+    def _feed(self, kernel: Kernel, chunks: Sequence[tuple[int, bytes]], outputs: list[Output]) -> None:
         """Take what Python has read."""
-        self._load(turn)
-        ended = self._sent(turn, turn.feed(chunks))
-        self._settle(turn, outputs)
+        self._load(kernel)
+        ended = self._sent(kernel, kernel.feed(chunks))
+        self._settle(kernel, outputs)
         if not self._run.connection.link.virtual:
-            self._note(turn)
-        self._continue(turn, ended, outputs, turn.feed_on)
+            self._note(kernel)
+        self._continue(kernel, ended, outputs, kernel.feed_on)
 
-    def _continue(self, turn: Kernel, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
+    def _continue(self, kernel: Kernel, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
         """Deal with what ended a call until nothing that was read is left; no more is read."""
         while ended in (ring.ODD, ring.FULL, ring.BROKEN):
             if ended == ring.ODD:
-                self._take_odd(turn, outputs)
-            self._load(turn)
+                self._take_odd(kernel, outputs)
+            self._load(kernel)
             self._run.report(outputs)  # before the rings are filled anew
-            ended = self._sent(turn, again())
-            self._settle(turn, outputs)
+            ended = self._sent(kernel, again())
+            self._settle(kernel, outputs)
 
-    def _take_odd(self, turn: Kernel, outputs: list[Output]) -> None:
+    def _take_odd(self, kernel: Kernel, outputs: list[Output]) -> None:
         """Let Python take one message that is not ordinary."""
-        run, arrival_ns = self._run, turn.arrival_ns
-        connection, frame = run.connection, turn.take_odd()
+        run, arrival_ns = self._run, kernel.arrival_ns
+        connection, frame = run.connection, kernel.take_odd()
         if frame.type in STREAM_TYPES and frame.session == connection.session.nonce:
             connection.session.heard_ns = arrival_ns
             connection.delivered += 1
@@ -208,44 +208,44 @@ class Receiver:
         elif connection.sort(frame, arrival_ns):
             run.take_frame(arrival_ns, frame, outputs)
 
-    def _sent(self, turn: Kernel, ended: int) -> int:
+    def _sent(self, kernel: Kernel, ended: int) -> int:
         """Send what is left of a command that the kernel could not send whole, all of it without a descriptor; return `ended`."""
         if ended == ring.BROKEN:
-            last, unsent = turn.shows[-1], turn.counts.unsent
+            last, unsent = kernel.shows[-1], kernel.counts.unsent
             try:
-                self._run.connection.link.write(turn.bytes_of(last)[-unsent:])
+                self._run.connection.link.write(kernel.bytes_of(last)[-unsent:])
                 last[ring.TIME], self._asked = self._run.now_ns(), True
-                if turn.control[ring.OLDEST_ID] == turn.control[ring.NEXT_ID] - 1:
-                    turn.control[ring.OLDEST_NS] = last[ring.TIME]
+                if kernel.control[ring.OLDEST_ID] == kernel.control[ring.NEXT_ID] - 1:
+                    kernel.control[ring.OLDEST_NS] = last[ring.TIME]
             except LinkError as error:
                 self._run.note_broken(error)
         return ended
 
-    def _ask_why(self, turn: Kernel) -> None:
+    def _ask_why(self, kernel: Kernel) -> None:
         """The descriptor says that the other end is gone: the link says it in its words."""
-        link, errno = self._run.connection.link, turn.counts.errno
+        link, errno = self._run.connection.link, kernel.counts.errno
         try:
             self._run.connection.reader.wait(0.0)
             raise LinkError(f"{link.name} went away: {os.strerror(errno) if errno else 'closed by the other end'}")
         except LinkError as error:
             self._run.note_broken(error)
 
-    def _note(self, turn: Kernel) -> None:
+    def _note(self, kernel: Kernel) -> None:
         """Give what a call has waited for, and long decisions, to the evidence of what makes work late, in the order of time."""
-        evidence, blocks = self._run.lateness.evidence, turn.blocks
+        evidence, blocks = self._run.lateness.evidence, kernel.blocks
         worked = blocks[blocks[:, ring.DECIDED] - blocks[:, ring.DECODED] >= evidence.floor_ns]
         spans = [(ended, began, -1) for began, ended in worked[:, ring.DECODED : ring.DECIDED + 1].tolist()]
-        spans += [(ended, began, asked) for began, asked, ended, _ in turn.notes.tolist()]
+        spans += [(ended, began, asked) for began, asked, ended, _ in kernel.notes.tolist()]
         for ended, began, asked in sorted(spans) if len(worked) else spans:
             if asked < 0:
                 evidence.worked(INFERENCE, began, ended)
             else:
                 evidence.waited(began, (asked - began) / NS_PER_S, ended)
-        evidence.arrived(*turn.arrivals.tolist())
+        evidence.arrived(*kernel.arrivals.tolist())
 
-    def _settle(self, turn: Kernel, outputs: list[Output]) -> None:
+    def _settle(self, kernel: Kernel, outputs: list[Output]) -> None:
         """Account for what a call took and sent: session, driver, marks, recording, decisions."""
-        run, counts = self._run, turn.counts
+        run, counts = self._run, kernel.counts
         if not counts.kept:
             return
         connection = run.connection
@@ -253,61 +253,61 @@ class Receiver:
         connection.delivered += counts.messages
         connection.answers += counts.answers
         run.taken_here += counts.messages
-        if turn.control[ring.DRIVES] and (counts.shows or counts.answers):
-            self._settle_commands(turn)
-        self._stamp(turn)
+        if kernel.control[ring.DRIVES] and (counts.shows or counts.answers):
+            self._settle_commands(kernel)
+        self._stamp(kernel)
         if counts.messages > counts.steps:
-            self._settle_marks(turn)
-        self._record(turn)
+            self._settle_marks(kernel)
+        self._record(kernel)
         if counts.steps:
-            self._settle_blocks(turn, outputs)
+            self._settle_blocks(kernel, outputs)
 
-    def _stamp(self, turn: Kernel) -> None:
+    def _stamp(self, kernel: Kernel) -> None:
         """Set the times of the blocks where the kernel has another clock than the link; in virtual time none passes in between."""
         if not self._stamps_itself:
-            blocks, link = turn.blocks, self._run.connection.link
+            blocks, link = kernel.blocks, self._run.connection.link
             blocks[:, ring.DECODED : ring.RECORDED + 1] = (
                 blocks[:, ring.ARRIVAL, None] if link.virtual else link.now_ns()
             )
 
-    def _record(self, turn: Kernel) -> None:
+    def _record(self, kernel: Kernel) -> None:
         """Record what a call took and sent."""
-        recorder, counts = self._run.recorder, turn.counts
+        recorder, counts = self._run.recorder, kernel.counts
         if recorder is not None:
-            recorder.add_stamped(Kind.MESSAGES, turn.kept, turn.messages)
+            recorder.add_stamped(Kind.MESSAGES, kernel.kept, kernel.messages)
             if counts.answers:
-                recorder.add_stamped(Kind.ANSWERS, turn.kept, turn.answers)
+                recorder.add_stamped(Kind.ANSWERS, kernel.kept, kernel.answers)
             if counts.shows:
-                recorder.add_stamped(Kind.COMMANDS, turn.kept, turn.shows)
+                recorder.add_stamped(Kind.COMMANDS, kernel.kept, kernel.shows)
 
-    def _settle_marks(self, turn: Kernel) -> None:
+    def _settle_marks(self, kernel: Kernel) -> None:
         """Let the core know of the marks of a call."""
-        for mark in turn.marks():
+        for mark in kernel.marks():
             self._core.remember(mark)
 
-    def _settle_commands(self, turn: Kernel) -> None:
+    def _settle_commands(self, kernel: Kernel) -> None:
         """Bring the session and the driver to where the kernel has them."""
-        run, control, shows = self._run, turn.control, turn.shows
+        run, control, shows = self._run, kernel.control, kernel.shows
         first = int(control[ring.NEXT_ID]) - len(shows)
         open_since = max(int(control[ring.OLDEST_ID]), first)
-        sent = [(number, turn.bytes_of(shows[number - first])) for number in range(open_since, first + len(shows))]
+        sent = [(number, kernel.bytes_of(shows[number - first])) for number in range(open_since, first + len(shows))]
         session = run.connection.session
         session.continue_from(int(control[ring.OLDEST_ID]), int(control[ring.OLDEST_NS]), sent, Opcode.SHOW)
         session.next_id = first + len(shows)
-        for span in turn.answers[turn.answers[:, ring.WHAT] == ring.REFUSAL]:
-            ack = decode_ack(turn.bytes_of(span)[HEADER.size :])
+        for span in kernel.answers[kernel.answers[:, ring.WHAT] == ring.REFUSAL]:
+            ack = decode_ack(kernel.bytes_of(span)[HEADER.size :])
             session.refusals.append(Refusal(ack.refused_id, ack.status, ack.text, Opcode.SHOW))
         if run.driver is not None:
             exposure, state = control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1].tolist()
             run.driver.account((exposure, state), shows[:, ring.TIME] - shows[:, ring.WHAT])
 
-    def _settle_blocks(self, turn: Kernel, outputs: list[Output]) -> None:
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
         """Account for the blocks of a call and their decisions."""
         raise NotImplementedError
 
-    def _ends_of(self, turn: Kernel) -> tuple[I64, I64]:
+    def _ends_of(self, kernel: Kernel) -> tuple[I64, I64]:
         """Return when each block ended on the host's clock and how uncertain that is; what lies in the future is noted."""
-        run, blocks = self._run, turn.blocks
+        run, blocks = self._run, kernel.blocks
         ends_ns, unsure_ns = run.connection.known_clock().to_host_ns_many(blocks[:, ring.END_TICK])
         for at in np.flatnonzero(ends_ns - unsure_ns - STEP_MARGIN_NS > blocks[:, ring.ARRIVAL]).tolist():
             run.check_tick(int(blocks[at, ring.END_TICK]), int(blocks[at, ring.ARRIVAL]))
@@ -325,21 +325,21 @@ class StillReceiver(Receiver):
             exposures = ring.KEPT_BYTES // 2  # two bytes each
             self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
 
-    def _warm_up(self, turn: Kernel) -> None:
-        unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits)
+    def _warm_up(self, kernel: Kernel) -> None:
+        unpack_blocks(kernel.kept, kernel.messages, self._stamps, self._bits)
         if self._run.recorder is not None:
-            self._run.recorder.add_stamped(Kind.MESSAGES, turn.kept, turn.messages)
+            self._run.recorder.add_stamped(Kind.MESSAGES, kernel.kept, kernel.messages)
 
-    def _settle_blocks(self, turn: Kernel, outputs: list[Output]) -> None:
-        run, blocks, steps = self._run, turn.blocks, turn.steps
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
+        run, blocks, steps = self._run, kernel.blocks, kernel.steps
         assert isinstance(steps, CoreState)
-        rows = turn.rows  # a back end that is not the kernel's decides here
+        rows = kernel.rows  # a back end that is not the kernel's decides here
         if not steps.decides and not run.connection.link.virtual:
             blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
-        events = self._watch(turn, rows)
+        events = self._watch(kernel, rows)
         for event in events:
             run.journal.take(event)
-        ends_ns, unsure_ns = self._ends_of(turn)
+        ends_ns, unsure_ns = self._ends_of(kernel)
         if len(rows):
             run.tally.add_rows(rows, steps.photons_of(rows["object"]))
             if run.recorder is not None:
@@ -351,14 +351,14 @@ class StillReceiver(Receiver):
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
         outputs.append(Output(RowDecisions(rows), events, self._still.last_tick))
 
-    def _watch(self, turn: Kernel, rows: npt.NDArray[np.void]) -> list[Any]:
+    def _watch(self, kernel: Kernel, rows: npt.NDArray[np.void]) -> list[Any]:
         """Let the guard of the dark counts see the exposures of a call."""
         core = self._still
         if core.guard is None:
             return []
         if core.windows.parallel:
-            spans = turn.messages[turn.messages[:, ring.WHAT] == int(MessageType.FRAMES)]
-            blocks = (decode_frames(turn.bytes_of(span)[HEADER.size :]) for span in spans)
+            spans = kernel.messages[kernel.messages[:, ring.WHAT] == int(MessageType.FRAMES)]
+            blocks = (decode_frames(kernel.bytes_of(span)[HEADER.size :]) for span in spans)
             return [event for block in blocks for event in core.watch_frames(block)]
-        n = int(unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits))
+        n = int(unpack_blocks(kernel.kept, kernel.messages, self._stamps, self._bits))
         return core.watch_blocks(self._stamps[:n], self._bits[:n], core.tracker.next_exposure - n, rows)

@@ -1,7 +1,6 @@
 """A lost device: look for it with growing pauses for a bounded time, and arm it for what is left of the run.
 
-Owns the schedule of attempts, the way back to an open link and what is told about an outage; never decides what a lost stream means,
-which is the core's. `reconnect` returns a connection that has been prepared anew, or raises the LinkError of the last attempt.
+`reconnect` returns a connection that has been prepared anew, or raises the LinkError of the last attempt.
 """
 
 from __future__ import annotations

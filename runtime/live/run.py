@@ -1,7 +1,7 @@
-"""One live run in progress, turn by turn: wait for bytes, decide on them, judge the time, record, renew the lease.
+"""One live run in progress, iteration by iteration: receive, judge the time, record, act, renew the lease.
 
-Owns the state of a run while it lives and what is due in a turn; the order of a whole run is loop.py's, its outages are reconnect.py's, and
-what a frame means is the core's. Any `Follower` can be driven. `turn` sets `ended` when the run is over.
+The order of a whole run is loop.py's, its outages are reconnect.py's. Any `Follower` can be driven. `iterate` sets `ended` when the run
+is over.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ Rows = npt.NDArray[np.void]
 
 
 class LiveRun(Reconciled):
-    """One run in progress: what `run_live` calls in turn, and what a live view may look at."""
+    """One run in progress: what `run_live` calls again and again, and what a live view may look at."""
 
     receiver: Receives  # set before the run is armed
     driver: HostDriver | None = None  # of an automaton that the host follows
@@ -86,7 +86,7 @@ class LiveRun(Reconciled):
         self.realtime: dict[str, Any] = {}
         self.page_faults: dict[str, int] = {}  # of the loop's thread while armed
         self.ended, self.link_lost, self.reconnects = "", False, 0
-        self.turned_s = time.monotonic()  # the loop's heartbeat: when it turned last
+        self.turned_s = time.monotonic()  # the loop's heartbeat: when an iteration began last
         self.stops = False  # the device is being told to go dark
         self.stopped = False  # it has been told, and what came is recorded
         self.outage_ns: int | None = None  # since when there has been no block
@@ -96,7 +96,7 @@ class LiveRun(Reconciled):
         self.failed: list[Connection] = []  # those that broke before they could be armed
         self.taken_here = 0  # messages of the present connection that the core was given, or came before ARM
         self.recorder = recorder
-        self._watch: Watcher | None = None  # of the turn under way
+        self._watch: Watcher | None = None  # of the iteration under way
         self._idle = True  # nothing has come in it
         self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
         self._setup: list[bytes] = []  # what each part of the recording must repeat
@@ -232,9 +232,9 @@ class LiveRun(Reconciled):
         body = pack_gate(Gate(tick, duration_ticks, channel))
         return self.connection.session.submit(Opcode.GATE, body, may_be_refused=True)
 
-    # -- one turn ------------------------------------------------------------------------------------------------------
+    # -- one iteration -------------------------------------------------------------------------------------------------
 
-    def turn(self, watch: Watcher | None) -> None:
+    def iterate(self, watch: Watcher | None) -> None:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
         self.turned_s = time.monotonic()
         looked_ns = self.now_ns()

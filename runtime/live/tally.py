@@ -1,8 +1,7 @@
 """What the decisions of a run add up to: accuracy with both spreads, clicks, photons, confusion.
 
-Owns integer sums, updated per decision; never touches single photons. `RunTally.figures` returns the figures of the contract.
 Spread over trials: how much the mean accuracy of one pass over the objects varies. Spread over objects: the standard error from
-having measured only these objects.
+having measured only these objects. `RunTally.figures` returns the figures of the contract.
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ STAGES = {
     "opening": ("pans.runtime.commands.one_run", "", "open_link", 1),
     "handshake": ("pans.runtime.link.connection", "Connection", "handshake", 1),
     "upload": ("pans.runtime.link.connection", "Connection", "upload", 1),
-    "armed": ("pans.runtime.live.run", "LiveRun", "turn", 1),
-    "running": ("pans.runtime.live.run", "LiveRun", "turn", 60),
+    "armed": ("pans.runtime.live.run", "LiveRun", "iterate", 1),
+    "running": ("pans.runtime.live.run", "LiveRun", "iterate", 60),
     "stopping": ("pans.runtime.live.run", "LiveRun", "stop", 1),
     "closing": ("pans.runtime.record.recorder", "Recorder", "close", 1),
 }
