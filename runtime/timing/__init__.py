@@ -2,10 +2,12 @@
 
 Device ticks and host times come in; host times with their uncertainty, latencies and causes go out. Begin with `clock.py`.
 
+>>> import numpy as np
 >>> from pans.runtime.timing import TimingLedger
 >>> ledger = TimingLedger(deadline_ns=1_000_000)
->>> ledger.judge((0, 200_000, 250_000, 1_300_000, 1_350_000), uncertainty_ns=10_000)  # ended, arrived, decoded, decided, recorded
-True
+>>> marks_ns = np.array([[0, 200_000, 250_000, 1_300_000, 1_350_000]])  # ended, arrived, decoded, decided, recorded
+>>> ledger.judge(marks_ns, np.array([10_000]), np.array([1])).tolist()
+[True]
 >>> ledger.blame
 {'decide': 1}
 """
