@@ -83,7 +83,6 @@ class Facts(NamedTuple):
     cpu_ns: int  # the loop's thread computed for so long, at most
     run_delay_ns: int  # it, or its reader while it did not compute, waited for a processor
     steal_ns: int
-    switches: int
     stamped: tuple[Stamped, ...]
 
 
@@ -233,7 +232,7 @@ def _words(cause: str, share: int, facts: Facts) -> str:
         )
         return (
             f"the host did not run for {_ms(share)} of {_ms(total_ns)}: waiting for a processor {waited}, stolen from the "
-            f"machine {stolen}, computing at most {computed}, {facts.switches} involuntary switches"
+            f"machine {stolen}, computing at most {computed}"
         )
     sentence = {
         "gc": "a garbage collection held the interpreter",
@@ -368,7 +367,6 @@ class Evidence:
                 [own, *(delay - cpu_ns for delay in readers)]
             ),  # a reader that waits while the loop computes waits for it
             last.steal_ns - first.steal_ns,
-            last.switches - first.switches,
             tuple(
                 one
                 for one in self._stamped
@@ -392,7 +390,6 @@ class Sample(NamedTuple):
     cpu_ns: int  # that the loop's thread has computed
     run_delays_ns: tuple[int, ...]  # how long each thread, the loop's first, waited to run
     steal_ns: int  # of the whole machine: time in which the hypervisor ran somebody else
-    switches: int  # involuntary, of the loop's thread
 
 
 class Counters:
@@ -409,12 +406,12 @@ class Counters:
         self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
         self._lock, self._stop = threading.Lock(), threading.Event()
         tasks = [f"/proc/self/task/{thread}" for thread in threads]
-        paths = [f"{tasks[0]}/status", "/proc/stat", *(f"{task}/schedstat" for task in tasks)] if tasks else []
+        paths = ["/proc/stat", *(f"{task}/schedstat" for task in tasks)] if tasks else []
         self._files = [_open(path) for path in paths]
         self._tick_ns = NS_PER_S // (os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100)
-        self._told = len(self._files) > 2 and self._files[2] is not None
+        self._known = len(self._files) > 1 and self._files[1] is not None
         self.read()
-        self._thread = threading.Thread(target=self._watch, name="pans-counters", daemon=True) if self._told else None
+        self._thread = threading.Thread(target=self._watch, name="pans-counters", daemon=True) if self._known else None
         if self._thread is not None:
             self._thread.start()
 
@@ -431,23 +428,22 @@ class Counters:
             self._lock.release()
 
     def _sample(self, began_ns: int, ended_ns: int, files: Sequence[bytes]) -> Sample:
-        if not self._told:
-            return Sample(began_ns, ended_ns, time.thread_time_ns(), (), 0, 0)
-        status, stat, *threads = files
+        if not self._known:
+            return Sample(began_ns, ended_ns, time.thread_time_ns(), (), 0)
+        stat, *threads = files
         return Sample(
             began_ns,
             ended_ns,
             _number(threads[0], 0),
             tuple(_number(text, 1) for text in threads),
             _number(stat.partition(b"\n")[0], 8) * self._tick_ns,
-            _number(status.partition(b"\nnonvoluntary_ctxt_switches:")[2], 0),
         )
 
     def around(self, begin_ns: int, end_ns: int) -> tuple[Sample, Sample]:
         """Return the latest sample that was whole at `begin_ns` and the first one begun at `end_ns`; as near as there are."""
         samples = list(self._samples)
         if not samples:
-            return Sample(0, 0, 0, (), 0, 0), Sample(0, 0, 0, (), 0, 0)
+            return Sample(0, 0, 0, (), 0), Sample(0, 0, 0, (), 0)
         before = next((one for one in reversed(samples) if one.ended_ns <= begin_ns), samples[0])
         return before, next((one for one in samples if one.began_ns >= end_ns), samples[-1])
 

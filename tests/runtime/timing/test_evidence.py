@@ -65,7 +65,7 @@ def facts(
     """Late work whose exposure ended at 0; times in ms; a block every millisecond."""
     stamps = tuple(int(one * MS) for one in arrivals)
     begin, came, decided = 0, int(arrival * MS), int(end * MS)
-    return Facts(begin, came, decided, 0, spans, stamps, MS, int(cpu * MS), int(run_delay * MS), 0, 0, stamped)
+    return Facts(begin, came, decided, 0, spans, stamps, MS, int(cpu * MS), int(run_delay * MS), 0, stamped)
 
 
 def span(kind: str, begin: float, end: float) -> Span:
@@ -137,7 +137,7 @@ def test_no_cause_explains_more_than_the_delay(
         reached = begin + int(length * total / 2)
         pieces.append(Span(kind, begin, reached))
     verdict = judge(
-        Facts(0, int(arrival * total), total, 0, tuple(pieces), (), 1, total // 3, int(delay * total), 0, 0, ())
+        Facts(0, int(arrival * total), total, 0, tuple(pieces), (), 1, total // 3, int(delay * total), 0, ())
     )
     assert verdict.cause in CAUSES
     assert all(0 <= share <= total for share in verdict.shares_ns.values())
@@ -254,11 +254,10 @@ def test_a_reading_is_taken_apart() -> None:
     counters = Counters(time.perf_counter_ns, [threading.get_native_id()])
     counters.close()
     tick_ns = 10**9 // os.sysconf("SC_CLK_TCK")
-    status = b"Name:\tx\nvoluntary_ctxt_switches:\t900\nnonvoluntary_ctxt_switches:\t12\n"
     stat = b"cpu  1 2 3 4 5 6 7 120 9 10\ncpu0 1 2 3 4 5 6 7 99 9 10\n"
-    files = (status, stat, b"120 77 12\n", b"5 240 3\n")
-    assert counters._sample(0, 1, files) == (0, 1, 120, (77, 240), 120 * tick_ns, 12)
-    assert counters._sample(0, 1, (b"", b"", b"", b"damaged")) == (0, 1, 0, (0, 0), 0, 0)
+    files = (stat, b"120 77 12\n", b"5 240 3\n")
+    assert counters._sample(0, 1, files) == (0, 1, 120, (77, 240), 120 * tick_ns)
+    assert counters._sample(0, 1, (b"", b"", b"damaged")) == (0, 1, 0, (0, 0), 0)
 
 
 @given(
@@ -272,7 +271,7 @@ def test_the_readings_around_a_stretch_are_the_nearest_that_enclose_it(
     counters, now = Counters(time.perf_counter_ns, []), 0
     counters._samples.clear()
     for gap, length in steps:
-        counters._samples.append(Sample(now + gap, now + gap + length, now, (), 0, 0))
+        counters._samples.append(Sample(now + gap, now + gap + length, now, (), 0))
         now += gap + length
     samples = list(counters._samples)
     before = [one for one in samples if one.ended_ns <= begin_ns]
