@@ -1,7 +1,7 @@
 """What bundles and recordings have in common on disk: strict JSON, reading within limits, chained blocks.
 
-Owns the byte framing and its limits; never knows what a part or a block means. Readers take bytes or an open file and
-raise DamagedFileError; files are created by outputs.py. Whoever shows how far a long file has been read is within `watching_blocks`.
+Readers take bytes or an open file and raise DamagedFileError; files are created by outputs.py. What a part or a block means is for the
+caller. Progress over a long file is reported within `watching_blocks`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Arrays of a .npz file from a stranger: measured before anything is allocated, never unpickled.
 
-Owns the limits and the reading; what the arrays mean is the caller's. ValueError says what cannot be, UsageError that
-there is no such file.
+ValueError says what cannot be, UsageError that there is no such file. What the arrays mean is for the caller.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pans.runtime import __version__
 from pans.runtime.errors import UsageError
-from pans.runtime.guests import load_guest
+from pans.runtime.offered import load_offered
 
 from .command import Command
 
@@ -33,7 +33,7 @@ def find_commands() -> dict[str, EntryPoint]:
 def load_command(point: EntryPoint) -> Command:
     """Return the command of an entry point; UsageError that names the missing extra, or the package that is broken."""
     try:
-        command = load_guest(point)
+        command = load_offered(point)
     except UsageError as error:
         missing = (getattr(error.__cause__, "name", None) or "").split(".")[0]
         extra = EXTRAS.get(missing)

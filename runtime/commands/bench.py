@@ -15,7 +15,7 @@ from typing import Any
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
 from pans.runtime.cli.finding import missing_extra
 from pans.runtime.errors import UsageError
-from pans.runtime.guests import load_guest
+from pans.runtime.offered import load_offered
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
@@ -86,7 +86,7 @@ def _check_used(args: argparse.Namespace) -> None:
 
 def _find(name: str) -> Callable[[Any], list[dict[str, Any]]] | None:
     for point in entry_points(group="pans.benches", name=name):
-        found: Callable[[Any], list[dict[str, Any]]] = load_guest(point)
+        found: Callable[[Any], list[dict[str, Any]]] = load_offered(point)
         return found
     return None
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pans.runtime.bundle.automaton import DoseCap
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
-from pans.runtime.guests import load_guest, package_of
+from pans.runtime.offered import load_offered, package_of
 
 from .onnx import OnnxDecider, PictureDecider
 from .table import count_table, fits_count_table, word_table
@@ -156,14 +156,14 @@ class OfferedDecider:
         self.name, self.n_features, self.n_classes = point.name, bundle.n_features, bundle.n_classes
         self.largest = bundle.largest
         self._whose = f"back end {point.name!r} of {package_of(point)}"
-        make = load_guest(point)
+        make = load_offered(point)
         try:
-            self._guest = make(bundle)
+            self._theirs = make(bundle)
         except Exception as error:
             raise UsageError(f"{self._whose} cannot be made: {type(error).__name__}: {error}") from error
         wanted = {"name": self.name, "n_features": self.n_features, "n_classes": self.n_classes}
         for member, value in wanted.items():
-            found = getattr(self._guest, member, None)
+            found = getattr(self._theirs, member, None)
             if found != value:
                 raise UsageError(
                     f"{self._whose}: its {member} is {found!r}, must be {value!r}",
@@ -177,7 +177,7 @@ class OfferedDecider:
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """Decide one object; UsageError for an answer that is none, and for an error of the back end."""
         try:
-            label, probability = self._guest.decide(counts, shots * self.largest)
+            label, probability = self._theirs.decide(counts, shots * self.largest)
         except Exception as error:
             raise UsageError(
                 f"{self._whose} fails on the clicks {counts.tolist()}: {type(error).__name__}: {error}",

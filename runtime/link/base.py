@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from pans.runtime.errors import LinkError, UsageError
-from pans.runtime.guests import load_guest, package_of
+from pans.runtime.offered import load_offered, package_of
 from pans.runtime.outputs import refuse_existing
 
 from .serial import SerialLink
@@ -90,7 +90,7 @@ _MEANT = (  # what looks like a device, and the URL of it
 
 def _checked_link(point: EntryPoint, url: str) -> Link:
     """Open a link of another package; an error that is not one of ours names the package."""
-    opener = load_guest(point)
+    opener = load_offered(point)
     try:
         link: Link = opener(url)
     except OSError as error:

@@ -22,10 +22,10 @@ from pans.runtime.core.decision import Action
 from pans.runtime.core.plan import NO_SHOT, Plan, ticks_of
 from pans.runtime.core.plan_codec import plan_chunks
 from pans.runtime.errors import DeviceError, LinkError, UsageError
-from pans.runtime.guests import load_guest
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, open_link
 from pans.runtime.link.connection import ARM_LEAD_NS, NS_PER_S, Connection
+from pans.runtime.offered import load_offered
 from pans.runtime.record import Recorder
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire.commands import Arm, Gate, PatternChunk, pack_arm, pack_gate, pack_pattern, pack_plan
@@ -386,7 +386,7 @@ def open_actuator(url: str, profile: Profile) -> Actuator | SecondInstrument | N
         return None
     found = {point.name: point for point in entry_points(group=GROUP)}
     if name in found:
-        actuator: Actuator = load_guest(found[name])(rest)
+        actuator: Actuator = load_offered(found[name])(rest)
         return actuator
     links = {*LINKS, *(point.name for point in entry_points(group=DEVICES))}
     if name not in links:

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.optics import Light, Optics
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.guests import load_guest
 from pans.runtime.images import read_class_folder, to_8_bits
 from pans.runtime.npz_file import read_arrays
+from pans.runtime.offered import load_offered
 
 from .generators import GENERATORS
 from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, read_idx
@@ -124,7 +124,7 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_see
     if name_or_path in GENERATORS:
         return draw_task(name_or_path, data_seed)
     if name_or_path in (offered := _offered_tasks()):
-        return _checked_task(load_guest(offered[name_or_path])(data_seed), name_or_path)
+        return _checked_task(load_offered(offered[name_or_path])(data_seed), name_or_path)
     path = Path(name_or_path)
     if path.is_dir():
         return _load_folder(path)

@@ -97,7 +97,7 @@ def test_another_packages_back_end_gets_sums_over_shots_times_the_largest(
             asked.append((counts.tolist(), shots))
             return 1, 1.0
 
-    monkeypatch.setattr(backends, "load_guest", lambda point: Lab)
+    monkeypatch.setattr(backends, "load_offered", lambda point: Lab)
     monkeypatch.setattr(backends, "offered_backends", lambda: {"lab": EntryPoint("lab", "lab:Lab", backends.GROUP)})
     make_decider(counted, shots=5, backend="lab").decide(np.array([10, 0, 3]), 5)
     assert asked[-1] == ([10, 0, 3], 10)

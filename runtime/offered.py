@@ -1,7 +1,6 @@
-"""What other packages offer by entry point: found by name, loaded with an error that names the package.
+"""An entry point of another package in (command, device, actuator, back end, task, bench); its value, or an error that names the package.
 
-Owns the loading for every group (commands, devices, actuators, back ends, tasks, benches); what a loaded value must be is checked by
-those that use it.
+What the value must be is checked by those that use it.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from typing import Any
 from .errors import UsageError
 
 
-def load_guest(point: EntryPoint) -> Any:
+def load_offered(point: EntryPoint) -> Any:
     """Return the value of an entry point; UsageError that says which package offers it and why it cannot be loaded."""
     try:
         return point.load()
