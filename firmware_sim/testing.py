@@ -1,7 +1,6 @@
 """What a test needs to run against the simulator: a profile, a bundle and a plan, made from nothing and small.
 
-Public: a lab's own package may use it in the tests of its drivers and back ends. Owns the making of these three; never opens a link: the
-instrument is `open_link("sim:ideal?scene=uniform&pace=fast")`.
+Public: a lab's own package may use it in the tests of its drivers and back ends, with `open_link("sim:ideal?scene=uniform&pace=fast")`.
 
 >>> profile, bundle, plan = small_setup()
 >>> profile.name, bundle.classes, plan.n_patterns

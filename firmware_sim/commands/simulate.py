@@ -1,7 +1,4 @@
-"""`pans simulate`: a stand-alone simulated instrument behind a pseudo-terminal or TCP.
-
-Owns the command's arguments and its way to end; never the instrument. The first line on stdout is the device URL.
-"""
+"""`pans simulate`: a stand-alone simulated instrument behind a pseudo-terminal or TCP; the first line on stdout is its URL."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Rules of section 11: automata that the device follows, or that the host names state by state.
 
-Owns these checks; on a device that announces no automata only its refusals are tried.
+On a device that announces no automata only its refusals are tried.
 """
 
 from __future__ import annotations

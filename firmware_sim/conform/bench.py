@@ -1,6 +1,6 @@
 """The host's end of a conformance test: one link, what was sent and heard, and the short way to a session, a command or an armed run.
 
-Owns the link's bytes and the waiting; never judges. What a check waits for and does not get is `Broken`.
+What a check waits for and does not get is `Broken`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Rules of sections 13 and 14: exposures that are photon numbers, or the clicks of several detectors, and automata that follow them.
 
-Owns these checks; on a device that announces neither only its refusals are tried.
+On a device that announces neither only its refusals are tried.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Rules of section 1 (frames) and of reserved fields: what a receiver must live through, and still answer.
-
-Owns these checks; the bytes are made by hand where they must be wrong.
-"""
+"""Rules of section 1 (frames) and of reserved fields: what a receiver must accept or drop, and still answer."""
 
 from __future__ import annotations
 

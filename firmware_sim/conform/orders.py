@@ -1,7 +1,4 @@
-"""Rules of section 4: how commands are numbered, acknowledged and refused.
-
-Owns these checks.
-"""
+"""Rules of section 4: how commands are numbered, acknowledged and refused."""
 
 from __future__ import annotations
 

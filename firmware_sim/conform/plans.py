@@ -1,7 +1,6 @@
-"""Small plans for a device that only its profile and its WELCOME describe.
+"""Small plans for a device that only its profile and its WELCOME describe: bodies of LOAD_PATTERN and LOAD_PLAN.
 
-Owns the bodies of LOAD_PATTERN and LOAD_PLAN for them; never sends one. Exposures are the shortest that the profile allows, at
-most a thousand a second, so that any host and any link follow.
+Exposures are the shortest that the profile allows, at most a thousand a second, so that any host and any link can keep up.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""The table of rules: number, words and check; and what a check raises.
+"""The table of rules, which the check modules fill when they are imported: number, words and check; and what a check raises.
 
-Owns the registry that the check modules fill when they are imported; never talks to a device. The words are those of section 12 of
-docs/reference/protocol.md, compared by tests/firmware_sim/conform.
+The words are those of section 12 of docs/reference/protocol.md.
 """
 
 from __future__ import annotations

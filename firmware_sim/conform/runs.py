@@ -1,7 +1,4 @@
-"""Rules of sections 4 (states, lease) and 5 (the stream): whole runs, and what must agree in them.
-
-Owns these checks.
-"""
+"""Rules of sections 4 (states, lease) and 5 (the stream): whole runs, and what must agree in them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Rules of sections 2 and 3 (sessions, WELCOME) and 6 (probes, the clock).
-
-Owns these checks.
-"""
+"""Rules of sections 2 and 3 (sessions, WELCOME) and 6 (probes, the clock)."""
 
 from __future__ import annotations
 

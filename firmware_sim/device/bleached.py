@@ -1,7 +1,6 @@
-"""Objects that bleach: their light depends on all that was shown to them since they came.
+"""Objects that bleach: their light depends on all that was shown to them since they came (`pans.runtime.imaging.bleaching`).
 
-Owns the dose of each pixel and the light that is left; the law is `pans.runtime.imaging.bleaching`. Patterns of a plan are tabulated
-exposure by exposure; of an automaton, one sample is kept, which the walk bleaches. Never draws a click.
+Patterns of a plan are tabulated exposure by exposure; of an automaton, one sample is kept, which the walk bleaches.
 """
 
 from __future__ import annotations

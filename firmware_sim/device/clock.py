@@ -1,8 +1,4 @@
-"""Where device time comes from: the device's imperfect clock, and what a shell needs of a device.
-
-Owns the conversion host nanoseconds <-> device ticks of the simulator (the truth that the host's clock model has to find);
-never reads a clock. Conversions are exact integer arithmetic.
-"""
+"""The device's imperfect clock, in exact integer arithmetic, and what a shell needs of a device."""
 
 from __future__ import annotations
 

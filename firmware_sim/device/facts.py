@@ -1,7 +1,4 @@
-"""What WELCOME says of a simulated instrument, its scene and its optics.
-
-Owns these keys and their values; never sends them.
-"""
+"""What WELCOME says of a simulated instrument, its scene and its optics."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Frame blocks and marks as bytes on the wire, many at a time: a parallel instrument sends thousands of them a second.
 
-Owns the order of blocks and marks and their encoding, in two compiled kernels; the bytes are those of `wire.encode_frames` and
-`wire.encode_mark`, which stay the reference (tests/firmware_sim/device/test_parallel.py compares them). Draws no click, keeps no state.
+Two compiled kernels; the bytes are those of `wire.encode_frames` and `wire.encode_mark`.
 """
 
 from __future__ import annotations

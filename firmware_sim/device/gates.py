@@ -1,7 +1,4 @@
-"""The actuation outputs: which pulses were accepted, and which output is open when.
-
-Owns the pulses and refusals, bounded, as the ground truth of what was actuated; never decides whether the state allows one (instrument.py).
-"""
+"""The actuation outputs: which pulses were accepted, and which output is open when; whether the state allows one is instrument.py's."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""The instrument as a sans-I/O state machine: bytes and ticks in, bytes out (docs/reference/protocol.md is its specification).
+"""The instrument as a state machine without I/O: bytes and ticks in, bytes out (docs/reference/protocol.md is its specification).
 
-Owns the session, commands, states, lease, receive window and gates; never reads a clock, sleeps or opens a port.
-`Instrument.step(tick, data)` moves device time to `tick`, digests what the host sent by then and returns what the device has
-sent. Whatever arrives, it answers, refuses or counts; it never raises over bytes and never allocates beyond its limits.
+`Instrument.step(tick, data)` moves device time to `tick`, takes what the host sent by then and returns what the device has sent.
+Whatever arrives, it answers, refuses or counts; it never raises over bytes and never allocates beyond its limits.
 """
 
 from __future__ import annotations

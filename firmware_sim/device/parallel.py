@@ -1,9 +1,8 @@
 """One armed run of an instrument that exposes all channels at once: its stream, made ahead of time in stretches.
 
-Owns the stretches that are not yet sent and the place in them; never knows about windows or buffers (stream_buffer.py), reads no clock.
-The future of a scene is fixed, so that clicks and the order of messages are made before they are due. Sequence numbers, drop counts and the
-session are stamped on when the first message of a stretch leaves, and again when one of them turns out otherwise for the rest of it.
-What is not yet due can be forgotten at any time: numbers drawn ahead belong to exposures, and change nothing for those of later runs.
+The future of a scene is fixed, so clicks and the order of messages are made before they are due. Sequence numbers, drop counts and the
+session are stamped when the first message of a stretch leaves, and again when one of them turns out otherwise for the rest. What is not
+yet due can be forgotten at any time: numbers drawn ahead belong to exposures.
 """
 
 from __future__ import annotations

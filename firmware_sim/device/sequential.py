@@ -1,8 +1,6 @@
 """One armed run of a program, pattern after pattern: which stream message is due at which tick, and what is in it.
 
-Owns the schedule of exposures, objects and blocks; knows no sessions, windows or buffers (instrument.py). `Measurement.emit` returns
-messages without sequence number and drop count, which the device adds. Clicks are drawn in batches. Instruments that expose all
-channels at once have a run of their own (parallel.py).
+`Measurement.emit` returns messages without sequence number and drop count, which the device adds. Clicks are drawn in batches.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The automaton that the host has uploaded, and the states that the host names one by one.
 
-Owns the checks of LOAD_STATES and SHOW (docs/reference/protocol.md, section 11), of READ_COUNTS and LOAD_COUNT_STATES (13 and 14), with
-every limit checked before anything is stored; never draws a click. A command that makes no sense raises `Refused` and leaves what is
-stored as it was.
+LOAD_STATES, SHOW, READ_COUNTS and LOAD_COUNT_STATES (docs/reference/protocol.md, sections 11, 13 and 14) are checked before anything is
+stored: one that makes no sense raises `Refused` and leaves what is stored as it was.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The device's end of the stream: sequence numbers, receive window, buffer and drop count (docs/reference/protocol.md, section 5).
 
-Owns what waits to be sent; never retransmits. `StreamBuffer.put`, `put_due` and `grant` return the frames that may be sent now.
+`StreamBuffer.put`, `put_due` and `grant` return the frames that may be sent now.
 """
 
 from __future__ import annotations

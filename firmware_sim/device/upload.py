@@ -1,8 +1,7 @@
 """What the host has uploaded: pattern memory and plan memory, with every limit checked before anything is stored.
 
-Owns the checks of LOAD_PATTERN and LOAD_PLAN and compiles the `Program`; never runs it. A chunk that makes no sense raises
-`Refused` with the status and text of the acknowledgement, and leaves the memory as it was. Chunks come in order; the one that
-starts at 0 starts over.
+A chunk of LOAD_PATTERN or LOAD_PLAN that makes no sense raises `Refused` with the status and text of the acknowledgement, and leaves the
+memory as it was. Chunks come in order; the one that starts at 0 starts over.
 """
 
 from __future__ import annotations

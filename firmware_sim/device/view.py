@@ -1,8 +1,8 @@
 """What the instrument looks at, and through what: from a program and the uploaded patterns to a run.
 
-Owns the scene's table for a pattern set and the making of runs; never knows states, sessions or time. The table is made once for each
-pattern set and exposure time, which takes seconds for many pictures in flow. A scene that cannot be shown is refused when the
-instrument is switched on (ConfigError), patterns that do not fit it when they are tabulated (`Refused`).
+The table of light is made once for each pattern set and exposure time, which takes seconds for many pictures in flow. A scene that
+cannot be shown is refused when the instrument is switched on (ConfigError), patterns that do not fit it when they are tabulated
+(`Refused`).
 """
 
 from __future__ import annotations

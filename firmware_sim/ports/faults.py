@@ -1,7 +1,6 @@
 """Which faults a simulated link and device have: names, strengths and what cannot be done.
 
-Owns the text form (`loss:0.01,stall:600ms/5s`, in a URL or a TOML file) and its limits; never damages a byte (faulty.py). `parse_faults`
-returns a `Faults`, or raises UsageError for whatever it cannot do exactly as asked.
+`parse_faults` reads the text form (`loss:0.01,stall:600ms/5s`, in a URL or a TOML file) and returns a `Faults`, or raises UsageError.
 """
 
 from __future__ import annotations

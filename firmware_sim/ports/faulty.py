@@ -1,8 +1,6 @@
 """A device behind a bad link: wraps an instrument and damages, delays, repeats or loses what passes, by seed.
 
-Owns the two lanes of frames and the schedule of what recurs; never reads a clock and looks at no more of a message than its type.
-`FaultyDevice` is a `SteppedDevice`: shells drive it like an instrument. All randomness comes from one seed, so that a failure can be
-repeated.
+`FaultyDevice` is a `SteppedDevice`: shells drive it like an instrument. It looks at no more of a message than its type.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """A pyserial URL handler: `panssim://PROFILE?scene=...` is a serial port with a simulated instrument at its end.
 
-Owns the registration and the way from the URL to an instrument; reading and writing are pyserial's own. pyserial finds this module by its
-name (`protocol_SCHEME`) once `register` has been called.
+pyserial finds this module by its name (`protocol_SCHEME`) once `register` has been called; reading and writing are pyserial's own.
 """
 
 from __future__ import annotations

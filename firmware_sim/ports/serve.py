@@ -1,8 +1,7 @@
 """`sim:` device URLs -> an open link to a simulated instrument, in process or in a process of its own.
 
-Owns the URL's keys, the making of an instrument from them and the child process; never looks into the bytes. `open_sim` returns
-a Link: pace=fast is virtual time in process (virtual.py), pace=real a child behind an ordinary port (shell.py), since in one
-process the interpreter's lock would let the instrument disturb the host that it is there to measure.
+`open_sim` returns a Link: pace=fast is virtual time in process (virtual.py), pace=real a child behind an ordinary port (shell.py), since
+in one process the interpreter's lock would let the instrument disturb the host that it is there to measure.
 """
 
 from __future__ import annotations

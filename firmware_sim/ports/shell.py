@@ -1,7 +1,7 @@
 """The instrument at real pace: a port (pseudo-terminal or TCP) and the loop that steps the device on time.
 
-Owns file descriptors and the wall clock; never knows the protocol. `serve` returns when `stopped()` says so. What the client
-does not take is held up to MAX_BACKLOG_BYTES, then whole device outputs are dropped, as a full transmit buffer would.
+`serve` returns when `stopped()` says so. What the client does not take is held up to MAX_BACKLOG_BYTES, then whole device outputs are
+dropped, as a full transmit buffer would.
 """
 
 from __future__ import annotations

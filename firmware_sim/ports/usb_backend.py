@@ -1,7 +1,6 @@
 """A pyusb backend with one simulated instrument on its bus, so that pyusb's own find, claim, read and write run without hardware.
 
-Owns the descriptors of the pretended device and the transfers; never looks into the bytes. Errors are those of libusb: USBTimeoutError
-(-7, 110), USBError 16 (busy), 19 (gone).
+Errors are those of libusb: USBTimeoutError (-7, 110), USBError 16 (busy), 19 (gone).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The instrument in process, in virtual time: a link whose clock moves only while the host waits.
 
-Owns virtual time; never sleeps, starts a thread or reads a clock, so that a run is the same bit for bit on every machine and
-an hour takes seconds. `VirtualLink` is an ordinary Link (pans.runtime.link) that can break and be opened again.
+A run is the same bit for bit on every machine, and an hour takes seconds. `VirtualLink` is an ordinary Link (pans.runtime.link) that can
+break and be opened again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Cells in flow: when each one comes, how fast and how far off, and what light the field passes while they cross.
 
-Owns the flow of one run and the marks that tell the truth about it; never draws a click (drawing.py). Everything about arrival
-number n is a function of (seed, n) alone, except its time, which is a running sum of such functions: batches change nothing.
+Everything about arrival number n is a function of (seed, n) alone, except its time, which is a running sum of such functions: batches
+change nothing.
 
 Model: a cell is centred at its arrival; its shift in pixels is velocity times the time since, from -width to +width, beyond which it
 is outside. Light is exactly the mean over the exposure of the linear interpolation between whole-pixel shifts (shifts.py), at constant

@@ -1,7 +1,6 @@
 """What changes while a scene is watched: dark rates, light leaks, hot and dead channels, drifting efficiency, readings that shift.
 
-Owns how declared changes add up at a given time; never draws a click and never reads a file (scene_file.py). A scene without changes
-never comes here: nothing declared costs nothing. Times are seconds after the run's first exposure may begin.
+A scene without changes costs nothing. Times are seconds after the run's first exposure may begin.
 """
 
 from __future__ import annotations

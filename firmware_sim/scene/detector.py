@@ -1,8 +1,7 @@
 """From click probabilities to clicks: the detector's memory and its random numbers, in numpy.
 
-Owns a counter-based generator: the number drawn for an exposure depends on (seed, exposure, channel) alone, so that blocks, batches
-and threads change nothing. Never keeps state: the click of the exposure before is an argument. The law is detector_model.py's; the
-compiled twin is detector_kernels.py.
+The number drawn for an exposure depends on (seed, exposure, channel) alone, so that blocks, batches and threads change nothing; the click
+of the exposure before is an argument. The compiled twin is detector_kernels.py.
 
 Sources: afterpulsing 1 - (1 - p)(1 - p_ap * previous); the generator mixes counters with the finaliser of Steele, Lea and Flood,
 "Fast splittable pseudorandom number generators" (2014).

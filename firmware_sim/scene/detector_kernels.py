@@ -1,8 +1,7 @@
 """The compiled kernels of the simulated detector: many clicks, packed as a parallel instrument sends them.
 
-Owns the loops; law and model are detector_model.py's, and every bit is the one that `detector.sample_clicks` draws.
-What the profile does not declare is in no loop: dead time, read noise and dark counts are in the probability already, afterpulsing
-looks one exposure back, crosstalk draws two more numbers for neighbours of a click and none elsewhere.
+Every bit is the one that `detector.sample_clicks` draws. What the profile does not declare is in no loop: dead time, read noise and dark
+counts are in the probability already, afterpulsing looks one exposure back, crosstalk draws two more numbers for neighbours of a click.
 """
 
 from __future__ import annotations

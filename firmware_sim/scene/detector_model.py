@@ -1,7 +1,4 @@
-"""The detector's law and the keys of its random numbers: what the plain and the compiled generator share.
-
-Owns the click probability with the effects that the profile declares, the streams of random numbers and their keys; never draws one.
-What is not declared costs nothing.
+"""The detector's law with the effects that the profile declares, and the keys of its random numbers.
 
 Sources: thresholded Poisson law, qCMOS threshold and dead time in pans.runtime.instrument.click_law.
 """

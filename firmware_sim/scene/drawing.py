@@ -1,7 +1,6 @@
 """From the light of a run to its clicks: any stretch of exposures, drawn in one piece.
 
-Owns how light, changes and the detector's model come together; never knows about blocks, messages or ticks of the device. Clicks depend
-on the exposure's number and the click before it alone, so that the size of stretches changes nothing.
+Clicks depend on the exposure's number and the click before it alone, so that the size of stretches changes nothing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What reaches the detectors in one run: the three kinds of scenes behind one interface.
+"""What reaches the detectors in one run: still objects, cells and a tape behind one interface.
 
-Owns the tables made once per pattern set (`prepare`), the choice of a scene's flow (`begin`) and still objects, which pass as the plan
-says; cells and tape have modules of their own, with numba, loaded only where something moves. Never draws a click.
+`prepare` makes the tables of a pattern set, `begin` starts a scene. Cells and tape have modules of their own, with numba, loaded only
+where something moves.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""What becomes messages many at a time: marks as rows, and the stamp that the device puts on all messages.
+"""Marks as rows, many at a time, and the stamp that the device puts on all messages.
 
-Owns the rows and how a run takes from their front; never computes what stands in them (light.py, cells.py, tape.py) and never
-encodes one (frame_writer.py). Ticks count from the start of the run and never decrease.
+Ticks count from the start of the run and never decrease.
 """
 
 from __future__ import annotations

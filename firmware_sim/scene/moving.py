@@ -1,7 +1,6 @@
-"""Scenes that move: cells that cross the field of the patterns, and an endless tape of bars; and what changes while a scene is watched.
+"""The facts of scenes that move, and their limits: cells that cross the field of the patterns, an endless tape of bars, and changes.
 
-Owns the facts of such scenes and their limits; never reads a file (scene_file.py) and never computes light (cells.py, tape.py). All
-frozen. Moving scenes stand before parallel instruments: static patterns, one frame of all channels per exposure.
+Moving scenes stand before parallel instruments: static patterns, one frame of all channels per exposure.
 
 Cells: the centres of the cells pass the middle of the field as a Poisson process. A cell's picture is as large as the patterns and moves
 from left to right, from one field before the middle to one behind it, at its own constant speed. Tape: bars run through a window of

@@ -1,6 +1,5 @@
-"""From projector levels and objects to light: expected photoelectrons of every object under every pattern.
+"""From projector levels and objects to light: expected photoelectrons of every object under every pattern, once per pattern set.
 
-Owns the optical model and computes it once per loaded pattern set; never draws a random number, never runs per exposure.
 Only what the profile declares is modelled: the projector's photon scale, the object modulator where there is one, and where a scene's
 images stand on the grid of the patterns (pans.runtime.imaging); or passive optics, as a bundle states them.
 On perfect optics sums of level times grey are integers below 2^53: exact, whatever the BLAS, its threads and the block size are.

@@ -1,7 +1,7 @@
 """Shifted pictures under static patterns: the light sums of every picture at every whole-pixel shift, once per pattern set.
 
-Owns the tables and how they are made; never knows about time (cells.py). All sums are whole numbers (level times grey step) and so exact.
-Between whole-pixel shifts light is linear in the shift, since pixels are boxes: what cells.py interpolates is exact too.
+All sums are whole numbers (level times grey step) and so exact. Between whole-pixel shifts light is linear in the shift, since pixels are
+boxes: what cells.py interpolates is exact too.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """What stands before the detector: a list of still images with their truth, or a calibration target.
 
-Owns the scene file (`.npz` with `images`, `labels`, `classes`), the shipped scenes, the targets `uniform`, `dark` and `registration`.
-Never computes light or clicks (optics.py, detector.py). `load_scene` returns a frozen `Scene` or raises ConfigError; a
-scene file is measured before anything is allocated, and never unpickled.
+`load_scene` reads an `.npz` with `images`, `labels`, `classes`, a shipped scene or a target (`uniform`, `dark`, `registration`), and
+returns a frozen `Scene` or raises ConfigError. A file is measured before anything is allocated, and never unpickled.
 """
 
 from __future__ import annotations

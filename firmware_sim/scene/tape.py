@@ -1,7 +1,6 @@
 """A tape of bars that runs through the field: which bars stand where at any time, and the light they pass.
 
-Owns the tape of one run and the marks that tell the truth about it; never draws a click. Bar b and position error number k are functions of
-(seed, b) and (seed, k); the error is a running sum of those: how a run is cut into batches changes nothing.
+Bar b and position error number k are functions of (seed, b) and (seed, k); the error is a running sum of those: batches change nothing.
 
 Model: at t bar pitches after the start the window begins at bar t - 1 + e(t), so that window m (bars m to m + bars - 1, bar m at the
 first pixel) is centred at about m + 1. The error e is an Ornstein-Uhlenbeck process, exact at every whole pitch and linear between. A
