@@ -15,7 +15,7 @@ from pans.runtime.wire.fields import LARGEST_TICK
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN
 
 I64 = NDArray[np.int64]
-LONG_CYCLE = 4096  # exposures: so many are told in one piece, without a division for each
+LONG_CYCLE = 4096  # exposures: so many are computed in one piece, without a division for each
 
 
 @dataclass(frozen=True, slots=True, eq=False)

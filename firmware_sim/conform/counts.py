@@ -225,12 +225,12 @@ def one_at_a_time(bench: Bench) -> None:
     "A device that announces several detectors at once does so with the number of section 13, up to 4 of its channels, and automata.",
 )
 def says_how_many(bench: Bench) -> None:
-    told = bench.facts.get("channels_at_once")
-    if told in (None, 1):
+    channels = bench.facts.get("channels_at_once")
+    if channels in (None, 1):
         raise NotTried("the device announces one detector at a time")
     schema, most = bench.facts.get("count_schema"), min(4, bench.facts["channels"])
     need(schema == COUNT_SCHEMA, f"count_schema is {schema}, expected {COUNT_SCHEMA:#010x}")
-    need(isinstance(told, int) and 2 <= told <= most, f"channels_at_once is {told}, expected 2 to {most}")
+    need(isinstance(channels, int) and 2 <= channels <= most, f"channels_at_once is {channels}, expected 2 to {most}")
     need(bench.facts["mode"] == "sequential", f"mode is {bench.facts['mode']}, expected sequential")
     need(announced(bench.facts) is not None, "no automata are announced")
 

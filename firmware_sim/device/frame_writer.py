@@ -80,7 +80,7 @@ def lay_out(plan, cycle, block, marks, start_tick, messages):  # type: ignore[no
         if taken < marks.shape[0] and start_tick + marks[taken, MARK_TICK] < end:
             mark = marks[taken]
             message[TICK] = start_tick + mark[MARK_TICK]
-            # what passes by is told with the block in which it stands: one reading less for the host
+            # an object that passes is marked before the block in which it stands: one reading less for the host
             message[DUE] = message[TICK] if plan.cycles_per_object else end
             message[EXPOSURES] = 0
             message[EXPOSURE], message[OBJECT] = mark[MARK_EXPOSURE], mark[MARK_OBJECT]

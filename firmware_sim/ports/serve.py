@@ -230,7 +230,7 @@ class ChildLink:
 
 
 def _check_scene(options: SimOptions, profile: Profile) -> None:
-    """Raise what is wrong with the scene here, where it is better told than by the child."""
+    """Raise what is wrong with the scene here, where the message is clearer than the child's."""
     from pans.firmware_sim.scene.scene_file import scene_on_table
 
     scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach, options.seed)
