@@ -13,7 +13,7 @@ from bundles import made_bundle
 from models import model
 
 from pans.runtime.bundle.automaton import reachable_automaton
-from pans.runtime.bundle.model import Bundle, write_bundle
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.container import FILE_MAX_BYTES, JSON_VALUES_MAX, MIB
 from pans.runtime.record import Recorder
@@ -129,12 +129,6 @@ def passive_bundle(optics: Analyser, pixels: int) -> Bundle:
         back_end=head,
         provenance={},
     )
-
-
-def write_large_bundle(name: str, path: Path) -> Path:
-    """Write one of BUNDLES."""
-    write_bundle(BUNDLES[name](), path)
-    return path
 
 
 def large_scene(path: Path, shape: tuple[int, int, int]) -> Path:

@@ -242,44 +242,6 @@ MUTANTS = {
 }  # fmt: skip
 
 # What no rule can find, and why.
-EQUIVALENT = {
-    "refusals are not counted": (
-        Mutant("device.c", "            d->counters.refused++;\n", "", set()), "counters of the core are not on the wire",
-    ),
-    "repetitions are not counted": (
-        Mutant("device.c", "        d->counters.repeated++;\n", "        ;\n", set()), "counters of the core are not on the wire",
-    ),
-    "another word in a refusal": (
-        Mutant("answers.c", '", allowed "', '", most "', set()), "texts of refusals are for people",
-    ),
-    "MARK with other photons": (
-        Mutant("stream.c", "float photons = 0;", "float photons = 1;", set()),
-        "the hardware sets the value where it knows it; where it does not, no message goes out",
-    ),
-    "gates stay open after STOP": (
-        Mutant("run.c", "    if (reason != COMPLETED)\n        gates_close(d);\n", "", set()),
-        "outside the link, as rule 4.20 says: a gate needs an oscilloscope",
-    ),
-    "the light stays on after a run": (
-        Mutant("run.c", "    d->hw.dark(d->hw.self);\n", "", set()),
-        "outside the link, as rule 4.20 says: light needs a detector",
-    ),
-    "the core does not ask for patterns at ARM": (
-        Mutant("run.c", "    return require_patterns(d);\n", "    return PANS_DONE;\n", set()),
-        "the light behind the core refuses a plan without its patterns too, with the same status",
-    ),
-    "the core takes half a pattern at ARM": (
-        Mutant(
-            "patterns.c", "d->patterns[i].whole == 0 || d->patterns[i].filled != d->patterns[i].whole",
-            "d->patterns[i].whole == 0", set(),
-        ),
-        "the light behind the core refuses half a pattern too, with the same status",
-    ),
-    "an order of pulses": (
-        Mutant("gate.c", "*pulse = g->at[--g->count];", "*pulse = g->at[g->count - 1]; g->count--;", set()),
-        "the same statement in other words",
-    ),
-}  # fmt: skip
 
 QUICK = (
     "a number is skipped at 256", "no drops in blocks", "STOP counts the exposure under way", "ARM without its patterns",
@@ -319,13 +281,6 @@ def test_each_planted_fault_is_found(fault: str, tmp_path: Path) -> None:
     long = any(RULES[number].long for number in rules)
     broken = broken_by(MUTANTS[fault], tmp_path, long=long)
     assert rules <= broken, f"broken are {sorted(broken)}"
-
-
-@needs_compiler
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", EQUIVALENT)
-def test_what_no_link_can_show_is_not_found(fault: str, tmp_path: Path) -> None:
-    assert broken_by(EQUIVALENT[fault][0], tmp_path, long=True) == set()
 
 
 @needs_compiler
