@@ -108,20 +108,16 @@ def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = 
     except ValueError as error:
         raise UsageError(f"clicks are no array: {error}", remedy="give the same number of counts per object") from error
     if found.size and found.dtype.kind not in "iub":
-        raise UsageError(
-            f"clicks are {found.dtype} {found.shape}, allowed: integers, words (n,) or counts (n, {bundle.n_features}) from 0 to "
-            f"{shots * bundle.largest}",
-            remedy="give whole numbers of clicks; means times shots are counts",
-        )
+        allowed = f"integers, words (n,) or counts (n, {bundle.n_features}) from 0 to {shots * bundle.largest}"
+        remedy = "give whole numbers of clicks; means times shots are counts"
+        raise UsageError(f"clicks are {found.dtype} {found.shape}, allowed: {allowed}", remedy=remedy)
     found = found.astype(np.int64) if found.dtype.kind != "u" else found
     if found.ndim == 1:
         if bundle.largest > 1:
             raise UsageError(f"words of clicks, but {bundle.name} takes photon numbers", remedy="give counts (n, d_f)")
         if bundle.n_features > 63:
-            raise UsageError(
-                f"words of one shot hold at most 63 clicks, {bundle.name} has {bundle.n_features}",
-                remedy="give counts (n, d_f)",
-            )
+            what = f"words of one shot hold at most 63 clicks, {bundle.name} has {bundle.n_features}"
+            raise UsageError(what, remedy="give counts (n, d_f)")
         if found.size and (int(found.min()) < 0 or int(found.max()) >> bundle.n_features):
             raise UsageError(f"words run from {found.min()} to {found.max()}, allowed: {bundle.n_features} bits")
         found = word_means(found, bundle.n_features).astype(np.int64)

@@ -118,13 +118,13 @@ def run_and_report(args: argparse.Namespace, options: RunOptions) -> int:
     """Run, print how it went and return the exit code."""
     from pans.runtime.report.words import closing_words
 
-    def tell(done: Outcome) -> None:
+    def report(done: Outcome) -> None:
         files = {"recording": str(done.recording), "report": str(done.report)}
         payload = {**done.summary.as_json(), **files, "shots": options.shots, "seed": getattr(args, "seed", None)}
         emit(args, payload, closing_words(done.summary, **files))
 
     options = replace(options, started_ns=process_start_ns())
-    return _exit_code(run_once(options, ends_process=True, tell=tell).summary)
+    return _exit_code(run_once(options, ends_process=True, report=report).summary)
 
 
 def run_once(
@@ -132,11 +132,11 @@ def run_once(
     profile: Profile | None = None,
     *,
     ends_process: bool = False,
-    tell: Callable[[Outcome], None] = lambda done: None,
+    report: Callable[[Outcome], None] = lambda done: None,
 ) -> Outcome:
     """Run and leave the files; `profile` takes the place of the one that `options` name.
 
-    With `ends_process` a run that hangs when a signal asks for its end takes the process with it (watch/watchdog.py). `tell` gets the
+    With `ends_process` a run that hangs when a signal asks for its end takes the process with it (watch/watchdog.py). `report` gets the
     outcome once the files are whole and before the link is closed, which may wait for a device or a child process.
     """
     check_together(options)
@@ -159,7 +159,7 @@ def run_once(
                 with _monitor_of(options) as monitor:
                     around = _Around(stop, watchdog, monitor, metrics, ending)
                     done = _prepare_and_run(options, profile, around)
-                tell(done)
+                report(done)
                 return done
         except PansError:
             raise

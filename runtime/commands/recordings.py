@@ -34,16 +34,14 @@ from pans.runtime.report.words import passage_words
 OF_RECORDINGS = ("csv", "photon-hdf5", "parquet")
 OF_BUNDLES = ("onnx", "npy", "png")
 FORMATS = (*OF_RECORDINGS, *OF_BUNDLES)
-EITHER = "a recording (file, folder or index of its parts), or a bundle"
+EITHER = "a recording (file, or folder of its parts), or a bundle"
 
 
 # ---- replay ----
 
 
 def _configure_replay(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "recording", type=Path, help="a recording (.pansrec), a folder with one in parts, or the index of its parts"
-    )
+    parser.add_argument("recording", type=Path, help="a recording (.pansrec), or a folder with one in parts")
     parser.add_argument("--bundle", type=Path, help="decide with this bundle instead of the recorded one")
     parser.add_argument("--pictures", type=Path, metavar="OUT.npz", help="write the pictures that the head returns")
     parser.add_argument(
