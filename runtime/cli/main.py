@@ -38,9 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         code = _run(words)
     except KeyboardInterrupt as interrupt:
-        return fail(
-            PansError(str(interrupt) or "interrupted"), EXIT_INTERRUPTED
-        )  # a signal's handler says which it was
+        # a signal's handler says which signal it was
+        return fail(PansError(str(interrupt) or "interrupted"), EXIT_INTERRUPTED)
     except BrokenPipeError:
         _silence()  # the reader of our output went away: nothing more can be said to it
         return EXIT_FINE
