@@ -1,7 +1,6 @@
 """Where a training computes: on the processor, or on a CUDA device, by the same code.
 
-Owns the choice and its check; never moves data by itself: whatever torch makes while a device is chosen, is made there. The same seed
-gives the same result on one device and one version of torch; devices draw other random numbers, so that results differ between them.
+The same seed gives the same result on one device and one version of torch; devices draw other random numbers, so that results differ.
 """
 
 from __future__ import annotations

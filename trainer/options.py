@@ -1,23 +1,29 @@
-"""What to train: the options of `pans train`, and what of them is impossible on a profile.
+"""What can be asked of a training, a baseline and an evaluation: dataclasses whose fields are options of the command line.
 
-Owns the names, defaults and limits; never trains. `check_options` returns nothing, or raises with the numbers.
+`check_options` returns nothing, or raises with the numbers, for what cannot be trained on a profile; of automata adaptive/budget.py does.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Collection
+from dataclasses import MISSING, asdict, dataclass
 from typing import Any
 
+from pans.runtime.bundle.automaton import CHANNELS_MAX, CONFIDENCE_RANGE, SLOTS_MAX, STATES_MAX
+from pans.runtime.cli.option_fields import add_options, option, option_fields
+from pans.runtime.cli.option_fields import check_options as check_ranges
 from pans.runtime.errors import PlanError, UsageError, as_usage_error
-from pans.runtime.imaging import bleaching_of, tolerance_of
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of, tolerance_of
 from pans.runtime.instrument.click_law import OUTCOMES_MAX, cannot_count
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.ranges import Range
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
 EXACT_WORDS_MAX = 1 << EXACT_FEATURES_MAX
 STRAIGHT_THROUGH = ("ste", "identity")  # from the first epoch to the last
 ESTIMATOR_NAMES = (*STRAIGHT_THROUGH, "exact", "local", "disarm", "loo")  # estimators.py
+COUNTED_ESTIMATORS = ("ste", "exact", "local")  # those that know photon numbers
 ENCODERS = ("active", "coherent", "incoherent")
 PICTURE_HEADS = ("picture", "decoder")  # heads.py
 HEADS = ("mlp", "deep", "conv", *PICTURE_HEADS)
@@ -25,96 +31,277 @@ HEADS = ("mlp", "deep", "conv", *PICTURE_HEADS)
 # would not be back in time; it meets tight budgets. Gentle: the light is spent first and given back late, which found better patterns.
 BUDGETS = {"firm": (5.0, 3e-4), "gentle": (1.0, 1e-5)}
 DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
+METHODS = {  # of each paradigm of `pans baseline`, the default first
+    "direct": ("bayes", "cnn", "clean-cnn", "stopping"),
+    "compressive": ("mlp", "clean-mlp", "bayes"),
+    "e2e": ("qat", "plain"),
+    "fsi": ("deep", "pca"),
+    "hadamard": ("differences", "counts"),
+}
+
+LIGHT = Range(1e-9, 1e9)  # photoelectrons or clicks: beyond, nothing can be drawn or trained
+NONE_OR_LIGHT = Range(0, 1e9)
+BUDGET = Range(0.1, 1000)  # of an automaton
+SHARE = Range(0, 1)
+TENFOLD = Range(0, 10)
+SEED = Range(0, (1 << 63) - 1, whole=True)
+EPOCHS = Range(1, 100_000, whole=True)
+THOUSAND = Range(1, 1000, whole=True)
+UP_TO_THOUSAND = Range(0, 1000, whole=True)
+PIXELS = Range(0, 65536, whole=True)
+BATCH = Range(2, 1 << 20, whole=True)
+OUTCOMES = Range(2, OUTCOMES_MAX, whole=True)
+PATTERNS = Range(1, 4096, whole=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
     """What to train. `alpha` weighs the illumination; `photons`, `clicks` and `illumination` are targets per inference, held by weights."""
 
-    features: int
-    alpha: float | None = None
-    photons: float | None = None
-    clicks: float | None = None
-    estimator: str = "exact"
-    epochs: int = 60
-    seed: int = 0
-    restarts: int = 1
-    starts: int = 1  # runs of stage 1 per restart; the best on validation goes on
-    warm: float = 0.3  # part of the epochs that stage 1 takes, when another estimator follows it
-    head: str = "mlp"
-    hidden: int = 512
-    batch: int = 512
+    features: int = option(MISSING, "number of patterns (not of an automaton)", range=PATTERNS, metavar="D")
+    alpha: float | None = option(
+        None, "weight of the illumination in the loss (default 0.0003)", range=NONE_OR_LIGHT, metavar="A"
+    )
+    photons: float | None = option(None, "photoelectrons per decision to aim for", range=LIGHT, metavar="B")
+    clicks: float | None = option(None, "clicks per decision to aim for, beside either", range=LIGHT, metavar="C")
+    estimator: str = option(
+        "exact", "default: exact up to 12 patterns, else local; of pictures ste", choices=ESTIMATOR_NAMES
+    )
+    epochs: int = option(
+        60, "passes over the training objects (default 60; of an automaton 6)", range=EPOCHS, metavar="E"
+    )
+    seed: int = option(0, "of everything random (default 0)", range=SEED, metavar="N")
+    restarts: int = option(1, "trainings; the best on validation stays", range=THOUSAND, metavar="R")
+    starts: int = option(
+        1, "runs of the first stage per restart; the best is trained to the end", range=THOUSAND, metavar="S"
+    )
+    warm: float = option(0.3, "part of the epochs in the first stage, if another follows", range=SHARE, metavar="W")
+    head: str = option("mlp", "digital back end (default mlp; picture where the task asks for it)", choices=HEADS)
+    hidden: int = option(512, "hidden units of the head (default 512)", range=Range(1, 65536, whole=True), metavar="H")
+    batch: int = option(512, "objects per step (default 512; of an automaton 250)", range=BATCH, metavar="B")
     front_rate: float = 1e-2
     head_rate: float = 1e-3
     constant: bool = False  # learning rates as in the paper, instead of one cycle per estimator
-    slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
-    clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
-    similarity: float = 0.0  # share of 1 - SSIM in the loss of pictures; the rest is the squared error
-    polish: float = 0.0  # last part of the epochs, in which the loss turns from cross-entropy to wrong decisions
-    encoder: str = "active"
-    complex_field: bool = False  # of a coherent encoder: W complex; the paper's is real
-    conserving: bool = False  # of a passive encoder: no more light out than in; the paper's W is unconstrained
-    input_photons: float | None = (
-        None  # of passive sensing: mean photoelectrons that reach the encoder; None: full scale is 1
+    # of the light at the start; rises or falls to 1 within stage 1
+    slope: float = option(1.0, "slope annealing: light at the start times S", range=Range(1e-9, 1e6), metavar="S")
+    clamp: float = option(math.inf, "clamp photoelectrons early in training", range=LIGHT, metavar="L")
+    similarity: float = option(
+        0.0,
+        "of pictures: share of 1 - SSIM in the loss, the rest being the squared error (default 0)",
+        range=SHARE,
+        metavar="S",
     )
-    dark: float | None = None  # dark photoelectrons per exposure in training, instead of the profile's
-    budget: str = "firm"  # how fast the weight of a budget follows its excess: a key of BUDGETS
+    polish: float = option(0.0, "last part of the epochs, trained for decisions (default 0)", range=SHARE, metavar="P")
+    encoder: str = "active"
+    complex_field: bool = option(False, "a coherent encoder's W is complex, not real")
+    conserving: bool = option(False, "a passive encoder gives no more light than it gets (default)")
+    input_photons: float | None = option(
+        None, "mean photoelectrons that reach a passive encoder in one exposure", range=LIGHT, metavar="N"
+    )
+    dark: float | None = option(
+        None, "dark photoelectrons per exposure in training, instead of the profile's", range=NONE_OR_LIGHT, metavar="R"
+    )
+    budget: str = option(
+        "firm",
+        "how strictly --photons, --clicks and --illumination hold during training (default firm)",
+        choices=tuple(BUDGETS),
+    )
     light: float = 1.0  # of the initial patterns, times the paper's
-    mix: float = 0.0  # share of the loss that several shots have in stage 2, for patterns that gain from them
-    shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
-    shift_px: int = 0  # training images are moved by up to that much along the rows, for objects in flow
-    offset_px: int = 0  # and across them
-    copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
-    bleach: str | None = None  # what the patterns do to the objects, as `--bleach` spells it
-    optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
-    outcomes: int = 2  # of an exposure; 3: no photon, one, two or more, on a detector that counts
-    spread: float = 0.0  # weight in the loss of how concentrated the light of a pattern is (concentration.py)
-    illumination: float | None = None  # of patterns that are sent: sum of their intensities
+    mix: float = option(
+        0.0, "share of the loss of 2 to K shots, for patterns too (default 0)", range=SHARE, metavar="M"
+    )
+    shots: int = option(1, "fit the head to 1 to K shots (default 1)", range=Range(1, 64, whole=True), metavar="K")
+    shift_px: int = option(0, "move training images by up to X along the rows (default 0)", range=PIXELS, metavar="X")
+    offset_px: int = option(0, "and by up to Y across them (default 0)", range=PIXELS, metavar="Y")
+    copies: int = option(
+        0,
+        "add N distorted copies of every training image: turned, stretched, bent a little (default 0; of an automaton for mnist 20)",
+        range=UP_TO_THOUSAND,
+        metavar="N",
+    )
+    bleach: str | None = option(
+        None,
+        "train for objects of many emitters per pixel that bleach: 1/e of a pixel's light is left after D0 photoelectrons of illumination",
+        metavar="D0[:mixed]",
+    )
+    optics: str | None = option(
+        None,
+        "train through optics drawn within this tolerance, like shift=1:rotate=2:psf=0.5..0.8:black=0.002",
+        metavar="SPEC",
+    )
+    outcomes: int = option(
+        2,
+        "outcomes of an exposure; 3: no photon, one, two or more, on a detector that counts (default 2)",
+        range=OUTCOMES,
+        metavar="K",
+    )
+    spread: float = option(
+        0.0,
+        "weight in the loss of how concentrated the light of a pattern is, for optics that are not perfect (default 0)",
+        range=TENFOLD,
+        metavar="W",
+    )
+    illumination: float | None = option(
+        None, "photoelectrons to send per decision, summed over all pixels of all patterns", range=LIGHT, metavar="L"
+    )
 
 
-SLOPE_MAX = 1e6  # times the light that is meant: far beyond what annealing needs
-LIGHT_MAX = 1e9  # photoelectrons, clicks or weights: beyond, nothing can be drawn or trained
-LIMITS = {
-    "features": (1, 4096),
-    "epochs": (1, 100_000),
-    "restarts": (1, 1000),
-    "starts": (1, 1000),
-    "hidden": (1, 65536),
-    "batch": (2, 1 << 20),
-    "seed": (0, 2**63 - 1),
-    "shots": (1, 64),
-    "warm": (0, 1),
-    "polish": (0, 1),
-    "spread": (0, 10),
-    "similarity": (0, 1),
-    "mix": (0, 1),
-    "shift_px": (0, 65536),
-    "offset_px": (0, 65536),
-    "copies": (0, 1000),
-    "outcomes": (2, OUTCOMES_MAX),
-}
-COUNTED_ESTIMATORS = ("ste", "exact", "local")  # readings.py
-CHOICES = {"budget": BUDGETS, "encoder": ENCODERS, "head": HEADS, "estimator": ESTIMATOR_NAMES}
+@dataclass(frozen=True, slots=True)
+class AutomatonOptions:
+    """What to train. `photons` or `clicks` is the budget of one decision, on average; 0 exposures or states stand for defaults."""
+
+    photons: float | None = option(None, "photoelectrons per decision to aim for", range=BUDGET)
+    clicks: float | None = option(None, "clicks per decision to aim for", range=BUDGET)
+    exposures: int = option(
+        0, "exposures per decision (default: by the budget)", range=Range(0, SLOTS_MAX, whole=True), metavar="T"
+    )
+    states: int = option(
+        0, "most states per exposure (default: by the budget)", range=Range(0, STATES_MAX, whole=True), metavar="S"
+    )
+    seed: int = option(0, "of everything random", range=SEED)
+    batch: int = option(250, "objects per step", range=BATCH)
+    grow_epochs: int = 2
+    candidates: int = 6
+    first_price: float = 0.2  # nats per photoelectron of the first exposure, halved every `half` levels
+    half: float = 6.0
+    tune_epochs: int | None = None  # of grey patterns; None: 3, or 0 through optics, where they brought nothing
+    epochs: int = option(6, "of the patterns as they are displayed", range=EPOCHS)
+    tune_rate: float = 0.005
+    rate: float = option(0.01, "learning rate of its last stage (default 0.01)", range=SHARE, metavar="R")
+    reroutes: int = option(2, "sweeps that move edges to better states (default 2)", range=UP_TO_THOUSAND, metavar="R")
+    shift_px: int = option(0, "along the rows, anew in every epoch", range=PIXELS)
+    offset_px: int = option(0, "and across them", range=PIXELS)
+    copies: int | None = option(
+        None, "distorted copies, which the epochs take in turn (default: by the task)", range=UP_TO_THOUSAND
+    )
+    grey: bool = option(False, "patterns in all levels, not one bit and a brightness")
+    # at full strength distortions cost more than they bring
+    strength: float = option(0.3, "of the distortions, times the usual (default 0.3)", range=TENFOLD, metavar="F")
+    # from the second epoch of the last stage on; the rest is the log loss
+    decide: float = option(
+        0.7, "part of the last loss that counts wrong decisions (default 0.7)", range=SHARE, metavar="F"
+    )
+    exposure_price: float = option(
+        0.0, "nats per exposure; walks then end early where that pays (default 0)", range=TENFOLD, metavar="P"
+    )
+    patterns: int = option(
+        0,
+        "most different patterns, which states share (default: the projector's memory)",
+        range=Range(0, 65_535, whole=True),
+        metavar="P",
+    )
+    soft: float | None = option(
+        None,
+        "weight of a network's answers in the targets (default: 0.5 for fashion-mnist, else 0)",
+        range=SHARE,
+        metavar="W",
+    )
+    teacher_epochs: int = 6  # of that network
+    dark: float | None = option(None, "dark photoelectrons per exposure, instead of the profile's", range=NONE_OR_LIGHT)
+    optics: str | None = option(None, "tolerance of the optics to train through")
+    spread: float = option(0.0, "weight of the concentration of the light", range=TENFOLD)
+    outcomes: int = option(2, "of one exposure", range=OUTCOMES)
+    channels: int = option(
+        1,
+        "detectors that are read at once, each with a pattern of its own (default 1, at most 4)",
+        range=Range(1, CHANNELS_MAX, whole=True),
+        metavar="C",
+    )
+    start: str | None = None  # sha256 of the bundle whose automaton is trained on, instead of one that grows
+
+    @property
+    def successors(self) -> int:
+        """Number of outcomes of one exposure."""
+        return 1 << self.channels if self.channels > 1 else self.outcomes
+
+
+@dataclass(frozen=True, slots=True)
+class BaselineOptions:
+    """One way to measure and to decide. `epochs`, `trials` and `floor` at None: the default of the method."""
+
+    paradigm: str = option(MISSING, "how the object is measured", flag="paradigm", choices=tuple(METHODS))
+    method: str = option(MISSING, "; ".join(f"{k}: {', '.join(v)}" for k, v in METHODS.items()), metavar="M")
+    features: int = option(32, "patterns, masks or pairs, unless direct (default 32)", range=PATTERNS, metavar="D")
+    patterns: str = option("binary", "of compressive sensing", choices=("binary", "hadamard"))
+    detector: str = option(
+        "counting", "Poisson counts, or one click at most (default counting)", choices=("counting", "binary")
+    )
+    brightness: str = option(
+        "source", "one source for all objects (default), or every object gives N photons", choices=("source", "object")
+    )
+    floor: float | None = option(
+        None, "of bayes: least transmission (default: chosen)", range=Range(1e-9, 1 - 1e-9), metavar="F"
+    )
+    dark: float = option(0.0, "dark photoelectrons per readout", range=NONE_OR_LIGHT, metavar="R")
+    bits: int = option(4, "of qat: bits of a detected value (default 4)", range=Range(1, 16, whole=True), metavar="B")
+    epochs: int | None = option(
+        None,
+        "of a network (default: 5 CNN, 10 MLP and pairs, 15 end-to-end and masks)",
+        range=Range(1, 10_000, whole=True),
+        metavar="E",
+    )
+    trials: int | None = option(
+        None,
+        "readouts per object (default: bayes 2, stopping 1, others 10)",
+        range=Range(1, 100_000, whole=True),
+        metavar="N",
+    )
+    information: bool = option(
+        False, "of bayes, on a counting detector: bits that the readouts know of the label, and Fisher's ratio"
+    )
+    seed: int = option(0, "of everything random (default 0)", range=SEED, metavar="N")
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """How the objects are shown: by default through the profile that the bundle was trained for, as it is."""
+
+    profile: str | None = option(None, "default: what the bundle was trained for", metavar="P")
+    eta: float = option(1.0, "scale all light by E (default 1)", type=float, metavar="E")
+    dark: float | None = option(
+        None, "dark photoelectrons per exposure, instead of the profile's", type=float, metavar="R"
+    )
+    seed: int = option(0, "of the trials (default 0)", range=SEED, metavar="N")
+    data_seed: int | None = option(
+        None, "of a drawn task (default: that of the bundle's training)", range=SEED, metavar="N"
+    )
+    confidence: float = option(
+        0.0,
+        "of an automaton: decide as soon as a class is this probable, abstain if none is at the end",
+        range=CONFIDENCE_RANGE,
+        metavar="C",
+    )
+    imaging: Imaging | None = None  # how objects stand on the grid of the patterns; None: as the profile states
+    bleaching: Bleaching = NO_BLEACHING  # what the light does to the objects, each of them fresh when it comes
+
+    def imaging_on(self, profile: Profile) -> Imaging:
+        """Return how objects stand on the grid of the patterns, on `profile`."""
+        return profile.imaging() if self.imaging is None else self.imaging
+
+
+def option_names(kind: type[Any]) -> tuple[str, ...]:
+    """Return the names of the fields of `kind` that are options."""
+    return tuple(one.name for one, _ in option_fields(kind))
+
+
+def add_unset_options(parser: Any, kind: type[Any], omit: Collection[str] = ()) -> None:
+    """Add the options of `kind`; those that are not given stay None, so that a task or its images can choose them."""
+    unset = {one.name: None for one, _ in option_fields(kind) if not isinstance(one.default, bool)}
+    add_options(parser, kind, defaults=unset, omit=omit)
+
+
+def flag_of(name: str) -> str:
+    """Return the option that fills the field `name`."""
+    return "--" + name.replace("_", "-")
 
 
 def check_options(options: Options, profile: Profile) -> None:
     """Raise UsageError or PlanError for what cannot be trained on this profile."""
-    for name, (low, high) in LIMITS.items():
-        if not low <= getattr(options, name) <= high:
-            raise UsageError(f"{_flag(name)} is {getattr(options, name)}, allowed: {low} to {high}")
-    for name, allowed in CHOICES.items():
-        if getattr(options, name) not in allowed:
-            raise UsageError(f"{_flag(name)} is {getattr(options, name)!r}, allowed: {', '.join(allowed)}")
-    for name in ("alpha", "photons", "clicks", "illumination", "light", "input_photons"):
-        value = getattr(options, name)
-        if value is not None and not (value <= LIGHT_MAX and (value > 0 or (name == "alpha" and value == 0))):
-            raise UsageError(f"{_flag(name)} is {value:g}, allowed: above 0, at most {LIGHT_MAX:g}")
-    if not 0 < options.slope <= SLOPE_MAX or not (0 < options.clamp <= LIGHT_MAX or options.clamp == math.inf):
-        raise UsageError(
-            f"--slope is {options.slope:g}, --clamp is {options.clamp:g}, allowed: above 0 (slope to {SLOPE_MAX:g})"
-        )
-    if options.dark is not None and not 0 <= options.dark <= LIGHT_MAX:
-        raise UsageError(f"--dark is {options.dark:g}, allowed: 0 to {LIGHT_MAX:g}")
+    check_ranges(options)
+    if options.encoder not in ENCODERS:
+        raise UsageError(f"--encoder is {options.encoder!r}, allowed: {', '.join(ENCODERS)}")
+    if not LIGHT.holds(options.light):
+        raise UsageError(f"light is {options.light:g}, allowed: {LIGHT.allowed}")
     _check_together(options)
     _check_fits(options, profile)
 
@@ -125,63 +312,49 @@ def check_optics(text: str) -> None:
         tolerance_of(text)
 
 
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
 def _check_together(options: Options) -> None:
-    """Options that are right by themselves and not beside each other."""
-    if options.clicks is not None and options.clicks >= options.features * (options.outcomes - 1):
-        raise UsageError(
-            f"--clicks is {options.clicks}, allowed: below {options.features * (options.outcomes - 1)}, "
-            f"{'one click' if options.outcomes == 2 else f'{options.outcomes - 1} photons'} per pattern at most"
-        )
-    if options.illumination is not None and options.encoder != "active":
+    """Refuse options that are right by themselves and not together."""
+    active, counted = options.encoder == "active", options.outcomes > 2
+    most_clicks = options.features * (options.outcomes - 1)
+    most_patterns = int(math.log(EXACT_WORDS_MAX, options.outcomes) + 1e-9)
+    if options.clicks is not None and options.clicks >= most_clicks:
+        raise UsageError(f"--clicks is {options.clicks}, allowed: below {most_clicks}, all that the patterns can bring")
+    if options.illumination is not None and not active:
         raise UsageError(f"--illumination: a {options.encoder} encoder sends no light", remedy="--input-photons N")
-    most = int(math.log(EXACT_WORDS_MAX, options.outcomes) + 1e-9)
-    if options.estimator == "exact" and options.features > most:
+    if options.estimator == "exact" and options.features > most_patterns:
         raise UsageError(
-            f"the exact estimator enumerates {options.outcomes}**{options.features} click words, allowed: at most {most} patterns",
+            f"the exact estimator enumerates {options.outcomes}**{options.features} click words, allowed: at most "
+            f"{most_patterns} patterns",
             remedy="use --estimator local",
         )
     if options.optics is not None:
         check_optics(options.optics)
-        if options.encoder != "active":
+        if not active:
             raise UsageError(
                 f"--optics: a {options.encoder} encoder shows no patterns that could miss the object",
                 remedy="leave it out, or use --encoder active or automaton",
             )
     if options.bleach is not None:
-        _check_bleach(options)
-    if options.outcomes > 2:
-        _check_counted(options)
-    if options.mix > 0 and options.shots < 2:
-        raise UsageError(f"--mix is {options.mix} with --shots {options.shots}", remedy="--shots 2, or more")
-
-
-def _check_counted(options: Options) -> None:
-    """What photon numbers of fixed patterns do not go with."""
-    if options.encoder != "active" or options.head in PICTURE_HEADS or options.bleach is not None:
+        with as_usage_error():
+            bleaching_of(options.bleach)
+        if not active or options.optics is not None or options.shots > 1:
+            raise UsageError(
+                "--bleach is for patterns that are sent once each, on perfect optics: not for a passive encoder, --optics or --shots",
+                remedy="leave --bleach out, or the other one",
+            )
+    if counted and (not active or options.head in PICTURE_HEADS or options.bleach is not None):
         raise UsageError(
-            f"--outcomes {options.outcomes} is for patterns that are shown and classes: not for a passive encoder, pictures or --bleach",
+            f"--outcomes {options.outcomes} is for patterns that are sent, and classes: not for a passive encoder, pictures or --bleach",
             remedy="leave --outcomes out, or the other one",
         )
-    if options.estimator not in COUNTED_ESTIMATORS:
+    if counted and options.estimator not in COUNTED_ESTIMATORS:
         raise UsageError(
             f"--estimator {options.estimator} knows clicks alone, allowed with --outcomes {options.outcomes}: "
             f"{', '.join(COUNTED_ESTIMATORS)}",
             remedy="use --estimator local",
         )
-
-
-def _check_bleach(options: Options) -> None:
-    with as_usage_error():
-        bleaching_of(options.bleach or "")
-    if options.encoder != "active" or options.optics is not None or options.shots > 1:
-        raise UsageError(
-            "--bleach is for patterns that are sent once each, on perfect optics: not for a passive encoder, --optics or --shots",
-            remedy="leave --bleach out, or the other one",
-        )
+    if options.mix > 0 and options.shots < 2:
+        raise UsageError(f"--mix is {options.mix} with --shots {options.shots}", remedy="--shots 2, or more")
 
 
 def check_order(order: str | None, options: Options) -> None:
@@ -194,29 +367,30 @@ def check_order(order: str | None, options: Options) -> None:
 
 
 def _check_fits(options: Options, profile: Profile) -> None:
-    channels = profile.detector.channels
-    if options.outcomes > 2:
-        why = cannot_count(profile, options.outcomes)
-        if why or profile.mode != "sequential":
-            raise PlanError(
-                why
-                or f"--outcomes {options.outcomes}: {profile.name} shows all patterns at once, which no photon numbers are told of",
-                remedy="use a profile whose detector counts: --profile dmd-qcmos",
-            )
-    if profile.mode == "parallel" and options.features > channels:
+    """Refuse what the detector or the projector of `profile` cannot do."""
+    sequential = profile.mode == "sequential"
+    why = cannot_count(profile, options.outcomes) if options.outcomes > 2 else ""
+    if options.outcomes > 2 and (why or not sequential):
+        raise PlanError(
+            why
+            or f"--outcomes {options.outcomes}: {profile.name} displays all patterns at once, photon numbers need them in turn",
+            remedy="use a profile whose detector counts: --profile dmd-qcmos",
+        )
+    if options.bleach is not None and not sequential:
+        raise UsageError(
+            f"--bleach: {profile.name} displays all patterns at once, none meets what another has left",
+            remedy="leave it out",
+        )
+    channels, memory = profile.detector.channels, profile.projector.pattern_memory
+    if not sequential and options.features > channels:
         raise PlanError(
             f"{options.features} patterns at once, {profile.name} has {channels} detector channels",
             remedy=f"--features {channels}, or fewer",
         )
-    if options.bleach is not None and profile.mode != "sequential":
-        raise UsageError(
-            f"--bleach: {profile.name} shows all patterns at once, none meets what another has left",
-            remedy="leave it out",
-        )
-    if options.encoder == "active" and options.features > profile.projector.pattern_memory:
+    if options.encoder == "active" and options.features > memory:
         raise PlanError(
-            f"{options.features} patterns, the pattern memory of {profile.name} holds {profile.projector.pattern_memory}",
-            remedy=f"--features {profile.projector.pattern_memory}, or fewer",
+            f"{options.features} patterns, the pattern memory of {profile.name} holds {memory}",
+            remedy=f"--features {memory}, or fewer",
         )
 
 

@@ -1,9 +1,8 @@
 """Which matrix products and convolutions torch really computes on this processor, found by trying them in child processes.
 
-In: the processor and the installed torch. Out: a `Choice`: the type of training's products and the environment that torch needs. A
-processor's flags are no proof: a virtual machine may announce AMX and refuse it, and then every bfloat16 product and every convolution
-of oneDNN fails, or ends the process by SIGILL. So each candidate is tried once, checked and timed. The answer is kept in the user's cache
-folder, by machine and torch version. Start reading at `settle`. Nothing here loads torch into this process.
+A processor's flags are no proof: a virtual machine may announce AMX and refuse it, and then every bfloat16 product and every convolution
+of oneDNN fails, or ends the process by SIGILL. So each candidate is tried once, checked and timed; the answer is kept in the user's cache
+folder, by machine and torch version. Start with `settle`. Nothing here loads torch into this process.
 """
 
 from __future__ import annotations
@@ -86,13 +85,16 @@ class Choice:
 def settle() -> Choice | None:
     """Set the environment that torch needs here and return what was chosen; None where torch is not installed.
 
-    It must come before torch's first operation. The first call on a machine tries the candidates, which takes a few seconds. Later calls
-    read the answer.
+    It must come before torch's first operation. The first call on a machine tries the candidates, which takes a few seconds.
     """
     try:
         choice = _kept()
         if choice is None:
-            choice = _tried()
+            say("pans: trying which products this processor computes: once per machine and torch version")
+            trials = [attempt(LIMITS[0])]
+            while not trials[-1].complete and len(trials) < len(LIMITS):
+                trials.append(attempt(LIMITS[len(trials)]))
+            choice = choose(trials)
             _keep(choice)
             os.environ.update(choice.limits)
             _keep(choice)  # once more, by the environment that child processes inherit
@@ -116,18 +118,13 @@ def choose(trials: list[Trial]) -> Choice:
 
 def attempt(limits: dict[str, str]) -> Trial:
     """Compute products and convolutions in a child process under `limits`: it may die, as of an illegal instruction."""
-    started = [sys.executable, "-c", "from pans.trainer.processor import compute_all; compute_all()"]
-    silence = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    command = [sys.executable, "-c", "from pans.trainer.processor import compute_all; compute_all()"]
+    environment = {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"), **limits}
     try:
-        done = subprocess.run(
-            started, env={**os.environ, **silence, **limits}, capture_output=True, text=True, timeout=PATIENCE_S
-        )
-        ended = (
-            f"the process ended with {done.returncode}"
-            if done.returncode >= 0
-            else signal.Signals(-done.returncode).name
-        )
-        printed = done.stdout
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+        ended, printed = f"the process ended with {done.returncode}", done.stdout
+        if done.returncode < 0:
+            ended = signal.Signals(-done.returncode).name
     except subprocess.TimeoutExpired as error:
         ended, printed = f"no answer within {PATIENCE_S:.0f} s", (error.stdout or b"").decode()
     answers = dict(line.split("=", 1) for line in printed.splitlines() if line.startswith(TYPES))
@@ -219,25 +216,10 @@ def _rates(gflops: dict[str, float]) -> str:
     return ", ".join(f"{name} {rate:.0f} GFLOP/s" for name, rate in gflops.items()) or "nothing"
 
 
-def _tried() -> Choice:
-    version("torch")
-    say("pans: trying which products this processor computes: once per machine and torch version")
-    trials: list[Trial] = []
-    for limits in LIMITS:
-        trials.append(attempt(limits))
-        if trials[-1].complete:
-            break
-    return choose(trials)
-
-
-# ---- the answer of this machine ----
-
-
 def _announced() -> str:
     """Return the wide instruction sets that the processor's flags name."""
-    return ", ".join(
-        sorted(flag for flag in _cpu().split() if flag.startswith(("amx", "avx512_bf16", "avx512f", "avx2")))
-    )
+    wide = ("amx", "avx512_bf16", "avx512f", "avx2")
+    return ", ".join(sorted(flag for flag in _cpu().split() if flag.startswith(wide)))
 
 
 def _cpu() -> str:
@@ -258,8 +240,8 @@ def _file() -> Path:
 def _kept() -> Choice | None:
     """Return the answer that was kept; None where there is none, or none that can be read."""
     with suppress(OSError, ValueError, TypeError, KeyError):
-        told = json.loads(_file().read_text(encoding="utf-8"))
-        choice = Choice(told["products"], told["limits"], [Trial(**trial) for trial in told["trials"]])
+        kept = json.loads(_file().read_text(encoding="utf-8"))
+        choice = Choice(kept["products"], kept["limits"], [Trial(**trial) for trial in kept["trials"]])
         if choice.products in TYPES and choice.limits in LIMITS and choice.trials:
             return choice
     return None

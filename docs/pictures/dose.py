@@ -12,9 +12,10 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.imaging import NO_BLEACHING
 from pans.trainer.commands.evaluate import dose_curve_words
 from pans.trainer.evaluate.dose import dose_curve
-from pans.trainer.evaluate.held_out import Conditions, held_out_of
+from pans.trainer.evaluate.held_out import held_out_of
 from pans.trainer.evaluate.pictures import draw_dose
 from pans.trainer.export.ordering import information_order, reordered
+from pans.trainer.options import Conditions
 
 if __name__ == "__main__":
     objects = int(sys.argv[1]) if len(sys.argv) > 1 else None

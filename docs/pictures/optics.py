@@ -10,9 +10,10 @@ from pathlib import Path
 
 from pans.runtime.bundle.model import load_bundle
 from pans.trainer.commands.evaluate import optics_curve_words
-from pans.trainer.evaluate.held_out import Conditions, held_out_of, imaging_on
+from pans.trainer.evaluate.held_out import held_out_of
 from pans.trainer.evaluate.optics import misalignment_curves
 from pans.trainer.evaluate.pictures import draw_optics
+from pans.trainer.options import Conditions
 
 OBJECTS = 2000
 
@@ -21,7 +22,7 @@ if __name__ == "__main__":
     for name in sys.argv[1:] or ["fashion10", "fashion-adaptive"]:
         bundle = load_bundle(name)[0]
         held_out = held_out_of(bundle, None, OBJECTS, None, Conditions())
-        about = imaging_on(held_out, Conditions())
+        about = Conditions().imaging_on(held_out.profile)
         drawn[bundle.name] = misalignment_curves(bundle, held_out, about)
         print(optics_curve_words(bundle.name, OBJECTS, about, drawn[bundle.name]))
     print(draw_optics(Path(__file__).parent, drawn, force=True))

@@ -1,12 +1,7 @@
-"""What every node knows: class posteriors from training objects, calibrated on objects held back.
+"""The end of a training: the budget is met, brightness is rounded, posteriors are calibrated, and the arrays of a bundle are made.
 
-Owns smoothing (pseudo-objects of every class) and sharpness (a power per level), both chosen by the log loss of the held-back objects,
-and how far stated confidence is from the share of right decisions. Numpy in float64; exact expectations, nothing is sampled.
-
-The finished automaton as arrays: patterns in projector levels, dwell, successors and posteriors, numbered as a bundle holds them.
-
-Owns the way from brightness to whole dwell steps or levels, the last step to the budget, the numbering, and patterns that several
-states share; never trains.
+Posteriors come from class counts of training objects, smoothed and sharpened by the log loss of objects held back. Exact expectations in
+float64.
 """
 
 from __future__ import annotations
@@ -203,7 +198,7 @@ def finished(machine: Machine, posteriors: Posteriors, profile: Profile, grid: G
     rows, dwells, top, channels = [], [], 0.0, 1
     levels = profile.projector.levels
     for level in machine.levels:
-        mask, scale = (None if part is None else part.double().cpu().numpy() for part in level.light.shown())
+        mask, scale = (None if part is None else part.double().cpu().numpy() for part in level.light.displayed())
         assert mask is not None
         channels = len(mask) // level.n_states
         if grid is None:

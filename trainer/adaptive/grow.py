@@ -1,13 +1,8 @@
 """Growing an automaton level by level: new patterns for every state, trained on what their outcome tells, then merged.
 
-Owns one level at a time: candidates from the class means that each state sees, the best of them trained by Adam on the expected
-cross-entropy of its children, one per outcome, and the price of its light, and the merging of the children to as many states as are
-wanted. Growing looks one exposure ahead; what lies further ahead is tuned (tune.py).
-
-Merging states by the agglomerative information bottleneck (Slonim and Tishby 1999): the pair goes first that tells least apart.
-
-Owns the cost, which is the information on the class that is lost (Jensen-Shannon divergence times mass), and the greedy order. Works on
-class counts alone: (nodes, classes), float64; memory is the square of the number of nodes.
+Candidates come from the class means that each state sees; the best are trained by Adam on the expected cross-entropy of their children
+and the price of their light. The children are merged by the agglomerative information bottleneck (Slonim and Tishby 1999): the pair goes
+first whose merger loses least information on the class. Growing looks one exposure ahead; what lies further ahead is tuned (tune.py).
 """
 
 from __future__ import annotations
@@ -153,12 +148,12 @@ class Growth:
             share = 0.05 if epoch == 0 else 0.03
             for index in torch.randperm(len(self.blocks), generator=self.random).tolist():
                 alpha, block = self.alphas[index], self.blocks[index]
-                mask, _ = light.shown()
+                mask, _ = light.displayed()
                 chances, falls = readings(self.sight.light(mask, block.grey), self.sight.law)
                 arrived = [(alpha * chance) @ block.one_hot.T for chance in chances]
                 slope = slope_of(falls, _told(parts, whole, block), self.sight.law)
                 slope.neg_().add_(price).mul_(by_row(alpha, self.channels)).mul_(1.0 / len(block))
-                light.take(self.sight.mask_slope(slope, block.grey, light), None)
+                light.set_gradients(self.sight.mask_slope(slope, block.grey, light), None)
                 optimiser.param_groups[0]["lr"] = options.rate * (1 - done / steps) + 1e-4
                 optimiser.step()
                 light.settle()
@@ -169,7 +164,7 @@ class Growth:
 
     def _outcome_counts(self, light: Grey) -> list[Tensor]:
         """Class counts of all outcomes but the last, each (states, classes)."""
-        mask, _ = light.shown()
+        mask, _ = light.displayed()
         totals: list[Tensor] = []
         for alpha, block in zip(self.alphas, self.blocks):
             chances, _ = readings(self.sight.light(mask, block.grey), self.sight.law)
@@ -191,7 +186,7 @@ class Growth:
 
     def _carry(self, light: Grey, successors: Tensor, n_nodes: int) -> None:
         """Carry the probabilities of all objects over one level, and add up its light and clicks."""
-        mask, _ = light.shown()
+        mask, _ = light.displayed()
         photons = clicks = 0.0
         for index, block in enumerate(self.blocks):
             alpha, brought = self.alphas[index], self.sight.light(mask, block.grey)

@@ -1,16 +1,8 @@
-"""The patterns of one level as parameters: grey, in whole projector levels, or one bit with a brightness per state.
+"""The automaton while it is trained: levels of states with their patterns and successors, and the class counts of its leaves.
 
-Owns the way from parameters to what is shown, and the way back of the gradient. Of several channels a state has as many rows of pixels
-(`parts`), one after the other, and one brightness. What is shown is `scale * mask`: `mask` (states,
-pixels) goes into the matrix products, `scale` (states, 1) does not. Grey patterns are squares, so that no light is negative; levels
-and bits pass the gradient straight through their rounding (levels) or as a smooth step would (bits).
-
-The automaton while it is trained: levels of states, their successors, and the class counts of its leaves.
-
-Owns the exact forward pass (the probability of every node, given an object), the exact gradient of the expected loss, and the matrix
-products in reduced precision that make both quick. A level has states; an outcome (no click, click; 0, 1, 2+ photons; or the clicks of
-several channels) of a state leads to a node of the next level; nodes are that level's states first, then its leaves. Nodes of the last
-level are all leaves.
+`forward` gives the probability of every node for every object, `backward` the exact gradient of the expected loss. An outcome (no click,
+click; 0, 1, 2+ photons; or the clicks of several channels) of a state leads to a node of the next level; nodes are that level's states
+first, then its leaves. Nodes of the last level are all leaves.
 
 Tensors stand as (states, objects): rows are moved whole along the edges. For a state s of a level, with alpha its probability, q that
 of no click and beta the expected loss from there on:
@@ -20,12 +12,10 @@ of no click and beta the expected loss from there on:
     d loss / d light(s) = alpha(s) * (sum_k q_k'(s) beta'(successor_k(s)) + price)
 
 The logarithm of a leaf's posterior is its loss; the class counts behind it are running means, whose own gradient vanishes at the
-optimum (envelope theorem). Decisions, the largest counts, are constant but where two are equal; a loss that counts wrong ones has
-a gradient all the same, as it is the probability of the leaves that changes.
+optimum (envelope theorem). A loss that counts wrong decisions has a gradient too: the probability of the leaves changes.
 
-A machine as plain values and tensors, for a checkpoint, and back; and a machine made of an automaton in a bundle.
-
-Owns these directions; never reads or writes a file.
+Patterns are grey (`Grey`) or of one bit with a brightness (`Bits`); what is displayed is `scale * mask`. Of several channels a state has
+as many rows of pixels (`parts`) and one brightness.
 """
 
 from __future__ import annotations
@@ -70,7 +60,7 @@ class Grey:
         """Return what an optimiser changes."""
         return [self.root]
 
-    def shown(self) -> tuple[Tensor, Tensor | None]:
+    def displayed(self) -> tuple[Tensor, Tensor | None]:
         """Return (mask, scale); no scale stands for 1."""
         light, scale = self.root.square(), self.scale()
         if scale is not None:
@@ -93,7 +83,7 @@ class Grey:
             return slope
         return slope.scatter_add_(1, self.root.abs().argmax(dim=1, keepdim=True), of_full)
 
-    def take(self, slope: Tensor, _: Tensor | None) -> None:
+    def set_gradients(self, slope: Tensor, _: Tensor | None) -> None:
         """Set the gradients from that of the mask times the scale; `slope` is used up."""
         factor = 2.0 * (self.levels - 1) / self.top if self.levels else 2.0
         self.root.grad = slope.mul_(self.root).mul_(factor)
@@ -129,7 +119,7 @@ class Bits:
         """Return the pixels' parameters of every state, (states, pixels)."""
         return self.lean if self.rows is None else self.lean[self.rows]
 
-    def shown(self) -> tuple[Tensor, Tensor]:
+    def displayed(self) -> tuple[Tensor, Tensor]:
         """Return (mask, scale)."""
         lean = self.own()
         return torch.gt(lean, 0, out=torch.empty_like(lean)), self.scale()
@@ -150,7 +140,7 @@ class Bits:
         """Return `slope`: what a full pixel has does not depend on the parameters."""
         return slope
 
-    def take(self, slope: Tensor, light_slope: Tensor | None) -> None:
+    def set_gradients(self, slope: Tensor, light_slope: Tensor | None) -> None:
         """Set the gradients from those of the mask (times the scale) and of the logarithm of the scale; `slope` is used up.
 
         The gradient of a bit is 1 / (1 + 2 lean**2)**2, which is near that of sigmoid(4 lean) and takes an eighth of the time.
@@ -336,7 +326,7 @@ class Pass:
 
 def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
     """Return the light (rows, objects) that the patterns of `light` bring from objects of `grey`."""
-    mask, scale = light.shown()
+    mask, scale = light.displayed()
     result = sight.light(mask, grey, light.full(mask) if sight.dark_pixels else None)
     return result if scale is None else result.mul_(scale)
 
@@ -423,8 +413,8 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         mask_slope = mask_slope if scale is None else mask_slope.mul_(scale)
         if aim.spread:
             mass = step.alpha.sum(dim=1, keepdim=True).mul_(aim.spread * share / len(machine.levels))
-            mask_slope.addcmul_(by_row(mass, channels), concentration_slope(level.light.shown()[0]))
-        level.light.take(mask_slope, light_slope)
+            mask_slope.addcmul_(by_row(mass, channels), concentration_slope(level.light.displayed()[0]))
+        level.light.set_gradients(mask_slope, light_slope)
         beta = gains[0].mul_(step.chances[0])
         for chance, gain in zip(step.chances[1:], gains[1:]):
             beta.addcmul_(chance, gain)

@@ -1,9 +1,8 @@
-"""What the training of an automaton sees: grey values of the objects, in an order and a distortion that change from epoch to epoch.
+"""What the training of an automaton sees: blocks of objects in an order and a distortion that change from epoch to epoch.
 
-Owns the split into objects to fit and objects held back (they set prices and calibrate, no pattern is trained on them), the random
-order, soft targets in place of the labels (train/teacher.py), and blocks of one size. Grey values stay whole
-numbers, exact in bfloat16 up to 256; the transmission is floor + gain * grey. Through drawn optics (model/imaging.py) they are
-transmission / gain with one more column, the light of dark pattern pixels.
+Objects held back set prices and calibrate; no pattern is trained on them. Grey values stay whole numbers, exact in bfloat16 up to 256; the
+transmission is floor + gain * grey. Through drawn optics (model/imaging.py) they are transmission / gain with one more column, the light
+of dark pattern pixels.
 """
 
 from __future__ import annotations
@@ -89,11 +88,6 @@ class TrainingObjects:
             raise ValueError(f"answers {answers.shape}, allowed: {(self.n_fit, self.n_classes)}")
         labels = np.eye(self.n_classes, dtype=np.float32)[self._fit.labels]
         self._targets = weight * answers + np.float32(1.0 - weight) * labels
-
-    def mean_transmission(self) -> Tensor:
-        """Return the mean transmission of every pixel over the first objects, float32 (pixels,)."""
-        grey = torch.from_numpy(self._grey(self._fit.images[:10_000]).copy())
-        return here(self._black + self.gain * grey.float().mean(dim=0))
 
     def wide(self, objects: Objects) -> Tensor:
         """Return the grey values of any objects of the task on perfect optics, float64 (objects, pixels), as blocks have them."""

@@ -1,8 +1,7 @@
-"""What one exposure can tell, with the light that reaches the detectors as argument: clicks of one or of several, or a number of photons.
+"""The chances of an exposure's outcomes and their slopes, from the light on the detectors: clicks of one or several, or photon numbers.
 
-Owns the probability of every outcome and its slope, as fast as training needs it; the laws themselves are those of `runtime.instrument`
-(click_law.py). Tensors in, tensors out, of any one shape; float32 in training, float64 where figures are compared. The last
-outcome is what remains: its probability is 1 less the others', its slope minus theirs.
+The laws are those of `runtime.instrument`, in torch and as fast as training needs; float32 in training, float64 where figures are compared.
+The last outcome is what remains: its probability is 1 less the others', its slope minus theirs.
 
 Of c channels that are read at once a state has c rows of light, one after the other, and 2**c outcomes: bit k is the click of channel k.
 Given the light, channels click independently: an outcome's chance is the product of theirs.

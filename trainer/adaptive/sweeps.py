@@ -1,16 +1,12 @@
-"""Better successors for what is already tuned: every edge goes to the node behind it that costs its objects least.
+"""Sweeps over a tuned automaton, from the last level to the first: better successors, and patterns that many states share.
 
-Owns one sweep from the last level to the first: with the expected loss beta' of every node of the next level, exact for every object, an
-edge (state s, outcome k) moves to the node n of least sum over objects of alpha(s) q_k(s) beta'(n). Levels above are not touched by
-it, levels below are already done, so that the expected loss on the objects of the sweep falls with every move (the improvement step of
-Hansen's policy iteration for finite-state controllers). Nodes that lose their last edge take over edges of the fullest
-nodes, as copies of them; what only the old node led to is revived by the next sweep.
+With the expected loss beta' of every node of the next level, exact for every object, `reroute` moves an edge (state s, outcome k) to the
+node n of least sum over objects of alpha(s) q_k(s) beta'(n). Levels before it are not touched, levels behind it are done, so that the
+expected loss falls with every move (policy iteration for finite-state controllers, Hansen 1998). Nodes that lose their last edge take over
+edges of the fullest nodes, as copies of them.
 
-Few patterns for many states: one-bit patterns are grouped, and the states of a group show one pattern, each with its own brightness.
-
-Owns the grouping (k-means on the directions of the patterns, weighted by how often a state is reached), the pool that takes the place of
-the states' own patterns and is trained on like any other parameters, and the sweep in which every state takes the pattern and brightness
-of the pool that cost its objects least (the improvement step of reroute.py, over patterns instead of edges).
+`share_patterns` groups one-bit patterns (k-means on their directions) into a pool; `choose_patterns` gives every state the pattern and
+brightness of the pool that cost its objects least.
 """
 
 from __future__ import annotations
@@ -239,7 +235,7 @@ def share_patterns(
     more states than that.
     """
     bits = [level.light for level in machine.levels if isinstance(level.light, Bits)]
-    masks = torch.cat([light.shown()[0] for light in bits])
+    masks = torch.cat([light.displayed()[0] for light in bits])
     if len(bits) < len(machine.levels) or len(masks) <= wanted:
         return
     weights = torch.cat(masses).clamp(min=1e-9)
@@ -248,7 +244,7 @@ def share_patterns(
     sums = torch.zeros(wanted, masks.shape[1], dtype=masks.dtype).index_add_(0, group, points * weights.unsqueeze(1))
     pool, first = one_bit(sums), 0
     for light, mean in zip(bits, own):
-        before = light.shown()[0]
+        before = light.displayed()[0]
         light.rows, light.lean = group[first : first + len(before)], pool
         first += len(before)
         if not one_brightness(bits):
@@ -282,7 +278,7 @@ def one_bit(sums: Tensor) -> Tensor:
 
 def _keep_light(light: Bits, before: Tensor, mean: Tensor) -> None:
     """Set the brightness so that the light on the mean objects is `scale * before` again, (states,)."""
-    after = (light.shown()[0] * mean).sum(dim=1).clamp(min=BRIGHTNESS_MIN)
+    after = (light.displayed()[0] * mean).sum(dim=1).clamp(min=BRIGHTNESS_MIN)
     light.log_light += (before.clamp(min=BRIGHTNESS_MIN) / after).log().unsqueeze(1)
 
 
@@ -383,8 +379,8 @@ def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool,
         lights = seen.unsqueeze(1) * bright.unsqueeze(2)  # (candidates, factors, objects)
         sent = glare * pool.lit[candidates].unsqueeze(1) * bright * alpha.sum()
         chances, _ = readings(lights, sweep.sight.law)
-        told = sum_of(chance @ (alpha * gain[state, some]) for chance, gain in zip(chances, gains))
-        costs = told + price * (lights @ alpha) + sent
+        expected = sum_of(chance @ (alpha * gain[state, some]) for chance, gain in zip(chances, gains))
+        costs = expected + price * (lights @ alpha) + sent
         best = int(costs.argmin())
         if costs.flatten()[best] < costs[0, len(pool.factors) // 2] - SURE_OF_PATTERN * alpha.sum():
             light.rows[state] = candidates[best // len(pool.factors)]

@@ -1,7 +1,6 @@
-"""Training of an automaton from end to end: grow, tune, one bit, reroute, meet the budget, calibrate.
+"""Training of an automaton: grow, tune, one bit, reroute, meet the budget, calibrate; a checkpoint after each step.
 
-Owns the order of the stages, the checkpoint between them and the way into the arrays of a bundle; never writes a bundle (the package
-export) and never sees the held-out objects. `train_automaton` returns a `TrainedAutomaton` whose figures are of objects held back.
+`train_automaton` returns a `TrainedAutomaton` whose figures are of objects held back; the held-out objects stay unseen.
 
 Sources: finite-state controllers and their improvement (Hansen 1998), decision jungles (Shotton et al. 2013), the agglomerative
 information bottleneck (Slonim and Tishby 1999), distillation (Hinton, Vinyals and Dean 2015), sequential decisions
@@ -26,10 +25,21 @@ from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
 from pans.trainer.model.detection import trained_through
 from pans.trainer.model.exposure import exposure_us_of, top_limits
+from pans.trainer.options import AutomatonOptions
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
 from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write_targets
 
+from .budget import (
+    check_automaton_options,
+    for_task,
+    patterns_at_most,
+    photons_wanted,
+    price_at,
+    price_of,
+    tune_epochs_of,
+    with_defaults,
+)
 from .finish import (
     Finished,
     Posteriors,
@@ -45,17 +55,6 @@ from .finish import (
 from .grow import GrowOptions, Growth
 from .machine import COUNT_FLOOR, Bits, Grey, Machine, Sight, as_bits, forward, machine_from, machine_of, machine_state
 from .objects import Augmentation, Block, TrainingObjects
-from .options import (
-    AutomatonOptions,
-    check_automaton_options,
-    for_task,
-    patterns_at_most,
-    photons_wanted,
-    price_at,
-    price_of,
-    tune_epochs_of,
-    with_defaults,
-)
 from .outcomes import by_row, law_of
 from .sweeps import choose_patterns, reroute, share_patterns
 from .tune import Figures, Price, Progress, Tuning, figures, masses, mean_objects
@@ -258,7 +257,7 @@ class _Run:
         if self.stage != "grey":
             return
         low, high = top_limits(self.profile)
-        lights = [level.light.shown()[0] for level in self.machine.levels]
+        lights = [level.light.displayed()[0] for level in self.machine.levels]
         if self.options.grey:
             top = min(high, max(low, max(float(light.max()) for light in lights)))
             for level, light in zip(self.machine.levels, lights):
@@ -320,11 +319,11 @@ class _Run:
             if stage == "shown" and 1 <= self.epoch <= epochs - 2:
                 self._choose_patterns()
             blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
-            told = self.tuning.epoch(blocks)
+            found = self.tuning.epoch(blocks)
             self.epoch += 1
             before = self.exposures + (tune_epochs_of(self.options) if stage == "shown" else 0)
-            figures_told = told.loss, told.accuracy, told.clicks, told.photons, told.price
-            self.report(Progress(stage, before + self.epoch, self.steps, *figures_told))
+            means = found.loss, found.accuracy, found.clicks, found.photons, found.price
+            self.report(Progress(stage, before + self.epoch, self.steps, *means))
             keep()
 
     def _choose_top(self) -> None:

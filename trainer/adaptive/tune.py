@@ -1,12 +1,6 @@
-"""What an automaton does on some objects, as exact sums: accuracy, loss, clicks, photons, illumination, exposures; who reaches what.
+"""Tuning all levels of an automaton at once by the exact gradient, with the price of light found from the budget.
 
-Owns the pass without gradient over given objects; decisions are those of the machine's class counts. Also what a
-training reports of itself.
-
-Tuning all levels of an automaton at once by the exact gradient, with the price of light found from the budget.
-
-Owns the loop over epochs and blocks, the learning rate, the running class counts of the leaves and the price; what is tuned (grey
-levels, one bit) is the machine's.
+Also `figures`: what an automaton does on some objects, as exact sums without gradient, by the machine's class counts.
 """
 
 from __future__ import annotations
@@ -60,7 +54,7 @@ def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:
         posteriors = [counts / counts.sum(dim=1, keepdim=True) for counts in machine.counts]
         whole = []
         for level in machine.levels:
-            mask, scale = level.light.shown()
+            mask, scale = level.light.displayed()
             shown = mask.sum(dim=1, keepdim=True) if scale is None else mask.sum(dim=1, keepdim=True) * scale
             whole.append(by_state(shown, channels_of(sight.law)).squeeze(1))
         for block in blocks:

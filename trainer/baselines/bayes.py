@@ -1,8 +1,7 @@
 """The exact posterior over the training objects: the strongest decision that few photons allow, for any linear measurement.
 
-Owns the likelihood of a readout under every training object, its sum per class, and the Bayes decision; never deals out
-light. numpy and numba only. The world is taken to hold just the training objects, each as likely: exact for the noise, and for the
-objects as good as the training set stands for them. At many photons it is a nearest neighbour, and networks do better.
+The world is taken to hold just the training objects, each as likely: exact for the noise, and for the objects as good as the training set
+stands for them. At many photons it is a nearest neighbour, and networks do better.
 """
 
 from __future__ import annotations

@@ -1,10 +1,6 @@
-"""Baselines, the common ground: light, detection and the score.
+"""Baselines, the common ground: how N photons are dealt out, how they are detected, and how a result is counted.
 
-Owns what every alternative to PANS shares: how N photons are dealt out, how they are detected, and how a result is counted.
-Never decides (bayes.py, nets.py) and reads no file. numpy only. Readouts are float32 (n, m): m pixels of a
-frame, or m = d_f patterns.
-
-Two conventions of "N photons" (`brightness`), both SIMULATED:
+Readouts are float32 (n, m): m pixels of a frame, or m = d_f patterns. Two conventions of "N photons" (`brightness`), both SIMULATED:
 
 - **source**: one source for all objects; N is the mean over the test objects, bright objects give more (the paper's
   appendix on direct imaging, and `photons` everywhere in this project). How bright an object is then tells about it.
@@ -45,7 +41,7 @@ def silent(_what: str, _done: float) -> None:
 
 
 def named(what: str, report: Report) -> Report:
-    """Return a `Report` that passes on what it is told with `what` before it."""
+    """Return a `Report` that passes on its words with `what` before it."""
     return lambda words, done: report(f"{what}, {words}", done)
 
 

@@ -1,28 +1,20 @@
-"""Conventional end-to-end optimisation: trained patterns, but no photons in training.
+"""Patterns that are trained, but not by photon-aware training: conventional end-to-end (`e2e`) and feature-specific imaging (`fsi`).
 
-Owns the training of patterns and head on expected values, as in computational imaging before PANS (paper, appendix on
-conventional end-to-end optimisation); detection and score are those of common.py. The same front end (squared weights) and
-back end (512 hidden units) as PANS. SIMULATED.
+End-to-end optimisation on expected values, as in computational imaging before PANS (paper, appendix on conventional end-to-end
+optimisation); the front end (squared weights) and back end (512 hidden units) are those of PANS. A model is tested at every photon level
+by scaling all its light (the paper's eta), the readouts scaled back.
 
 - `qat`: quantisation-aware training: detected values pass a `bits`-bit quantiser, patterns one of `PATTERN_BITS`, with
   straight-through gradients. The paper names the technique and no numbers; 4 and 5 bits are those of Wang et al. 2022.
 - `plain`: no quantiser.
 
-A trained model is tested at every photon level by scaling all its light (the paper's eta), the readouts scaled back.
+Feature-specific imaging: masks trained with a network on photon counts, through Poisson noise, anew for each photon level.
 
-Feature-specific imaging: a few masks trained together with a network on photon counts, through Poisson noise.
-
-Owns masks, training and the decision; light, detector and score are those of common.py. SIMULATED, ideal shot noise.
-
-- `deep`: after DeepFSI (Lu and Velten, arXiv 2508.01981). Taken from its abstract: masks that begin as principal components are
-  "unfrozen" and learnt together with the network, by gradients computed under Poisson noise; one single-pixel measurement per mask. Assumed
-  here, as nothing else was at hand: masks are intensities (positive and negative parts of a component are masks of their own, learnt as
-  squares), the photon budget is shared freely among the masks and held exactly on average over the training objects, the network is the
-  paper's back end (512 hidden units), and the gradient passes a Poisson number as lambda + sqrt(lambda) x noise does (`spread` "scaled")
-  or as lambda alone ("plain").
-- `pca`: the same with the masks frozen, conventional feature-specific imaging, the network trained on noisy counts.
-
-A training is of one photon level.
+- `deep`: after DeepFSI (Lu and Velten, arXiv 2508.01981). From its abstract: masks that begin as principal components are "unfrozen" and
+  learnt together with the network under Poisson noise; one single-pixel measurement per mask. Assumed here, as nothing else was at hand:
+  masks are intensities (positive and negative parts of a component are masks of their own, learnt as squares), the budget is shared freely
+  among the masks and held exactly on average, and the gradient passes a Poisson number as lambda + sqrt(lambda) x noise does.
+- `pca`: the same with the masks frozen, conventional feature-specific imaging.
 """
 
 from __future__ import annotations
@@ -47,7 +39,6 @@ PATTERN_BITS = 5
 PATTERN_RATE = 1e-2
 MASK_RATE = 1e-2
 START_LIGHT = 0.03  # of a mask's largest value, on all its pixels: the square of 0 has no gradient
-SPREADS = ("scaled", "plain")
 _LEAST = 0.05  # photoelectrons, below which the gradient of the noise's spread is cut: it grows as 1 / lambda
 
 F64 = NDArray[np.float64]
@@ -140,15 +131,13 @@ def patterns_measured(
 
 @dataclass(frozen=True, slots=True)
 class FsiOptions:
-    """One training: `features` masks, from principal components or (`start` "random") by chance; `frozen` ones are not learnt."""
+    """One training: `features` masks, from principal components; `frozen` ones are not learnt."""
 
     features: int
     photons: float
     seed: int = 0
     epochs: int = EPOCHS
     frozen: bool = False
-    start: str = "pca"
-    spread: str = "scaled"
     detector: str = "counting"
     dark: float = 0.0
 
@@ -192,22 +181,20 @@ class FeatureSpecific(nn.Module):
     def forward(self, transmission: Tensor) -> Tensor:
         """Return scores (n, classes) of fresh counts of objects (n, pixels); random numbers are those of torch's own generator."""
         expected = transmission @ self.masks().T + self.options.dark
-        scores: Tensor = self.head(noisy(expected, self.options.spread, self.options.detector))
+        scores: Tensor = self.head(noisy(expected, self.options.detector))
         return scores
 
 
-def noisy(expected: Tensor, spread: str, detector: str = "counting") -> Tensor:
+def noisy(expected: Tensor, detector: str = "counting") -> Tensor:
     """Return Poisson numbers of mean `expected` (or with a `binary` detector whether there was one) that carry its gradient.
 
-    "scaled": as lambda + sqrt(lambda) x noise, the noise held fixed. "plain", and every binary detector: as the mean readout alone.
+    Counts carry it as lambda + sqrt(lambda) x noise does, the noise held fixed; clicks as their mean does.
     """
     with torch.no_grad():
         counts = torch.poisson(expected)
     if detector == "binary":
         mean = -torch.expm1(-expected)
         return mean + ((counts > 0).to(mean.dtype) - mean).detach()
-    if spread == "plain":
-        return expected + (counts - expected).detach()
     root = expected.clamp(min=_LEAST).sqrt()
     carried = expected + root * ((counts - expected) / root).detach()
     return carried + (counts - carried).detach()  # the value is the number itself, whatever was rounded or cut
@@ -219,20 +206,17 @@ def train_masks(task: Task, options: FsiOptions, report: Report = silent) -> Fea
     n_pixels = math.prod(task.image_shape)
     images = task.train.images.reshape(len(task.train), n_pixels)
     mean_image = (images.mean(axis=0) / 255).astype(np.float32)
-    if options.start == "pca":
-        masks = principal_masks(images, options.features)
-    else:
-        masks = np.random.default_rng([options.seed, 5]).random((options.features, n_pixels)) ** 2
+    masks = principal_masks(images, options.features)
     model = seeded(lambda: FeatureSpecific(masks, mean_image, len(task.classes), options), options.seed)
     assert isinstance(model, FeatureSpecific)
 
     def objects(which: Tensor, _generator: torch.Generator) -> Tensor:
         return torch.from_numpy(images[which.numpy()].astype(np.float32)) / 255
 
-    told = named(f"{options.features} masks at {options.photons:g} photons", report)
+    progress = named(f"{options.features} masks at {options.photons:g} photons", report)
     labels = torch.from_numpy(task.train.labels)
     rates = {"weight": MASK_RATE}
-    fit(model, objects, labels, epochs=options.epochs, seed=options.seed, batch=256, rates=rates, report=told)
+    fit(model, objects, labels, epochs=options.epochs, seed=options.seed, batch=256, rates=rates, report=progress)
     return model
 
 
@@ -240,10 +224,6 @@ def _check(options: FsiOptions) -> None:
     if options.features < 1 or options.epochs < 1 or not 0 < options.photons < math.inf:
         raise ValueError(
             f"{options.features} masks, {options.epochs} epochs, {options.photons:g} photons, allowed: above 0"
-        )
-    if options.start not in ("pca", "random") or options.spread not in SPREADS:
-        raise ValueError(
-            f"start is {options.start!r}, spread is {options.spread!r}, allowed: pca or random; {', '.join(SPREADS)}"
         )
 
 

@@ -1,39 +1,14 @@
-"""Networks of the baselines and their one training loop.
+"""Networks of the baselines, their one training loop, and the fixed patterns behind which they decide. SIMULATED, ideal shot noise.
 
-Owns the AlexNet-style frame classifier of the paper's appendix on direct imaging, the two-layer head for measured features,
-and `fit`; never deals out light and never scores. `fit` trains in place; `decider` returns a function from readouts to labels.
+- direct imaging, `cnn`: an AlexNet-style network trained on noisy frames of the very photon level, strong at many photons; `clean-cnn`: the
+  same trained on noiseless frames (the paper's baseline).
+- compressive sensing, `mlp`: patterns that know nothing of the task, the paper's back end on noisy readouts of the very level, without
+  reconstruction; `clean-mlp`: the same trained on noiseless features (the paper's baseline).
+- hadamard: pairs of 12 x 12 Hadamard patterns and a network on the differences of their counts, after Kanwal et al., arXiv 2603.12036.
+  Assumed here, as only the abstract and summaries were at hand: every pattern is followed by its inverse (330 000 patterns/s for 1200
+  digits/s leave 275 per digit, about two for each of 144), patterns come from the coarsest on, H12 is Paley's.
 
 Everything random comes from `seed`; the global generator of torch is left as it was.
-
-Direct imaging: a frame of the object under uniform light, one readout per pixel.
-
-Owns the networks that decide from a frame; the light, the detector and the score are those of common.py. Each way is a
-function from a photon level to a decision `readouts -> labels`. SIMULATED, ideal shot noise unless dark counts are asked for.
-
-- `bayes` (bayes.py): the exact Poisson likelihood, averaged over all training objects. Knows the noise;
-  the strong one at few photons.
-- `cnn`: an AlexNet-style network trained on noisy frames of the very photon level. Knows the noise; strong at many photons.
-- `clean-cnn`: the same network trained on noiseless frames (the paper's baseline, which cannot know what noise looks like).
-
-Compressive sensing: fixed patterns that know nothing of the task, and a classifier on the measured features.
-
-Owns the pattern families and the feature classifiers; light, detector and score are those of common.py. Without
-reconstruction: the classifier sees the d_f readouts (paper, appendix on fixed optical transformations). SIMULATED.
-
-- `mlp`: the paper's back end trained on noisy readouts of the very photon level.
-- `clean-mlp`: the same trained on noiseless features and shown noisy ones (the paper's baseline).
-- `bayes` (bayes.py): the exact posterior over the training objects.
-
-Single-pixel classification by Hadamard patterns: pairs of binary patterns, counts, and a network on their differences.
-
-Owns the patterns and the network's view of the counts; light, detector and score are those of common.py. SIMULATED, ideal shot noise.
-
-After Kanwal et al., arXiv 2603.12036: a microLED projector shows Hadamard patterns of 12 x 12 fields, one detector sums the light, and a
-small network classifies the series of readings without a picture in between. Taken from there: 12 x 12 fields, at most 144 patterns, no
-reconstruction. Assumed here, as only the abstract and summaries were at hand: every pattern is followed by its inverse (330 000 patterns/s
-for 1200 digits/s leave 275 per digit, about two for each of 144), the network sees the differences (method `differences`), patterns are
-taken from the coarsest on, H12 is Paley's, and the network is that of every other baseline, trained on noisy counts of each photon level.
-With `counts` it sees all 2 x pairs counts.
 """
 
 from __future__ import annotations
@@ -58,9 +33,11 @@ RATE = 2e-3
 CONV_KERNEL, CONV_CHANNELS = 15, ((1, 32), (32, 64))  # of the convolutional back end: before and after each layer
 
 Inputs = Callable[[Tensor, torch.Generator], Tensor]  # (which objects, random numbers) -> what the network sees
-FRAME_EPOCHS = 5
 FAMILIES = ("binary", "hadamard", "gaussian", "binning")
-EPOCHS = 10
+EPOCHS = {"cnn": 5, "clean-cnn": 5, "mlp": 10, "clean-mlp": 10, "differences": 10, "counts": 10}
+WORDS = {"cnn": "noise-aware CNN", "mlp": "noise-aware MLP"} | dict.fromkeys(
+    ("differences", "counts"), "Hadamard pairs"
+)
 
 F64 = NDArray[np.float64]
 FIELDS = 12  # along each side
@@ -228,7 +205,7 @@ def fitted(
     report: Report,
     watch: Watch = lambda _epoch, _decide: None,
 ) -> Decide:
-    """Train `net` on `inputs` of the training objects and return its decision; `watch` is told it after every epoch."""
+    """Train `net` on `inputs` of the training objects and return its decision; `watch` gets it after every epoch."""
     decide, labels = decider(net), torch.from_numpy(measurement.train_labels)
     fit(net, inputs, labels, epochs=epochs, seed=seed, report=report, watch=lambda epoch: watch(epoch, decide))
     return decide
@@ -244,36 +221,6 @@ def decider(net: Callable[[Tensor], Tensor]) -> Decide:
         return labels
 
     return decide
-
-
-def aware_cnn(
-    measurement: Measurement,
-    photons: float,
-    detector: str,
-    *,
-    seed: int,
-    dark: float = 0.0,
-    epochs: int = FRAME_EPOCHS,
-    report: Report = silent,
-) -> Decide:
-    """Return the frame network trained on fresh noisy frames at this photon level."""
-    light = measurement.photoelectrons(measurement.train[:: max(1, len(measurement.train) // 1000)], photons) + dark
-    square = light + light**2 if detector == "counting" else -np.expm1(-light)
-    spread = math.sqrt(float(square.mean()))
-    net, told = _frame_net(measurement, seed, spread), named(f"noise-aware CNN at {photons:g} photons", report)
-    return fitted(net, measurement, shown(measurement, photons, detector, dark), seed=seed, epochs=epochs, report=told)
-
-
-def clean_cnn(measurement: Measurement, *, seed: int, epochs: int = FRAME_EPOCHS, report: Report = silent) -> Decide:
-    """Return the frame network trained on noiseless frames; one network serves all photon levels."""
-    net, told = _frame_net(measurement, seed, None), named("CNN on clean frames", report)
-    return fitted(net, measurement, shown(measurement, 1e6), seed=seed, epochs=epochs, report=told)
-
-
-def _frame_net(measurement: Measurement, seed: int, spread: float | None) -> torch.nn.Module:
-    assert measurement.image_shape is not None, "direct imaging measures frames"
-    shape, n_classes = measurement.image_shape, measurement.n_classes
-    return seeded(lambda: FrameNet(shape, n_classes, spread), seed)
 
 
 def patterns(family: str, n_features: int, shape: tuple[int, int], seed: int) -> F64:
@@ -325,27 +272,52 @@ def walsh(n: int) -> F64:
     return matrix[np.argsort(changes)]
 
 
-def aware_mlp(
+def aware_net(
+    method: str,
     measurement: Measurement,
     photons: float,
     detector: str,
     *,
     seed: int,
     dark: float = 0.0,
-    epochs: int = EPOCHS,
+    epochs: int | None = None,
     report: Report = silent,
 ) -> Decide:
-    """Return the feature network trained on fresh readouts at this photon level."""
-    told = named(f"noise-aware MLP at {photons:g} photons", report)
-    inputs = shown(measurement, photons, detector, dark)
-    return fitted(_net(measurement, seed), measurement, inputs, seed=seed, epochs=epochs, report=told)
+    """Return the network of `method` (cnn, mlp, differences, counts), trained on fresh readouts at this photon level."""
+    n, n_classes = measurement.train.shape[1], measurement.n_classes
+    if method == "cnn":
+        light = measurement.photoelectrons(measurement.train[:: max(1, len(measurement.train) // 1000)], photons) + dark
+        square = light + light**2 if detector == "counting" else -np.expm1(-light)
+        net = _frame_net(measurement, seed, math.sqrt(float(square.mean())))
+    elif method == "differences":
+        net = seeded(lambda: Differences(n // 2, n_classes), seed)
+    else:
+        net = seeded(lambda: feature_net(n, n_classes), seed)
+    progress, inputs = (
+        named(f"{WORDS[method]} at {photons:g} photons", report),
+        shown(measurement, photons, detector, dark),
+    )
+    return fitted(net, measurement, inputs, seed=seed, epochs=epochs or EPOCHS[method], report=progress)
+
+
+def clean_cnn(measurement: Measurement, *, seed: int, epochs: int | None = None, report: Report = silent) -> Decide:
+    """Return the frame network trained on noiseless frames; one network serves all photon levels."""
+    net, progress = _frame_net(measurement, seed, None), named("CNN on clean frames", report)
+    epochs = epochs or EPOCHS["clean-cnn"]
+    return fitted(net, measurement, shown(measurement, 1e6), seed=seed, epochs=epochs, report=progress)
+
+
+def _frame_net(measurement: Measurement, seed: int, spread: float | None) -> nn.Module:
+    shape = measurement.image_shape
+    assert shape is not None, "direct imaging measures frames"
+    return seeded(lambda: FrameNet(shape, measurement.n_classes, spread), seed)
 
 
 def clean_mlp(
     measurement: Measurement,
     *,
     seed: int,
-    epochs: int = EPOCHS,
+    epochs: int = EPOCHS["clean-mlp"],
     convolutions: bool = False,
     report: Report = silent,
     watch: Watch = lambda _epoch, _decide: None,
@@ -357,10 +329,10 @@ def clean_mlp(
     Counts are divided by the exposure, clicks by their mean over that of the clean features: the network then sees features
     of the size that it knows. `watch` is called after every epoch, with what the network decides then on noiseless features.
     """
-    told, inputs = named("network on clean features", report), shown(measurement, 1.0)
-    decide = fitted(
-        _net(measurement, seed, convolutions), measurement, inputs, seed=seed, epochs=epochs, report=told, watch=watch
-    )
+    progress, inputs = named("network on clean features", report), shown(measurement, 1.0)
+    made, n = feature_conv_net if convolutions else feature_net, measurement.train.shape[1]
+    net = seeded(lambda: made(n, measurement.n_classes), seed)
+    decide = fitted(net, measurement, inputs, seed=seed, epochs=epochs, report=progress, watch=watch)
     return lambda photons, detector: lambda readouts: decide(readouts / size(measurement, photons, detector))
 
 
@@ -370,11 +342,6 @@ def size(measurement: Measurement, photons: float, detector: str) -> np.float32:
     if detector == "counting":
         return np.float32(photons)
     return np.float32(-np.expm1(-light * np.float32(photons)).mean(dtype=np.float64) / light.mean(dtype=np.float64))
-
-
-def _net(measurement: Measurement, seed: int, convolutions: bool = False) -> torch.nn.Module:
-    made = feature_conv_net if convolutions else feature_net
-    return seeded(lambda: made(measurement.train.shape[1], measurement.n_classes), seed)
 
 
 def hadamard_12() -> F64:
@@ -421,25 +388,3 @@ class Differences(nn.Module):
         """Return scores (n, classes)."""
         scores: Tensor = self.head(counts[:, : self.n_pairs] - counts[:, self.n_pairs :])
         return scores
-
-
-def pair_net(
-    measurement: Measurement,
-    photons: float,
-    detector: str,
-    *,
-    seed: int,
-    differences: bool = True,
-    dark: float = 0.0,
-    epochs: int = EPOCHS,
-    report: Report = silent,
-) -> Decide:
-    """Return the network trained on fresh counts of pairs (`measure` by `pairs`) at this photon level."""
-    n, n_classes = measurement.train.shape[1], measurement.n_classes
-
-    def net() -> torch.nn.Module:
-        return Differences(n // 2, n_classes) if differences else feature_net(n, n_classes)
-
-    told = named(f"Hadamard pairs at {photons:g} photons", report)
-    inputs = shown(measurement, photons, detector, dark)
-    return fitted(seeded(net, seed), measurement, inputs, seed=seed, epochs=epochs, report=told)

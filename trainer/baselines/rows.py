@@ -1,8 +1,7 @@
 """What a baseline reaches at each of several photon levels: one row of figures per level.
 
-Owns the walk over the levels; the ways to measure and to decide are in the other modules of this package.
-Every row holds clicks, photons and illumination, the spread over trials and the error from having few
-objects, for all test objects and for the first 200 (those of the paper's tables).
+Rows hold clicks, photons and illumination, the spread over trials and the error from having few objects, for all test objects and for the
+first 200 (those of the paper's tables).
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from pans.trainer.evaluate.accuracy import row_of
+from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Task
 
 from .common import Decide, Measurement, Report, Trials, detect, measure, run_trials
-from .options import BaselineOptions
 
 FIRST = 200  # test objects, those of the paper's tables
 
@@ -130,19 +129,18 @@ def _information(measurement: Measurement, photons: float, floor: float, options
 
 
 def _network(measurement: Measurement, options: BaselineOptions, facts: dict[str, Any], report: Report) -> At:
-    from .networks import aware_cnn, aware_mlp, clean_cnn, clean_mlp
+    from .networks import EPOCHS, aware_net, clean_cnn, clean_mlp
 
-    shared: dict[str, Any] = {"seed": options.seed, "report": report}
-    if options.epochs:
-        shared["epochs"] = options.epochs
-    if options.method == "clean-cnn":
+    method = options.method
+    shared: dict[str, Any] = {"seed": options.seed, "report": report, "epochs": options.epochs or EPOCHS[method]}
+    if method == "clean-cnn":
         of_frame = clean_cnn(measurement, **shared)
         return lambda _photons: (of_frame, facts)
-    if options.method == "clean-mlp":
+    if method == "clean-mlp":
         of_level = clean_mlp(measurement, **shared)
         return lambda photons: (of_level(photons, options.detector), facts)
-    aware = aware_cnn if options.method == "cnn" else aware_mlp
-    return lambda photons: (aware(measurement, photons, options.detector, dark=options.dark, **shared), facts)
+    shared["dark"] = options.dark
+    return lambda photons: (aware_net(method, measurement, photons, options.detector, **shared), facts)
 
 
 def _end_to_end(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
@@ -157,12 +155,10 @@ def _end_to_end(task: Task, options: BaselineOptions, report: Report) -> tuple[M
 
 
 def _hadamard(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
-    from .networks import EPOCHS, pair_net, pairs
+    from .networks import pairs
 
     measurement = measure(task, pairs(options.features, task.image_shape), options.brightness)
-    shared: dict[str, Any] = {"seed": options.seed, "dark": options.dark, "report": report}
-    shared |= {"epochs": options.epochs or EPOCHS, "differences": options.method == "differences"}
-    return measurement, lambda photons: (pair_net(measurement, photons, options.detector, **shared), {})
+    return measurement, _network(measurement, options, {}, report)
 
 
 def _masks(task: Task, options: BaselineOptions, report: Report) -> AtLevel:

@@ -1,11 +1,8 @@
 """Direct imaging that stops when it is sure: photons come one by one, after each the exact posterior is known.
 
-Owns the arrival of single photons, the posterior after each of them, and the threshold that gives a mean number of photons. The posterior
-is that of bayes.py (all training objects, each as likely), here of a Poisson process: log P = sum of log rate at the pixels that were hit
-- total rate x elapsed time. So it knows pixels and times; it is looked at when a photon comes, and a decision falls after a photon only.
-SIMULATED: an ideal camera that reports every photon at once, no dark counts.
-
-Time is measured in exposures that give one photon per object (`Measurement.photoelectrons` at 1 photon).
+The posterior is that of bayes.py, here of a Poisson process: log P = sum of log rate at the pixels that were hit - total rate x elapsed
+time. It knows pixels and times; a decision falls after a photon only. SIMULATED: an ideal camera that reports every photon at once, no dark
+counts. Time is measured in exposures that give one photon per object (`Measurement.photoelectrons` at 1 photon).
 """
 
 from __future__ import annotations

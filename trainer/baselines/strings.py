@@ -1,7 +1,6 @@
 """Direct imaging of barcodes, exactly: one detector looks at each bar, and every string and every click word is gone through.
 
-Owns the chances of the words, the best decision on them and what it costs in light. No sampling, no training: the strings are all there
-are. A counting detector would say no more without dark counts: a dark bar gives no photon.
+No sampling, no training. A counting detector would say no more without dark counts: a dark bar gives no photon.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
-"""The size of a training, from the images: how many varied copies, the budget, exposures, states, batch and epochs, with reasons.
+"""What is chosen from a user's own images: how they are varied, the encoder, the size of the training; each rule with its reason.
 
-Owns the rules and their words; never trains. They were chosen on held-back parts of made-up folders of 300 to 3000 images
-(docs/measurements/index.md), never on held-out images.
-
-Which changes leave the class of an image as it is: asked of the images themselves, not of the user.
-
-Owns the kinds and sizes that are tried, and the way they are judged; never trains. A kind of change is right when it makes the left-out
-images of a class more likely: each try computes the exact posterior of direct imaging (package baselines) with changed copies of the
+The rules were chosen on held-back parts of made-up folders of 300 to 3000 images (docs/measurements/index.md). A kind of change is right
+when it makes the left-out images of a class more likely: each try computes the exact posterior of direct imaging with changed copies of the
 other images as the world, and the mean log-loss on photon frames of the left-out images is compared. That takes seconds, and no network.
 """
 

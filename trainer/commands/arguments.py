@@ -1,10 +1,4 @@
-"""What several of the trainer's commands share: their common options, the check for torch, and errors of the user's input.
-
-How a training goes, as it goes: a line or a bar with a small curve on the terminal, and the curves as pictures afterwards.
-
-Owns what is shown on stderr while `pans train` works; never trains. A terminal gets a bar with a curve of every report so far, other
-streams get a line at times.
-"""
+"""What several of the trainer's commands share: common options, the check for torch, errors of the user's input, and progress on stderr."""
 
 from __future__ import annotations
 
@@ -39,21 +33,6 @@ Show = Callable[
 def add_data_dir(parser: argparse.ArgumentParser) -> None:
     """Add --data-dir to a command that may need a public set."""
     parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
-
-
-def add_order_and_bleach(parser: argparse.ArgumentParser) -> None:
-    """Add --order and --bleach, of fixed patterns."""
-    parser.add_argument(
-        "--order",
-        choices=("information", "dose"),
-        help="show the patterns in the order that tells most first, per pattern or per light that it sends",
-    )
-    parser.add_argument(
-        "--bleach",
-        metavar="D0[:mixed]",
-        help="train for objects of many emitters per pixel that bleach: 1/e of a pixel's light is left after D0 photoelectrons of "
-        "illumination",
-    )
 
 
 def add_threads(parser: argparse.ArgumentParser, consequence: str = "; changes the rounding") -> None:
@@ -146,8 +125,8 @@ def curve(values: Sequence[float], width: int = CURVE_WIDTH) -> str:
 
 
 @contextmanager
-def shown_course(quantity: str) -> Iterator[Show]:
-    """Yield what takes every report; on a terminal a bar with remaining time and the curve of `quantity`, else lines."""
+def displayed_progress(quantity: str) -> Iterator[Show]:
+    """Yield a function for every report; on a terminal a bar with remaining time and the curve of `quantity`, else lines."""
     if not sys.stderr.isatty():
         yield lambda words, _value, _done, _steps, due: say(words) if due else None
         return
@@ -158,13 +137,13 @@ def shown_course(quantity: str) -> Iterator[Show]:
 
     console = Console(stderr=True)
     bar = Progress(console=console, auto_refresh=False)
-    line = bar.add_task("training", total=None)
+    line = bar.add_task("done", total=None)
     values: list[float] = []
     with Live(bar, console=console, refresh_per_second=4) as live:
 
         def show(words: str, value: float, done: int, steps: int, _due: bool) -> None:
             values.append(value)
-            bar.update(line, completed=done, total=steps, description="training")
-            live.update(Group(bar, Text(words), Text(f"{quantity} {curve(values)}")))
+            bar.update(line, completed=done, total=steps, description="done")
+            live.update(Group(bar, Text(words), Text(f"{quantity} {curve(values)}" if quantity else "")))
 
         yield show

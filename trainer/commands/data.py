@@ -1,7 +1,6 @@
 """`pans data`: the public sets (listed, fetched), and scenes for the simulator made from any task.
 
-Owns the command's arguments and how its answers look; the sets are public_sets.py's, the drawn objects generators.py's. A scene is a .npz
-file with images, labels and classes (docs/reference/simulator.md): objects that stand still, or cells for a scene that moves.
+A scene is a .npz file with images, labels and classes (docs/reference/simulator.md): objects that stand still, or cells for one that moves.
 """
 
 from __future__ import annotations
@@ -115,30 +114,17 @@ def _tasks(absent: set[str]) -> list[dict[str, str]]:
     from pans.trainer.tasks.public_sets import PUBLIC_SETS
     from pans.trainer.tasks.registry import FIBRE_TASKS
 
-    here = {False: "there", True: "not there"}
-    rows = [
-        {
-            "task": name,
-            "encoder": "active",
-            "state": here[name in absent],
-            "about": f"public, {PUBLIC_SETS[name].licence}",
-        }
-        for name in PUBLIC_SETS
+    found = [
+        (name, "active", "not there" if name in absent else "there", f"public, {one.licence}")
+        for name, one in PUBLIC_SETS.items()
     ]
+    mnist = "not there" if "mnist" in absent else "there"
     wants = {"class": "which digit", "image": "the image itself is asked for"}
-    rows += [
-        {
-            "task": name,
-            "encoder": "coherent",
-            "state": here["mnist" in absent],
-            "about": f"MNIST behind a fibre: {wants[target]}",
-        }
-        for name, target in FIBRE_TASKS.items()
+    found += [
+        (name, "coherent", mnist, f"MNIST behind a fibre: {wants[target]}") for name, target in FIBRE_TASKS.items()
     ]
-    drawn = {"state": "drawn on demand"}
-    return rows + [
-        drawn | {"task": name, "encoder": one.encoder, "about": one.summary} for name, one in GENERATORS.items()
-    ]
+    found += [(name, one.encoder, "drawn on demand", one.summary) for name, one in GENERATORS.items()]
+    return [dict(zip(("task", "encoder", "state", "about"), row)) for row in found]
 
 
 DATA = Command(

@@ -1,8 +1,4 @@
-"""`pans order`: show the patterns of a bundle in the order that tells most first, or only as many as a dose allows.
-
-Owns the arguments and how the answer looks; the order and the new bundle are made by the package export. Figures are SIMULATED through
-a profile.
-"""
+"""`pans order`: show the patterns of a bundle in the order that tells most first, or only as many as a dose allows. SIMULATED."""
 
 from __future__ import annotations
 
@@ -49,7 +45,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _order(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path, load_bundle, write_bundle
     from pans.trainer.evaluate.dose import of_first, patterns_within, training_readings
-    from pans.trainer.evaluate.held_out import Conditions, held_out_of, trained_bleaching
+    from pans.trainer.evaluate.held_out import held_out_of, trained_bleaching
+    from pans.trainer.options import Conditions
     from pans.trainer.tasks.registry import remembered_task
 
     check_outputs([args.out], inputs=[args.bundle, args.task, args.profile], force=args.force)

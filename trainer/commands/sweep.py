@@ -1,8 +1,7 @@
 """`pans sweep`: a search over training options with optuna, shared by several processes or machines.
 
-Owns the search space, the storage and the walk over trials; each trial is an ordinary training. A trial is judged by the loss on the
-validation part of the training objects: the held-out objects stay unseen, whatever the sweep tries. Killed processes cost their
-trial in work and nothing else; the same command goes on, and several may run at once on one storage.
+A trial is an ordinary training, judged by the loss on the validation part of the training objects: the held-out objects stay unseen. A
+killed process costs the work of its trial; the same command continues, and several may run at once on one storage.
 """
 
 from __future__ import annotations
@@ -17,42 +16,37 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
+from pans.runtime.cli.option_fields import add_options
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, file_identity
-from pans.trainer.options import DEFAULT_ALPHA, ESTIMATOR_NAMES, EXACT_FEATURES_MAX, Options, check_options
+from pans.runtime.ranges import Range
+from pans.trainer.options import DEFAULT_ALPHA, EPOCHS, EXACT_FEATURES_MAX, Options, check_options, option_names
 
 from .arguments import add_data_dir, add_threads, interruptible, needing, torch_with
-from .train_arguments import SEED
 
-TRIALS_MAX = 1_000_000
+TRIALS = Range(1, 1_000_000, whole=True)
 JOURNAL_LINE_MAX_BYTES = 1 << 20
 HEARTBEAT_S = 60  # a trial without a sign of life for twice that time is closed as failed
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", metavar="TASK", help="as of `pans train`")
-    parser.add_argument("--features", type=int, required=True, metavar="D", help="number of patterns")
     parser.add_argument(
         "--storage", required=True, metavar="FILE or URL", help="a journal file, or a database URL that machines share"
     )
     parser.add_argument("--study", metavar="NAME", help="default: from task, profile and patterns")
-    parser.add_argument(
-        "--trials", type=int, default=20, metavar="N", help="finished trials of the whole study (default 20)"
-    )
+    words = "finished trials of the whole study (default 20)"
+    parser.add_argument("--trials", type=TRIALS.option, default=20, metavar="N", help=words)
     parser.add_argument("--profile", default="oled-qcmos", metavar="P", help="default: oled-qcmos")
-    parser.add_argument("--clicks", type=float, metavar="C", help="clicks per decision to aim for")
-    parser.add_argument("--photons", type=float, metavar="B", help="photoelectrons per decision to aim for")
-    parser.add_argument("--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local")
-    parser.add_argument("--epochs", type=int, default=30, metavar="E", help="of a trial (default 30)")
+    parser.add_argument("--epochs", type=EPOCHS.option, default=30, metavar="E", help="of a trial (default 30)")
     parser.add_argument("--hidden", type=int, default=128, metavar="H", help="hidden units of the head (default 128)")
-    parser.add_argument("--seed", type=SEED.option, default=0, metavar="N", help="of the trainings (default 0)")
+    others = set(option_names(Options)) - {"features", "clicks", "photons", "estimator", "seed"}
+    add_options(parser, Options, defaults={"estimator": None}, omit=others)
     add_threads(parser, "")
     add_data_dir(parser)
 
 
 def _run(args: argparse.Namespace) -> int:
-    if not 1 <= args.trials <= TRIALS_MAX:
-        raise UsageError(f"--trials is {args.trials}, allowed: 1 to {TRIALS_MAX}")
     with needing("a sweep", "train,sweep"):
         import optuna
     torch_with(args.threads, "a sweep")

@@ -1,233 +1,224 @@
-"""`pans train`: train patterns and head through a profile, and export a bundle.
+"""`pans train`: train patterns and head, or an automaton, through a profile, and export a bundle. All accuracies here are SIMULATED.
 
-Owns what the arguments mean and how the answer looks; the work is done by the packages train, export and evaluate. Heavy packages are
-imported when the command runs, not before. All accuracies here are SIMULATED through the profile.
+What both kinds of training share is here; `train_fixed.py` and `train_automaton.py` hold one class each that trains, exports and says what
+came out. Heavy packages are imported when the command runs, not before.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
+from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_new_bundle, emit, say
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 from pans.trainer.options import (
-    DEFAULT_ALPHA,
-    EXACT_WORDS_MAX,
-    PICTURE_HEADS,
+    ENCODERS,
+    SEED,
+    AutomatonOptions,
     Options,
-    check_options,
-    check_order,
-    plain_options,
+    add_unset_options,
+    flag_of,
+    option_names,
 )
 
-from .arguments import interruptible, needing, shown_course, stated_tolerance, torch_with, usage_errors, warn_of_laws
-from .evaluate import passive_light, warn_of_majority, words_of
-from .train_arguments import AS_GIVEN, AUTOMATON, DEFAULT_PROFILE, OF_AUTOMATA, configure_train
-from .train_own import as_given, choose, finish, is_own, set_encoder
+from .arguments import (
+    HISTORY_FILES,
+    Show,
+    add_data_dir,
+    add_threads,
+    displayed_progress,
+    interruptible,
+    needing,
+    torch_with,
+    usage_errors,
+    warn_of_laws,
+)
+from .evaluate import warn_of_majority
+from .train_own import AUTOMATON, as_given, choose, finish, is_own, set_encoder
 
 if TYPE_CHECKING:
-    from pans.runtime.instrument.profile import Profile
-    from pans.trainer.export.writer import Exported
-    from pans.trainer.tasks.registry import Task
-    from pans.trainer.train.history import History
-    from pans.trainer.train.loop import EpochReport, Trained
+    from pans.runtime.bundle.model import Bundle
+
+SHARED = tuple(name for name in option_names(Options) if name in option_names(AutomatonOptions))
+ONLY_AUTOMATA = (*(name for name in option_names(AutomatonOptions) if name not in SHARED), "teacher", "start")
+ONLY_FIXED = (*(name for name in option_names(Options) if name not in SHARED), "order", "unconstrained")
+
+
+class Training(Protocol):
+    """One training that a command line asks for: its options are checked when it is made."""
+
+    quantity: str  # whose curve the progress shows
+    bundle: Bundle
+
+    def run(self, show: Show, checkpoint: Path) -> None:
+        """Train; KeyboardInterrupt passes through, with the checkpoint on disk."""
+
+    def export(self, provenance: dict[str, Any]) -> tuple[str, dict[str, Any], list[str]]:
+        """Write the bundle; return its SHA-256, the answer as JSON and in lines."""
+
+    def write_history(self, folder: Path, force: bool) -> list[Path]:
+        """Write how the training went; return the files."""
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "task", metavar="TASK", help="a name (`pans data list`), a .npz file, or a folder of class folders"
+    )
+    parser.add_argument("--profile", metavar="P", help="default: oled-qcmos; of an automaton ideal")
+    parser.add_argument(
+        "--encoder",
+        choices=(*ENCODERS, AUTOMATON),
+        help="how light meets the object (default: what the task's is); automaton: each pattern follows from the clicks before it",
+    )
+    add_unset_options(parser, Options)
+    parser.add_argument(
+        "--unconstrained",
+        action="store_true",
+        help="a passive encoder may give more light than it gets, as the paper's does",
+    )
+    parser.add_argument(
+        "--order",
+        choices=("information", "dose"),
+        help="display the patterns in the order that tells most first, per pattern or per light that it sends",
+    )
+    automata = parser.add_argument_group("of an automaton")
+    add_unset_options(automata, AutomatonOptions, omit=SHARED)
+    automata.add_argument(
+        "--teacher",
+        type=Path,
+        metavar="FILE.npz",
+        help="the network's answers are read from there; where nothing is, they are made and kept there",
+    )
+    automata.add_argument(
+        "--start",
+        type=Path,
+        metavar="OLD.pans",
+        help="train on the patterns and states of that one, instead of growing new ones",
+    )
+    parser.add_argument(
+        "--data-seed", type=SEED.option, default=0, metavar="N", help="of a drawn task's images (default 0)"
+    )
+    parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
+    parser.add_argument(
+        "--device",
+        choices=("cpu", "cuda"),
+        default="cpu",
+        help="where to compute (default cpu); changes the random numbers",
+    )
+    add_threads(parser)
+    parser.add_argument("--resume", action="store_true", help="continue from OUT.pans.checkpoint")
+    parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
+    add_data_dir(parser)
+    parser.add_argument(
+        "--as-is",
+        action="store_true",
+        help="of your own images: choose nothing from them, take the options and defaults as they are",
+    )
+    add_new_bundle(parser)
 
 
 def _train(args: argparse.Namespace) -> int:
-    from .train_automaton import FOREIGN, train_automaton_command
-
     checkpoint = args.out.with_name(args.out.name + ".checkpoint")
     own = is_own(args)
     if own:
-        set_encoder(args, FOREIGN)
-    if args.encoder == AUTOMATON:
-        check_files(args, checkpoint)
-        return train_automaton_command(args, checkpoint, own)
-    if args.features is None and not own:
-        raise UsageError("--features is missing: the number of patterns", remedy="--features 10, say")
-    for name in OF_AUTOMATA:
-        if getattr(args, name) not in (None, False):
-            raise UsageError(
-                f"--{name.replace('_', '-')} belongs to an automaton", remedy="add --encoder automaton, or leave it out"
-            )
-    check_files(args, checkpoint)
+        set_encoder(args, ONLY_FIXED)
+    automaton = args.encoder == AUTOMATON
+    _refuse_foreign(args, automaton, own)
+    _check_files(args, checkpoint)
     torch_with(args.threads)
     from pans.runtime.instrument.profile import load_profile
     from pans.trainer.device import computing_on
     from pans.trainer.tasks.registry import load_task
     from pans.trainer.train.checkpoint import timed
-    from pans.trainer.train.loop import train
 
-    profile = load_profile(args.profile or DEFAULT_PROFILE)
+    from .train_automaton import AutomatonTraining
+    from .train_fixed import FixedTraining
+
+    profile = load_profile(args.profile or ("ideal" if automaton else "oled-qcmos"))
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
     chosen = choose(args, task, profile) if own else as_given(args, task)
-    options = _options(args, task, profile)
-    check_order(args.order, options)
-    check_options(options, profile)
-    history = _history(args, options, checkpoint, chosen.task)
+    if args.history is not None:
+        with needing("--history", "plot"):
+            import matplotlib  # noqa: F401 - asked for before the training, not after it
+    training: Training = (AutomatonTraining if automaton else FixedTraining)(args, task, chosen.task, profile)
     try:
         with (
             usage_errors(),
-            _progress(options) as show,
+            displayed_progress(training.quantity) as show,
             computing_on(args.device),
             timed(checkpoint, resume=args.resume) as watch,
         ):
-
-            def report(epoch: EpochReport) -> None:
-                show(epoch)
-                if history is not None:
-                    history.take(epoch)
-
-            trained = train(chosen.task, profile, options, checkpoint=checkpoint, resume=args.resume, report=report)
+            training.run(show, checkpoint)
     except KeyboardInterrupt:
-        say(f"interrupted; the last whole epoch is in {checkpoint}\n  go on: the same command with --resume")
+        say(f"interrupted; the last whole step is in {checkpoint}\n  continue with the same command and --resume")
         return EXIT_INTERRUPTED
-    exported = _export(args, task, profile, trained, watch.seconds(), chosen.facts)
-    warn_of_laws(exported.bundle, profile, one_by_one=True)
-    answer, words = _figures(exported, trained, task, profile)
+    with usage_errors(), computing_on(args.device if automaton else "cpu"):
+        digest, answer, lines = training.export(_provenance(args, watch.seconds()) | chosen.facts)
+    warn_of_laws(training.bundle, profile, one_by_one=not automaton)
     checkpoint.unlink(missing_ok=True)
-    if history is not None:
-        shown = trained.quantised.patterns() if trained.quantised else None
-        for path in history.write(args.history, shown, task.image_shape, force=args.force):
+    if args.history is not None:
+        for path in training.write_history(args.history, args.force):
             say(f"wrote {path}")
     warn_of_majority(answer.get("by_class"), answer["photons_mean"])
     seconds = watch.seconds()
-    payload = {"bundle": str(args.out), **answer, "seconds": seconds, "simulated": True}
+    payload = {"bundle": str(args.out), "sha256": digest, **answer, "seconds": seconds, "simulated": True}
     if own and task.target == "class":
         after = finish(args, task, profile, answer)
-        payload, words = payload | after.payload, f"{words}\n{after.words}"
-    emit(args, payload, f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s\n{words}")
+        payload, lines = payload | after.payload, [*lines, after.words]
+    emit(args, payload, "\n".join([f"{args.out}  {digest[:12]}  trained in {seconds:.0f} s", *lines]))
     return EXIT_FINE
 
 
-def check_files(args: argparse.Namespace, checkpoint: Path) -> None:
+def _refuse_foreign(args: argparse.Namespace, automaton: bool, own: bool) -> None:
+    """Refuse options of the other kind of training, and those that contradict each other."""
+    given = [flag_of(name) for name in (ONLY_FIXED if automaton else ONLY_AUTOMATA) if _is_given(args, name)]
+    if given and automaton:
+        raise UsageError(f"{', '.join(given)}: not of an automaton", remedy="leave it out, or choose another --encoder")
+    if given:
+        raise UsageError(f"{given[0]} belongs to an automaton", remedy="add --encoder automaton, or leave it out")
+    if not automaton and args.features is None and not own:
+        raise UsageError("--features is missing: the number of patterns", remedy="--features 10, say")
+    for one, other in (("alpha", "photons"), ("conserving", "unconstrained")):
+        if _is_given(args, one) and _is_given(args, other):
+            raise UsageError(f"{flag_of(one)} and {flag_of(other)} exclude each other", remedy="leave one of them out")
+
+
+def _is_given(args: argparse.Namespace, name: str) -> bool:
+    return getattr(args, name) not in (None, False)
+
+
+def _check_files(args: argparse.Namespace, checkpoint: Path) -> None:
     """Refuse, before anything is loaded, what cannot be written in the end; a checkpoint is hours of work too."""
     inputs = [args.task, *([args.profile] if args.profile else [])]
     if checkpoint.exists() and not (args.resume or args.force):
         raise UsageError(
             f"{checkpoint}: is here, of a training that was interrupted",
-            remedy="go on with it by --resume, or replace it with --force",
+            remedy="continue it by --resume, or replace it with --force",
         )
     check_outputs([args.out], inputs=inputs, force=args.force)
     check_outputs([checkpoint], inputs=[*inputs, args.out], force=True)
     if args.history is not None:
-        from .arguments import HISTORY_FILES
-
         outputs = [args.history / name for name in HISTORY_FILES]
         check_outputs(outputs, inputs=inputs, force=args.force, makes_folders=True)
 
 
-def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile) -> tuple[dict[str, Any], str]:
-    """What the written bundle decides on the held-out objects, and how well it agrees with the model: for scripts, and in words."""
-    from pans.trainer.evaluate.held_out import HeldOut, as_trained, measure, trials_needed
-
-    bundle, told = exported.bundle, as_trained(exported.bundle)
-    trials, every = trials_needed(bundle), HeldOut(task, task.test, profile)
-    measured = measure(bundle, every, trials=trials, conditions=told)
-    of_first = measure(bundle, HeldOut(task, task.test.first(200), profile), trials=trials, conditions=told)
-    light = passive_light(bundle, every)
-    figures = {
-        "sha256": exported.sha256,
-        **asdict(measured),
-        "first_200": asdict(of_first),
-        "top_photoelectrons": bundle.photons_per_level * max(0, bundle.levels - 1),
-        "quantisation_error_bound": trained.quantised.error_bound if trained.quantised else None,
-        "score_difference": exported.score_difference,
-        "words_compared": exported.words_compared,
-        "dead_patterns": exported.dead_patterns,
-        "validation_losses": trained.validation_losses,
-        **light,
-    }
-    return figures, words_of(measured, light)
-
-
-def _history(args: argparse.Namespace, options: Options, checkpoint: Path, task: Task) -> History | None:
-    """What keeps the course of the training, if it is wanted; matplotlib is asked for before the training, not after it."""
-    if args.history is None:
-        return None
-    with needing("--history", "plot"):
-        import matplotlib  # noqa: F401
-    from pans.trainer.train.history import History
-
-    return History(checkpoint, options, task.sha256)
-
-
-def _options(args: argparse.Namespace, task: Task, profile: Profile) -> Options:
-    """What the arguments mean for this task: its physics chooses the encoder, its question the head."""
-    from pans.trainer.tasks.registry import physical_encoder
-
-    encoder = args.encoder or physical_encoder(task)
-    is_picture = task.target == "image"
-    head = args.head or ("picture" if is_picture else "mlp")
-    if (head in PICTURE_HEADS) != is_picture:
-        raise UsageError(
-            f"--head {head}: the task {task.name} asks for {'a picture' if is_picture else 'a class'}",
-            remedy="leave --head out",
-        )
-    if encoder == "active" and task.optics != "none":
-        raise UsageError(f"--encoder active: {task.name} lies behind a fibre", remedy="use --encoder coherent")
-    best = "exact" if min(args.outcomes or 2, 16) ** args.features <= EXACT_WORDS_MAX else "local"
-    estimator = args.estimator or ("ste" if is_picture else best)
-    budgets = (args.photons, args.illumination)
-    alpha = args.alpha if args.alpha is not None or any(one is not None for one in budgets) else DEFAULT_ALPHA
-    given: dict[str, Any] = {"optics": stated_tolerance(profile) if encoder == "active" else None}
-    given |= {name: value for name in AS_GIVEN if (value := getattr(args, name)) is not None}
-    if encoder != "active":
-        given["conserving"] = not args.unconstrained
-    elif args.unconstrained:
-        raise UsageError("--unconstrained belongs to a passive encoder", remedy="leave it out")
-    return Options(alpha=alpha, estimator=estimator, encoder=encoder, head=head, **given)
-
-
-def _export(
-    args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float, chosen: dict[str, Any]
-) -> Exported:
-    from pans.trainer.export.writer import export_trained
+def _provenance(args: argparse.Namespace, seconds: float) -> dict[str, Any]:
+    """What a bundle says of the command that made it."""
     from pans.trainer.tasks.registry import path_from, task_names
 
-    provenance = {
+    return {
         "task_argument": args.task if args.task in task_names() else Path(args.task).name,
         "data_path": path_from(args.out, args.task),
         "data_seed": args.data_seed,
-        "options": plain_options(trained.options) | {"threads": args.threads, "device": args.device},
         "training_seconds": round(seconds, 1),
-        **chosen,
     }
-    name = args.name or args.out.stem
-    return export_trained(
-        args.out, trained, task, profile, name=name, provenance=provenance, force=args.force, order=args.order
-    )
-
-
-@contextmanager
-def _progress(options: Options) -> Iterator[Callable[[EpochReport], None]]:
-    """A bar and the loss so far on a terminal, else a line per tenth of the epochs; both on stderr."""
-    step, steps = max(1, options.epochs // 10), options.epochs * options.restarts
-    with shown_course("loss") as show:
-
-        def told(epoch: EpochReport) -> None:
-            done = epoch.restart * options.epochs + epoch.epoch
-            show(_epoch_line(epoch, options), epoch.loss, done, steps, epoch.epoch % step == 0)
-
-        yield told
-
-
-def _epoch_line(epoch: EpochReport, options: Options) -> str:
-    return (
-        f"restart {epoch.restart + 1}/{options.restarts} epoch {epoch.epoch}/{options.epochs} {epoch.stage}: "
-        f"loss {epoch.loss:.3f}, {epoch.clicks:.2f} clicks, {epoch.photons:.1f} photons, {epoch.illumination:.0f} illumination"
-    )
 
 
 TRAIN = Command(
     "train patterns and head through a profile, and export a bundle",
-    configure_train,
+    _configure,
     interruptible(_train),
     examples=(
         "pans train parts --features 6 --profile my-lab.toml -o parts.pans",

@@ -1,7 +1,4 @@
-"""What `pans train` adds for a user's own images: what is chosen from them, what is warned of, and what comes next.
-
-Owns the words on screen and the way the choices take the place of options that were not given; the rules are in the package choose.
-"""
+"""What `pans train` adds for a user's own images: what is chosen from them, what is warned of, and what comes next."""
 
 from __future__ import annotations
 
@@ -129,8 +126,8 @@ def finish(args: argparse.Namespace, task: Task, profile: Profile, figures: Mapp
 
 def compared(task: Task, photons: float, seed: int) -> dict[str, Any]:
     """Return what direct imaging decides at that many photons, by its exact posterior: accuracy, its error, photons, illumination."""
-    from pans.trainer.baselines.options import BaselineOptions
     from pans.trainer.baselines.rows import baseline_rows
+    from pans.trainer.options import BaselineOptions
 
     options = BaselineOptions("direct", "bayes", trials=BASELINE_TRIALS, seed=seed)
     row = next(iter(baseline_rows(task, options, [photons], lambda _what, _done: None)))

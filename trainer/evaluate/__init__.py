@@ -4,7 +4,9 @@ A bundle and a task come in, accuracy with clicks, photons and illumination goes
 patterns) and `walks.py` (automata).
 """
 
-from .accuracy import Conditions, Light, Measured, MeasuredPictures, light_of
+from pans.trainer.options import Conditions
+
+from .accuracy import Light, Measured, MeasuredPictures, light_of
 from .held_out import evaluate, measure
 
 __all__ = ["Conditions", "Light", "Measured", "MeasuredPictures", "evaluate", "light_of", "measure"]

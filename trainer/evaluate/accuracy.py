@@ -1,9 +1,7 @@
-"""Accuracy against photons: what a bundle decides on held-out objects through a profile's optics and detector.
+"""Accuracy against photons: what fixed patterns decide on held-out objects through a profile's optics and detector.
 
-Owns the sampled and the exact evaluation; numpy and the runtime only, no torch. Both return a `Measured` that always holds
-clicks, photons and illumination together. SIMULATED figures: the click law of the profile, no instrument.
-
-The spread over repeated trials (shot noise) and the spread over objects (a different test set) are kept apart.
+`light_of` shows the patterns, `evaluate_exactly` and `evaluate_sampled` decide. The spread over repeated trials (shot noise) and the spread
+over objects (a different test set) are kept apart. SIMULATED figures: the click law of the profile, no instrument. No torch.
 """
 
 from __future__ import annotations
@@ -36,6 +34,7 @@ from pans.runtime.instrument.click_law import (
 )
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
+from pans.trainer.options import Conditions
 
 from .readings import Chain, Numbers, vector_chances
 
@@ -45,24 +44,6 @@ MAJORITY_ROUNDING = 1e-9  # sums of chances round
 _CHUNK_NUMBERS = 1 << 22  # numbers per piece of work, so that memory stays small
 
 F64 = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Conditions:
-    """How the objects are shown: by default through the profile that the bundle was trained for, as it is."""
-
-    profile: str | None = None
-    eta: float = 1.0  # all light times this
-    dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
-    seed: int = 0  # of the trials
-    data_seed: int | None = None  # of a drawn task; None: that of the bundle's training
-    confidence: float = 0.0  # of an automaton: it decides as soon as a class is that sure, and abstains below it
-    imaging: Imaging | None = None  # how objects stand on the grid of the patterns; None: as the profile states
-    bleaching: Bleaching = NO_BLEACHING  # what the light does to the objects, each of them fresh when it comes
-
-    def imaging_on(self, profile: Profile) -> Imaging:
-        """Return how objects stand on the grid of the patterns, on `profile`."""
-        return profile.imaging() if self.imaging is None else self.imaging
 
 
 AS_IT_IS = Conditions()
@@ -261,7 +242,7 @@ def exposure_of(bundle: Bundle, profile: Profile) -> float:
 def outcome_law_of(
     bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | None = None
 ) -> ClickLaw | CountLaw:
-    """Return the law of what `bundle` is told of an exposure: of clicks as `law_of`, or of photon numbers.
+    """Return the law of what `bundle` gets of an exposure: of clicks as `law_of`, or of photon numbers.
 
     ValueError for what `law_of` refuses, and for a profile that cannot tell so many photon numbers apart.
     """

@@ -1,14 +1,8 @@
-"""What fixed patterns decide when a dose cap leaves only the first of them: the rest of a word is summed over.
+"""Accuracy against dose: what a bundle decides when an object may receive only so much light, and when the light bleaches it.
 
-A word is what all exposures of one shot read, clicks or photon numbers. Owns the bundle of the first patterns. A table's rows are weighed
-by how often training objects show their words, and added over what is not seen: P(class | seen) = sum of P(class | word) P(word) / sum
-of P(word). A head without a table takes the mean reading of each pattern that is not shown. Never trains; the knowledge of training objects
-is their light under the bundle's own patterns.
-
-Accuracy against dose: what a bundle decides when an object may receive only so much light, and when the light bleaches it.
-
-Owns the caps of a curve and its points; the figures of one cap are those of held_out.py. Exact expectations, but for automata before
-samples that bleach: what is left in a state depends on the walk to it, and walks are sampled. SIMULATED.
+A cap leaves the first of the fixed patterns; what the others would read is summed over: P(class | seen) = sum of P(class | word) P(word) /
+sum of P(word), with words as training objects show them. A head without a table takes the mean reading of each pattern that is left out.
+Exact expectations, but for automata before samples that bleach: what is left depends on the walk, and walks are sampled. SIMULATED.
 """
 
 from __future__ import annotations
@@ -27,10 +21,11 @@ from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.imaging import NO_BLEACHING
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.refit.rebuild import chain_onnx
+from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects
 
 from .accuracy import EXACT_OUTCOMES_MAX, Measured, light_of
-from .held_out import Conditions, HeldOut, measure, trained_bleaching, trials_needed
+from .held_out import HeldOut, measure, trained_bleaching, trials_needed
 from .readings import vector_chances
 from .walks import MeasuredWalks
 
@@ -45,7 +40,7 @@ CAP_MAX = 1e300  # beyond any light
 BLEACHED_TRIALS = 4  # walks per object before samples that bleach
 
 Figures = Measured | MeasuredWalks
-Told = Callable[[int, int], None]
+Report = Callable[[int, int], None]
 _SHOWN = (
     "accuracy_mean",
     "accuracy_std",
@@ -224,7 +219,7 @@ def figures_of(found: Capped, held_out: HeldOut, conditions: Conditions, trials:
 
 
 def dose_curve(
-    bundle: Bundle, held_out: HeldOut, conditions: Conditions, told: Told = lambda done, of: None
+    bundle: Bundle, held_out: HeldOut, conditions: Conditions, report: Report = lambda done, of: None
 ) -> list[dict[str, Any]]:
     """Return the points of accuracy against dose, from small caps to none; each with light, both spreads and, before samples
     that bleach, the accuracy that it would have without (`accuracy_unbleached`)."""
@@ -238,7 +233,7 @@ def dose_curve(
             steady = plain.accuracy_mean
         point = found.facts() | {name: measured[name] for name in _SHOWN} | {"accuracy_unbleached": steady}
         points.append(point | {"accuracy_se_trials": trial_error(measured)})
-        told(number + 1, len(caps))
+        report(number + 1, len(caps))
     return points
 
 

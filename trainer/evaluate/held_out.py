@@ -1,7 +1,4 @@
-"""From a bundle and a task's name to figures: what `pans evaluate` and a notebook call.
-
-Owns the choice of profile, held-out objects and trials; the figures are those of `accuracy`. SIMULATED.
-"""
+"""From a bundle and a task's name to figures: what `pans evaluate` and a notebook call. SIMULATED."""
 
 from __future__ import annotations
 
@@ -11,8 +8,9 @@ from pathlib import Path
 
 from pans.runtime.bundle.model import Bundle, bundle_path, load_bundle
 from pans.runtime.detector.crosstalk import crosstalk_of
-from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, bleaching_of
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task, load_task, remembered_task
 
 from .accuracy import (
@@ -25,7 +23,6 @@ from .accuracy import (
     evaluate_sampled,
     light_of,
 )
-from .accuracy import Conditions as Conditions
 from .walks import MeasuredWalks, Walks, measured_walks, walks_of
 
 DEFAULT_PROFILE = "oled-qcmos"
@@ -39,8 +36,8 @@ EXACT_NUMBERS_MAX = (
 def trained_bleaching(bundle: Bundle) -> Bleaching:
     """Return the bleaching that the back end of `bundle` was trained through."""
     options = bundle.provenance.get("options")
-    told = options.get("bleach") if isinstance(options, Mapping) else None
-    return bleaching_of(told) if isinstance(told, str) else NO_BLEACHING
+    text = options.get("bleach") if isinstance(options, Mapping) else None
+    return bleaching_of(text) if isinstance(text, str) else NO_BLEACHING
 
 
 def as_trained(bundle: Bundle) -> Conditions:
@@ -85,7 +82,7 @@ def evaluate(
 
 
 def default_trials(bundle: Bundle) -> int:
-    """Return how often every object is decided on unless told otherwise: 30 times, pictures 3 times."""
+    """Return how often every object is decided on unless asked otherwise: 30 times, pictures 3 times."""
     return DEFAULT_TRIALS if bundle.picture_shape is None else PICTURE_TRIALS
 
 
@@ -96,11 +93,11 @@ def held_out_of(
 
     All objects of a file without a test part are held out, unless the bundle was trained on that very file.
     """
-    told = bundle.provenance
+    facts = bundle.provenance
     if count is not None and count < 1:
         raise ValueError(f"objects is {count}, allowed: 1 or more")
-    data_seed = int(told.get("data_seed", 0)) if conditions.data_seed is None else conditions.data_seed
-    found = load_task(task or str(told.get("task_argument", bundle.task)), data_dir, data_seed=data_seed)
+    data_seed = int(facts.get("data_seed", 0)) if conditions.data_seed is None else conditions.data_seed
+    found = load_task(task or str(facts.get("task_argument", bundle.task)), data_dir, data_seed=data_seed)
     if bundle.picture_shape not in (None, found.image_shape):
         raise ValueError(f"{bundle.name} returns pictures of {bundle.picture_shape}, the task has {found.image_shape}")
     if bundle.picture_shape is None and found.classes != bundle.classes:
@@ -108,14 +105,9 @@ def held_out_of(
             f"{bundle.name} decides among {len(bundle.classes)} classes ({', '.join(bundle.classes[:3])}, ...), the task "
             f"{found.name} has {len(found.classes)} ({', '.join(found.classes[:3])}, ...), allowed: the same classes in that order"
         )
-    whole = found.split_here and told.get("data_sha256") != found.sha256
-    profile = load_profile(conditions.profile or str(told.get("profile", DEFAULT_PROFILE)))
+    whole = found.split_here and facts.get("data_sha256") != found.sha256
+    profile = load_profile(conditions.profile or str(facts.get("profile", DEFAULT_PROFILE)))
     return HeldOut(found, (found.everything() if whole else found.test).first(count), profile)
-
-
-def imaging_on(held_out: HeldOut, conditions: Conditions) -> Imaging:
-    """Return how the objects stand on the grid of the patterns."""
-    return conditions.imaging_on(held_out.profile)
 
 
 def measure(
@@ -140,7 +132,7 @@ def measure(
         objects.images,
         eta=conditions.eta,
         dark=conditions.dark,
-        imaging=imaging_on(held_out, conditions),
+        imaging=conditions.imaging_on(held_out.profile),
         bleaching=conditions.bleaching,
     )
     if bundle.picture_shape is not None:

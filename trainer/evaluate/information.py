@@ -1,11 +1,7 @@
-"""How much the readouts know of the label: exact for click words, bounded for frames, and Fisher's ratio (paper, Fig. 2C).
-
-Owns mutual information, the Bayes error and Fisher discriminant ratios against photons; never trains an encoder. numpy
-only, float64. Entropies are in bits.
+"""How much the readouts know of the label: exact for click words, bounded for frames, and Fisher's ratio (paper, Fig. 2C). In bits.
 
 - **Click words** (`word_information`): all (shots + 1)**d_f count vectors are enumerated, so that I(label; clicks) of a set of
-  objects is a sum, not an estimate. On the training objects it is optimistic about new ones: the held-out figures (posterior
-  table from the training objects, judged on held-out ones) are the ones to quote.
+  objects is a sum, not an estimate. On the training objects it is optimistic about new ones: quote the held-out figures.
 - **Frames** (`posterior_information`): nothing can be enumerated. A posterior q gives I >= H(label) - E[-log2 q(label)],
   whatever q is; the gap is how wrong q is. The mixture over the training objects knows the noise exactly and the world only as
   far as those objects go: at few photons the bound is tight, at many it is not (a network may know more).

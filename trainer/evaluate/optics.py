@@ -1,7 +1,4 @@
-"""Accuracy under given optics: over draws within a tolerance, at its edge, and against each misalignment by itself.
-
-Owns the grids and the sums; the figures of one table are those of held_out.py. Exact expectations wherever a bundle has them. SIMULATED.
-"""
+"""Accuracy under given optics: over draws within a tolerance, at its edge, and against each misalignment by itself. SIMULATED."""
 
 from __future__ import annotations
 
@@ -14,8 +11,9 @@ import numpy as np
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.imaging import Imaging, Tolerance
+from pans.trainer.options import Conditions
 
-from .accuracy import AS_IT_IS, Conditions, Measured
+from .accuracy import AS_IT_IS, Measured
 from .held_out import HeldOut, measure, trials_needed
 from .walks import MeasuredWalks
 
@@ -27,7 +25,7 @@ CURVES: Mapping[str, tuple[float, ...]] = {
 }
 DRAW_STREAM = 0xD7A  # beside the seed
 Figures = Measured | MeasuredWalks
-Told = Callable[[int, int], None]
+Report = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +49,8 @@ def figures_under(bundle: Bundle, held_out: HeldOut, imaging: Imaging, condition
     """Return what `bundle` decides when objects stand as `imaging` says; ValueError for bundles that return pictures."""
     if bundle.picture_shape is not None:
         raise ValueError(f"{bundle.name} returns pictures, allowed: bundles that decide among classes")
-    told = replace(conditions, imaging=imaging)
-    found = measure(bundle, held_out, trials=trials_needed(bundle), conditions=told)
+    shifted = replace(conditions, imaging=imaging)
+    found = measure(bundle, held_out, trials=trials_needed(bundle), conditions=shifted)
     assert isinstance(found, (Measured, MeasuredWalks))
     return found
 
@@ -62,14 +60,14 @@ def over_optics(
     held_out: HeldOut,
     tables: Iterable[Imaging],
     conditions: Conditions = AS_IT_IS,
-    told: Told = lambda done, of: None,
+    report: Report = lambda done, of: None,
 ) -> OverOptics:
-    """Return the means over `tables`, at least one; `told` hears how many are done."""
+    """Return the means over `tables`, at least one; `report` gets how many are done."""
     which = list(tables)
     found = []
     for number, imaging in enumerate(which):
         found.append(figures_under(bundle, held_out, imaging, conditions))
-        told(number + 1, len(which))
+        report(number + 1, len(which))
     right = np.array([one.accuracy_mean or 0.0 for one in found])
     spread = float(right.std(ddof=1)) if len(right) > 1 else 0.0
     return OverOptics(
@@ -99,7 +97,7 @@ def misalignment_curves(
     held_out: HeldOut,
     about: Imaging,
     conditions: Conditions = AS_IT_IS,
-    told: Told = lambda done, of: None,
+    report: Report = lambda done, of: None,
 ) -> dict[str, list[dict[str, Any]]]:
     """Return for every curve of `CURVES` its points, one misalignment at a time about the optics `about`.
 
@@ -113,7 +111,7 @@ def misalignment_curves(
             measured = asdict(figures_under(bundle, held_out, _off(about, name, value), conditions))
             points.append({"value": value, **{key: measured[key] for key in _SHOWN}})
             done += 1
-            told(done, total)
+            report(done, total)
         found[name] = points
     return found
 

@@ -1,8 +1,4 @@
-"""A few pictures that a model of pictures gives back, kept as a small .npz.
-
-Owns the samples and their file; never trains, judges or draws. The objects are the first held-out one of every class, so that nothing is
-picked by how well it came out; every sample is one shot with clicks of its own.
-"""
+"""A few pictures that a model of pictures gives back, kept as a small .npz: the first held-out object of every class, not the best ones."""
 
 from __future__ import annotations
 

@@ -1,18 +1,6 @@
-"""Pictures of what a bundle does (`pans evaluate --pictures DIR`): confusion, a map of its clicks, patterns, reliability.
+"""Pictures of what a bundle does (`pans evaluate --pictures DIR`): confusion, a t-SNE map, patterns, reliability, dose and optics.
 
-Owns which pictures there are and what is on them; the measuring is accuracy.py's. All are SIMULATED, and say so.
-
-t-SNE maps of readouts in two dimensions, for pictures only (scikit-learn, extra `plot`).
-
-Distances on a map mean nothing beyond near and far. The same features and seed give the same map.
-
-The picture of `pans evaluate --dose-cap curve`: accuracy against the illumination that an object receives.
-
-Owns what is on it; the figures are dose.py's. SIMULATED, and says so.
-
-The picture of `pans evaluate --optics tolerance`: accuracy against each misalignment by itself.
-
-Owns what is on it; the figures are optics.py's. SIMULATED, and says so.
+All are SIMULATED, and say so.
 """
 
 from __future__ import annotations

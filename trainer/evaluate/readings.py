@@ -1,11 +1,7 @@
-"""Fixed patterns on one detector with afterpulses: the chances of click words, and clicks drawn one exposure after the other.
+"""Readings of fixed patterns whose exposures are more than independent clicks: afterpulses (`Chain`) and photon numbers (`Numbers`).
 
 Exposures come pattern after pattern, shot after shot, object after object without a break. An object begins with the memory of all that
-objects leave. Given this, `word_chances` are sums under the law of detector/afterpulses.py.
-
-Photon numbers of fixed patterns: drawn, and all vectors of their sums with their chances.
-
-Owns both, from the chance of each number; never the law of counts (instrument/count_law.py) and never a decision. numpy only.
+objects leave.
 """
 
 from __future__ import annotations

@@ -1,18 +1,13 @@
 """What an automaton decides on held-out objects: exact sums over all walks, or sampled walks; calibration of its posteriors.
 
-Owns the figures of `pans evaluate` for automata; the sums over walks are runtime's `decide.expectation`. Clicks, photons, illumination and
-exposures are always reported together. SIMULATED figures: the click law of the profile, no instrument.
-
-Objects that bleach while an automaton walks: what each still gives depends on the patterns of its own walk.
-
-Owns the state of the samples during sampled walks; the law is `pans.runtime.imaging.bleaching`, the walks are walks.py's. SIMULATED.
+The sums over walks are `pans.runtime.decide.expectation`. SIMULATED figures: the click law of the profile, no instrument.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +29,9 @@ from pans.runtime.instrument.click_law import (
     object_transmission,
 )
 from pans.runtime.instrument.profile import Profile
+from pans.trainer.options import Conditions
 
-from .accuracy import AS_IT_IS, ByClass, Conditions, among_classes, demand_sequence, exposure_of, outcome_law_of
+from .accuracy import AS_IT_IS, ByClass, among_classes, demand_sequence, exposure_of, outcome_law_of
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
 FIRST_OBJECTS = 200  # the paper's objects: judged beside all of them
@@ -44,6 +40,7 @@ _LEAF_NUMBERS = 1 << 22  # objects times leaves at once
 _LIGHT_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
+OF_OBJECTS = ("right", "decided", "clicks", "photons", "illumination", "exposures", "labels")
 BLEACHED_AT_ONCE = 512  # objects, whose pixels stand in memory
 
 
@@ -89,8 +86,7 @@ class Walks:
 
     def first(self, count: int) -> Walks:
         """Return the sums of the first `count` objects; `by_class` remains that of all."""
-        names = ("right", "decided", "clicks", "photons", "illumination", "exposures", "labels")
-        return replace(self, **{name: getattr(self, name)[:count] for name in names})
+        return replace(self, **{name: getattr(self, name)[:count] for name in OF_OBJECTS})
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,38 +118,36 @@ def walks_of(
     step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
     step = step if conditions.bleaching.is_none else min(step, BLEACHED_AT_ONCE)
     afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
-    shown = _Shown(
-        automaton, _patterns(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
-    )
+    patterns, scale = _patterns(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
+
+    def expected(seen: NDArray[Any], begins: tuple[float, float]) -> ExpectedWalk:
+        return expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins)
+
     begins, rng = (0.0, 0.0), np.random.default_rng(conditions.seed)
     if trials is None and afterpulses.time:
-        few = object_transmission(profile, _spread(images, min(step, BEGIN_OBJECTS)).reshape(-1, bundle.n_pixels))
-        begins = _begins(shown, few, law, afterpulses)
+        some = np.linspace(0, len(images) - 1, min(step, BEGIN_OBJECTS, len(images))).astype(np.int64)
+        few = object_transmission(profile, images[some].reshape(len(some), -1))
+        for _ in range(
+            BEGIN_ROUNDS
+        ):  # objects begin with the memory that those before them leave, which begin with it too
+            ends = expected(few, begins).ends
+            assert ends is not None
+            mean, square = ends.mean(axis=0).tolist()
+            begins = mean, max(square - mean**2, 0.0)
     parts: list[Walks] = []
     for start in range(0, len(images), step):
         part = images[start : start + step]
         seen = object_transmission(profile, part.reshape(len(part), -1))
         if trials is None:
-            sums = _sums_of(_expected(shown, seen, law, afterpulses, begins))
+            found = expected(seen, begins)
+            sums = found.clicks, found.photons, found.illumination, found.exposures, found.leaves
         else:
-            lit = _lit(shown, seen, conditions.bleaching)
-            sums = _sampled(automaton, lit, shown.illumination, (law, afterpulses), trials, rng)
+            lit = _Lit(automaton, patterns, seen, scale, conditions.bleaching)
+            sums = _sampled(lit, (law, afterpulses), trials, rng)
         parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
-    return replace(_together(parts, trials or 0), classes=bundle.classes)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Shown:
-    """What is walked: the automaton, its patterns (n, pixels) as they meet the object, and photoelectrons per level."""
-
-    automaton: Automaton
-    patterns: NDArray[Any]
-    scale: float
-
-    @property
-    def illumination(self) -> F64:
-        """Of one exposure of each pattern, float64 (n,)."""
-        return np.asarray(self.patterns.sum(axis=1, dtype=np.float64) * self.scale)
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in OF_OBJECTS}
+    by_class = sum((part.by_class for part in parts[1:]), parts[0].by_class)
+    return replace(parts[0], **joined, by_class=by_class, trials=trials or 0, classes=bundle.classes)
 
 
 def _fitting(
@@ -182,140 +176,105 @@ def _patterns(bundle: Bundle, imaging: Imaging) -> NDArray[Any]:
     return met(imaging, bundle.pattern_levels.astype(np.float64), bundle.image_shape, bundle.levels - 1.0)
 
 
-def _lit(shown: _Shown, seen: NDArray[Any], bleaching: Bleaching) -> _Lit:
-    what = shown.automaton, shown.patterns, seen, shown.scale
-    return _Steady(*what) if bleaching.is_none else BleachedObjects(*what, bleaching)
-
-
-def _expected(
-    shown: _Shown, seen: NDArray[Any], law: ClickLaw | CountLaw, afterpulses: Afterpulses, begins: tuple[float, float]
-) -> ExpectedWalk:
-    return expected_walk(
-        shown.automaton, shown.patterns, seen, law, shown.scale, afterpulses=afterpulses, begins=begins
-    )
-
-
-def _sums_of(found: ExpectedWalk) -> _Sums:
-    return found.clicks, found.photons, found.illumination, found.exposures, found.leaves
-
-
-def _spread(images: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
-    """Some of the images, from first to last."""
-    return images[np.linspace(0, len(images) - 1, min(count, len(images))).astype(np.int64)]
-
-
-def _begins(
-    shown: _Shown, seen: NDArray[Any], law: ClickLaw | CountLaw, afterpulses: Afterpulses
-) -> tuple[float, float]:
-    """The detector's memory when an object comes: that of all that the objects before leave, which begin with it themselves."""
-    begins = (0.0, 0.0)
-    for _ in range(BEGIN_ROUNDS):
-        found = _expected(shown, seen, law, afterpulses, begins)
-        assert found.ends is not None
-        mean, square = found.ends.mean(axis=0).tolist()
-        begins = mean, max(square - mean**2, 0.0)
-    return begins
-
-
 _Sums = tuple[F64, F64, F64, F64, F64]  # clicks, photons, illumination, exposures (n,), leaves (n, leaves)
 
 
 def _judged(sums: _Sums, labels: NDArray[np.int64], automaton: Automaton, leaf_labels: NDArray[np.uint16]) -> Walks:
     leaves = sums[4]
-    decides = (leaf_labels != NO_LABEL).astype(np.float64)
     right, by_class = np.empty(len(labels)), np.zeros((automaton.n_classes, automaton.n_leaves))
     for label in range(automaton.n_classes):
         of_class = labels == label
         right[of_class] = leaves[of_class] @ (leaf_labels == label).astype(np.float64)
         by_class[label] = leaves[of_class].sum(axis=0)
-    decided = leaves @ decides
+    decided = leaves @ (leaf_labels != NO_LABEL).astype(np.float64)
     return Walks(np.minimum(right, decided), decided, *sums[:4], by_class, automaton, leaf_labels, labels)
 
 
-def _together(parts: list[Walks], trials: int) -> Walks:
-    names = ("right", "decided", "clicks", "photons", "illumination", "exposures", "labels")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    by_class = sum((part.by_class for part in parts[1:]), parts[0].by_class)
-    return replace(parts[0], **joined, by_class=by_class, trials=trials)
+class _Lit:
+    """Objects of transmission `seen` (n, pixels) under the states of an automaton; `patterns` times `scale` are the light.
 
+    What bleaches gives less after each exposure of its own walk.
+    """
 
-class _Lit(Protocol):
-    """What the objects give when states are shown to them."""
-
-    n: int
+    def __init__(
+        self, automaton: Automaton, patterns: NDArray[Any], seen: NDArray[Any], scale: float, law: Bleaching
+    ) -> None:
+        self.n, self.automaton, self._patterns, self._scale, self._law = len(seen), automaton, patterns, scale, law
+        self.illumination = np.asarray(
+            patterns.sum(axis=1, dtype=np.float64) * scale
+        )  # of one exposure of each pattern
+        self._share = automaton.dwell / automaton.dwell_steps
+        self._displayed = automaton.rows if automaton.channels > 1 else automaton.pattern
+        self._light = pattern_light(patterns, seen, scale) if law.is_none else np.empty(0)
+        self._first = np.asarray(seen, np.float64)
+        self._left = self._first
 
     def fresh(self) -> None:
         """Begin new walks, each with an object that no light has met."""
+        self._left = self._first if self._law.is_none else self._first.copy()
 
     def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
-        """Show one state to each of the objects `rows` int64 (n,), and return the photoelectrons expected, float64 (n,).
+        """Display one state to each of the objects `rows` int64 (n,), and return the photoelectrons expected, float64 (n,).
 
         Of several channels (n, channels).
         """
-
-
-class _Steady:
-    """Objects that stay as they are."""
-
-    def __init__(self, automaton: Automaton, patterns: NDArray[Any], seen: NDArray[Any], scale: float) -> None:
-        self.n, self._share = len(seen), automaton.dwell / automaton.dwell_steps
-        self._shown = automaton.rows if automaton.channels > 1 else automaton.pattern
-        self._light = pattern_light(patterns, seen, scale)
-
-    def fresh(self) -> None:
-        """See `_Lit`."""
-
-    def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
-        """See `_Lit`."""
-        shown, share = self._shown[states], self._share[states]
-        if shown.ndim > 1:
+        if not self._law.is_none:
+            return self._bleached(rows, states)
+        displayed, share = self._displayed[states], self._share[states]
+        if displayed.ndim > 1:
             rows, share = rows[:, None], share[:, None]
-        return np.asarray(self._light[rows, shown] * share)
+        return np.asarray(self._light[rows, displayed] * share)
+
+    def _bleached(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
+        which, of_row = np.unique(states, return_inverse=True)
+        light = self._patterns[self.automaton.pattern[which]].astype(np.float64)
+        light *= (self._scale * self._share[which])[:, None]
+        dose = self._law.doses(light)
+        left = self._left[rows]
+        found = np.einsum("kp,kp->k", left, (light * mean_left(dose))[of_row])
+        self._left[rows] = left * np.exp(-dose)[of_row]
+        return np.asarray(found)
 
 
 def _sampled(
-    automaton: Automaton,
-    lit: _Lit,
-    whole: F64,
-    detector: tuple[ClickLaw | CountLaw, Afterpulses],
-    trials: int,
-    rng: np.random.Generator,
+    lit: _Lit, detector: tuple[ClickLaw | CountLaw, Afterpulses], trials: int, rng: np.random.Generator
 ) -> _Sums:
-    """Draw `trials` walks of every object; means per walk, and the share of each leaf. `whole` is the illumination of each pattern.
+    """Draw `trials` walks of every object; means per walk, and the share of each leaf.
 
     With a time constant a walk begins with the memory that another object's left, and every walk has its own clicks for memory.
     """
-    law, afterpulses = detector
+    (law, afterpulses), automaton = detector, lit.automaton
     n, rows = lit.n, np.arange(lit.n)
     sums, leaves = np.zeros((4, n)), np.zeros((n, automaton.n_leaves))
     memory = np.zeros((2, n))
-    warming = BEGIN_ROUNDS if afterpulses.time else 0
-    for trial in range(-warming, trials):
+    for trial in range(-BEGIN_ROUNDS if afterpulses.time else 0, trials):
         if trial == 0:
             sums[:], leaves[:] = 0.0, 0.0
-        node, going = np.zeros(n, np.int64), rows
+        node, active = np.zeros(n, np.int64), rows
         memory = rng.permutation(memory, axis=1) if afterpulses.time else np.zeros((2, n))
         lit.fresh()
         for _ in range(automaton.n_slots):
-            if not going.size:
+            if not active.size:
                 memory = afterpulses.in_the_dark(memory)
                 continue
-            state = node[going]
-            shown = whole[automaton.rows[state]].sum(axis=1) * (automaton.dwell[state] / automaton.dwell_steps)
-            photoelectrons = lit.photoelectrons(going, state)
-            clicks = outcome = _drawn(law, photoelectrons, afterpulses.sight(memory[:, going]), rng)
+            state = node[active]
+            sent = lit.illumination[automaton.rows[state]].sum(axis=1) * (
+                automaton.dwell[state] / automaton.dwell_steps
+            )
+            photoelectrons = lit.photoelectrons(active, state)
+            clicks = outcome = _drawn(law, photoelectrons, afterpulses.sight(memory[:, active]), rng)
             if automaton.channels > 1:
                 clicks, outcome = outcome.sum(axis=1), outcome @ (1 << np.arange(automaton.channels))
                 photoelectrons = photoelectrons.sum(axis=1)
             if afterpulses and isinstance(law, ClickLaw):
-                known = afterpulses.after(-log_no_click(law, photoelectrons), memory[:, going], outcome)
+                known = afterpulses.after(-log_no_click(law, photoelectrons), memory[:, active], outcome)
                 memory = afterpulses.in_the_dark(memory)
-                memory[:, going] = known
-            each: tuple[Any, ...] = (clicks, photoelectrons, shown, 1.0)
+                memory[:, active] = known
+            each: tuple[Any, ...] = (clicks, photoelectrons, sent, 1.0)
             for total, values in zip(sums, each):
-                total[going] += values
-            node[going] = automaton.successors[state, outcome]
-            going = going[node[going] < automaton.n_states]
+                total[active] += values
+            node[active] = automaton.successors[state, outcome]
+            active = active[node[active] < automaton.n_states]
         leaves[rows, node - automaton.n_states] += 1.0
     sums /= trials
     return sums[0], sums[1], sums[2], sums[3], leaves / trials
@@ -415,33 +374,3 @@ def walk_payload(walks: Walks) -> dict[str, Any]:
         del first["expected_calibration_error"]  # of so few objects it is mostly noise
     bins = [asdict(one) for one in calibration_bins(walks)]
     return {"exposures_longest": walks.automaton.n_slots, "calibration": bins, f"first_{FIRST_OBJECTS}": first}
-
-
-class BleachedObjects:
-    """Objects (n, pixels) of transmission `seen` under the states of an automaton; `patterns` times `scale` are the light."""
-
-    def __init__(
-        self, automaton: Automaton, patterns: NDArray[Any], seen: NDArray[Any], scale: float, law: Bleaching
-    ) -> None:
-        self.n = len(seen)
-        self._automaton, self._patterns, self._scale, self._law = automaton, patterns, scale, law
-        self._first = np.asarray(seen, np.float64)
-        self._left = self._first.copy()
-
-    def fresh(self) -> None:
-        """Begin with objects that no light has met."""
-        self._left[:] = self._first
-
-    def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
-        """Show `states` (k,) to the objects `rows` (k,): return the photoelectrons expected (k,), and bleach what was lit."""
-        which, of_row = np.unique(states, return_inverse=True)
-        shown = self._automaton.pattern[which]
-        share = self._automaton.dwell[which] / self._automaton.dwell_steps
-        light = self._patterns[shown].astype(np.float64) * (self._scale * share)[:, None]
-        dose = self._law.doses(light)
-        acts, stays = light * mean_left(dose), np.exp(-dose)
-        left = self._left[rows]
-        found = np.einsum("kp,kp->k", left, acts[of_row])
-        left *= stays[of_row]
-        self._left[rows] = left
-        return np.asarray(found)

@@ -1,14 +1,12 @@
-"""From a trained automaton to a bundle, with the proof that the bundle walks as the model does, and what it is expected to achieve.
+"""From a trained automaton to a bundle, with the check that the bundle walks as the model does, and what it is expected to achieve.
 
-Owns the bundle's facts and the comparison; never trains, and takes the figures of the held-out objects from the package evaluate.
-`export_automaton` writes the file, reads it back and raises when the file's walks differ from the model's. All figures are exact
-expectations, SIMULATED through the profile.
+`export_automaton` writes the file, reads it back and raises when its walks differ from the model's. Exact expectations, SIMULATED.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +21,9 @@ from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
 from pans.trainer.adaptive.train import TrainedAutomaton
-from pans.trainer.evaluate.accuracy import ByClass, Conditions, outcome_law_of
+from pans.trainer.evaluate.accuracy import outcome_law_of
 from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
+from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task
 
 from .writer import origin, programs, with_tolerance
@@ -35,28 +34,13 @@ SAMPLED_WALKS = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class WalkFigures:
-    """Exact means per decision over some objects; `accuracy_se_objects`: the standard error that comes from their number."""
-
-    objects: int
-    accuracy_mean: float
-    accuracy_se_objects: float
-    clicks_mean: float
-    photons_mean: float
-    illumination: float
-    exposures_mean: float
-    expected_calibration_error: float
-    by_class: ByClass | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class ExportedAutomaton:
     """The written bundle, and what it does on all held-out objects and on the first 200."""
 
     bundle: Bundle
     sha256: str
-    measured: WalkFigures
-    first_200: WalkFigures
+    measured: MeasuredWalks
+    first_200: MeasuredWalks
     difference: float  # of class chances between the file and the model, the largest
 
 
@@ -75,14 +59,14 @@ def export_automaton(
     bundle = with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
     difference = compare_walks(bundle, trained, task, profile)
     dark = trained.options.dark
-    found = measured_walks(walks_of(bundle, profile, task.test.images, task.test.labels, Conditions(dark=dark)))
+    found = measure_walks(bundle, task.test, profile, dark)
     first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, dark)
     expected = expected_figures(found, profile.name, task.name, "test")
     with whole_file(path, force=force) as unchecked:
         write_bundle(with_expected(bundle, expected), unchecked)
         written, digest = load_bundle(unchecked)
         compare_decider(written, trained.options.seed)
-    return ExportedAutomaton(written, digest, walk_figures(found), first, difference)
+    return ExportedAutomaton(written, digest, found, first, difference)
 
 
 def bundle_of(
@@ -120,16 +104,9 @@ def bundle_of(
     )
 
 
-def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> WalkFigures:
+def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> MeasuredWalks:
     """Return what the automaton of `bundle` does on `objects` through `profile`, exactly."""
-    return walk_figures(
-        measured_walks(walks_of(bundle, profile, objects.images, objects.labels, Conditions(dark=dark)))
-    )
-
-
-def walk_figures(found: MeasuredWalks) -> WalkFigures:
-    """Return of the figures of `pans evaluate` those that an export names; every walk must have decided."""
-    return WalkFigures(**{field.name: getattr(found, field.name) for field in fields(WalkFigures)})
+    return measured_walks(walks_of(bundle, profile, objects.images, objects.labels, Conditions(dark=dark)))
 
 
 def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile: Profile) -> float:

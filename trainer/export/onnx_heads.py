@@ -1,12 +1,7 @@
-"""Heads as ONNX graphs, with the normalisation folded in.
+"""Heads as ONNX graphs, with the normalisation folded in; and the quantised head in operators that every runtime has.
 
-Owns the folding, the nodes and the version of the format; never checks the result (writer.py compares every bundle with the torch
-model). Float32 click means (n, d_f) go in as `clicks`, scores or pixels (n, outputs) come out as `scores`.
-
-The quantised head as an ONNX model: the same integers and scales as the bundle's arrays, in operators that every runtime has.
-
-Owns the graph only; the quantisation is `pans.runtime.bundle.layers`'s. Clicks come as means in [0, 1] and are taken as whole 255ths,
-which is exact for one shot; means of several shots round to the nearest of them.
+Float32 click means (n, d_f) go in as `clicks`, scores or pixels (n, outputs) come out as `scores`. The quantised head takes means as whole
+255ths, which is exact for one shot; means of several shots round to the nearest of them.
 """
 
 from __future__ import annotations

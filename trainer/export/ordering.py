@@ -1,14 +1,8 @@
-"""In which order fixed patterns tell most first: greedy, by the information between the readings so far and the class.
+"""In which order fixed patterns tell most first, and a bundle in that order: tables, heads and golden vectors go with the patterns.
 
-A reading is a click or none, or a photon number; a word is one of each pattern. Owns the order; never changes a bundle (reorder.py). Up to
-4096 words, of 12 patterns that click, all of them are summed over training objects, so that the information of the objects' mixture is
-exact; beyond, words are sampled from it and the last reading of each is summed over. Before samples that bleach, a pattern's readings are
-those that the patterns chosen before it leave.
-
-A bundle whose patterns are shown in another order: tables, heads and golden vectors go with them.
-
-Owns the permutation of every back end; which order is ordering.py's. The bundle is made anew, so that all its golden vectors are
-computed and its table is held against its head. It decides on the same readings of the same patterns as before.
+The order is greedy, by the information between the readings so far and the class. Up to 4096 words, of 12 patterns that click, all are
+summed over training objects, so that the information of the objects' mixture is exact; beyond, words are sampled from it and the last
+reading of each is summed over. Before samples that bleach, a pattern's readings are those that the patterns before it leave.
 """
 
 from __future__ import annotations
@@ -210,10 +204,10 @@ def reordered(bundle: Bundle, order: Sequence[int], facts: Mapping[str, Any]) ->
 
 def order_facts(order: Order, bundle: Bundle) -> dict[str, Any]:
     """Return what a bundle says of its order; pattern numbers are those of `bundle`, as it was before."""
-    told = bundle.provenance.get("order")
+    known = bundle.provenance.get("order")
     first = list(order.patterns)
-    if isinstance(told, Mapping) and isinstance(told.get("patterns"), Sequence):
-        first = [int(told["patterns"][place]) for place in order.patterns]  # of the bundle as it was trained
+    if isinstance(known, Mapping) and isinstance(known.get("patterns"), Sequence):
+        first = [int(known["patterns"][place]) for place in order.patterns]  # of the bundle as it was trained
     bits = [round(value, 5) for value in order.bits]
     return {"order": {"by": order.by, "patterns": first, "bits": bits, "objects": order.objects, "exact": order.exact}}
 

@@ -1,8 +1,7 @@
 """`python -m pans.trainer.export.tape_bundle`: a bundle for a tape of bars, one bar per pattern, with guard bands and an exact table.
 
-Owns the layout of the patterns and the exact decision; nothing is trained: a window has 1024 strings, so that the Bayes table and
-its accuracy are sums. Light falls on the middle of each bar alone: a tape that stands a little beside its place, or moves during the
-exposure, changes nothing as long as it is off by less than the guard band. A table is made for one dark rate; make another for another.
+Nothing is trained: a window has 1024 strings, so that the Bayes table and its accuracy are sums. Light falls on the middle of each bar
+alone: a tape off by less than the guard band changes nothing. A table is made for one dark rate; make another for another.
 """
 
 from __future__ import annotations

@@ -1,11 +1,6 @@
-"""What a bundle tolerates of the optics: accuracy within the tolerance that it was trained through, and at its edge.
+"""From a trained model to a bundle, and the check that the bundle decides as the model does.
 
-Owns these facts of a bundle; the figures are evaluate/optics.py's. Exact expectations over the first held-out objects, SIMULATED.
-
-From a trained model to a bundle, and the proof that the bundle decides as the model does.
-
-Owns the bundle's facts and the comparison; never trains. `export` writes the file, reads it back and raises when a score or a
-decision of the file differs from the torch model.
+`export` writes the file, reads it back and raises when a score or a decision of the file differs from the torch model.
 """
 
 from __future__ import annotations
@@ -31,10 +26,11 @@ from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
 from pans.trainer.device import CHOICE
-from pans.trainer.evaluate.held_out import Conditions, HeldOut
+from pans.trainer.evaluate.held_out import HeldOut
 from pans.trainer.evaluate.optics import OverOptics, drawn_tables, over_optics
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.heads import Decoders, Heads
+from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.data import encoder_input, full_scale_photoelectrons
 from pans.trainer.train.loop import Trained
@@ -63,13 +59,13 @@ def with_tolerance(bundle: Bundle, task: Task, profile: Profile, optics: str | N
         return bundle
     tolerance = tolerance_of(optics)
     held_out = HeldOut(task, task.test.first(JUDGED_OBJECTS), profile)
-    told = Conditions(dark=dark)
+    conditions = Conditions(dark=dark)
     tables = {
         "middle": [tolerance.middle],
         "within": drawn_tables(tolerance, DRAWN_TABLES, 0),
         "edge": tolerance.edges(),
     }
-    found = {name: _rounded(over_optics(bundle, held_out, which, told)) for name, which in tables.items()}
+    found = {name: _rounded(over_optics(bundle, held_out, which, conditions)) for name, which in tables.items()}
     fact = {"optics": optics, "words": tolerance.words(), "simulated": True, **found}
     return replace(bundle, provenance={**bundle.provenance, "tolerates": fact})
 

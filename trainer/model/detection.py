@@ -1,24 +1,18 @@
-"""Photon detection as a stochastic layer: the click law in torch, sampled clicks, and exact enumeration of click words.
+"""Photon detection as a stochastic layer: the click law in torch, afterpulses, sampled clicks, and all click words.
 
-Owns the physics between light and clicks during training, and its gradients; never the patterns before it and never the
-head behind it. Shapes: n objects, d_f patterns; tensors in, tensors out, all differentiable in the photoelectrons.
+Shapes: n objects, d_f patterns; tensors in, tensors out, all differentiable in the photoelectrons. `sample_clicks` passes gradients
+straight through (the estimators are in estimators.py); the click law behind it damps them: for a plain Poisson detector
+dL/dlambda = dL/da * slope * exp(-slope * lambda) (paper, appendix on gradient estimation).
 
-`sample_clicks` passes gradients straight through (the estimators are in estimators.py); the click law behind it damps them: for
-a plain Poisson detector dL/dlambda = dL/da * slope * exp(-slope * lambda) (paper, appendix on gradient estimation).
-
-Afterpulses in training: what the clicks before add to the chance of each, in the mean, in torch.
-
-The twin of pans.runtime.detector.Afterpulses on tensors. Fixed patterns are trained with the memory of all words: clicks stay independent,
-as the estimators ask, each with its right chance; how clicks depend on each other is left out, and `pans evaluate` has it.
-In an automaton every state has the memory of all walks that reach it, mean and variance.
-The gradient is that of a memory that stays as it is. Growing looks at a level without memory; all that follows has it.
+Afterpulses are those of `pans.runtime.detector`, in the mean: fixed patterns are trained with the memory of all words, so that clicks stay
+independent, each with its right chance; how clicks depend on each other is left out, and `pans evaluate` has it. In an automaton every
+state has the memory of all walks that reach it, mean and variance. The gradient is that of a memory that stays as it is.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -35,22 +29,6 @@ _MU_MAX = 100.0  # beyond it no detector of a profile stays dark, and high power
 _NEGLIGIBLE = 1e-13  # chance of missing that many photoelectrons, below which the term is left out
 ROUNDS = 3  # the last one with gradients; those before find the memory with which objects come
 _SURE, _LEAST = 1 - 1e-12, 1e-30
-
-
-@dataclass(frozen=True, slots=True)
-class ThermalLaw:
-    """Thermal light in `modes` modes: P(no click) = (1 + lambda / modes)**-modes; dark counts are Poisson (Mandel and Wolf, 14.9).
-
-    One mode bunches most: at equal light it clicks least. Many modes are a plain Poisson detector.
-    """
-
-    modes: float = 1.0
-    dark_per_exposure: float = 0.0
-
-    def __call__(self, photoelectrons: Tensor) -> Tensor:
-        """Return p for photoelectrons in float64."""
-        log_dark = -self.modes * torch.log1p(photoelectrons / self.modes) - self.dark_per_exposure
-        return -torch.expm1(log_dark)
 
 
 Law = ClickLaw | Callable[[Tensor], Tensor]  # a user's own: photoelectrons (float64) -> p, differentiable

@@ -1,7 +1,6 @@
 """Encoders: from what an object shows to the photoelectrons of every exposure or detector.
 
-Owns the trainable optics and their physical limits (no negative light, a brightest pixel, whole levels, no more light out than
-in); never detects. Called with `(x, floor)` an encoder gives photoelectrons (n, d_f) of objects x (n, inputs).
+Called with `(x, floor)` an encoder gives photoelectrons (n, d_f) of objects x (n, inputs).
 
 - `ActiveIllumination`: the paper's active scheme. Patterns are squared weights; x is transmission.
 - `CoherentField`: the paper's passive scheme. x is a field, real or complex; light = |W x|**2, W real as in the paper, or complex.
@@ -10,12 +9,9 @@ in); never detects. Called with `(x, floor)` an encoder gives photoelectrons (n,
 The paper's passive W is unconstrained: it may create photons. With `conserving`, W's largest singular value (coherent) or its column
 sums (incoherent) are at most 1, so that the detectors together receive no more than the object gave.
 
-How concentrated the light of a pattern is: a penalty for sensors that must bear a table which is not perfect.
-
-Owns the measure and its gradient. Of a pattern P of n pixels it is log(n sum P**2 / (sum P)**2): the brightness that its light has on
-average, over the mean brightness of all pixels. A pattern that lights k pixels alike has log(n / k), a uniform one 0; how bright
-it is does not matter. Bright spots leave the object pixel that they were made for where the image is off, and light that leaks through dark
-pixels of the projector is a part of the brightest one's.
+`concentration` is a penalty for optics that are not perfect. Of a pattern P of n pixels it is log(n sum P**2 / (sum P)**2): the brightness
+that its light has on average, over the mean brightness of all pixels. Bright spots miss the pixel that they were made for where the image
+is off, and light that leaks through dark pixels of the projector is a part of the brightest one's.
 """
 
 from __future__ import annotations

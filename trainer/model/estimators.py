@@ -1,33 +1,26 @@
-"""Gradient estimators: the training loss of random clicks, with a gradient that reaches the light in front of them.
+"""Losses, readings of an exposure, and gradient estimators: the loss of random readings with a gradient that reaches the light before them.
 
-Owns how a loss on clicks is differentiated; never the click law before it (detection.py) and never the head behind it. Every
-estimator is a function `(p, target, head, loss_of, random) -> loss`: click probabilities p (n, d_f), a scalar whose value is
-the mean loss of the batch and whose gradient is the estimate. Heads normalise by the mean of p
-(`ste`: by that of the sampled clicks, as in the paper).
+Every estimator is a function `(p, target, head, loss_of, random, readings) -> loss`: chances p, clicks (n, d_f) or photon numbers (n, d_f,
+outcomes), a scalar whose value is the mean loss of the batch and whose gradient is the estimate. Heads normalise by the mean of p
+(`ste`: by that of the sampled clicks, as in the paper). The last three know clicks alone.
 
 | name | gradient in p | cost |
 | --- | --- | --- |
 | `ste` | straight-through: passed on from the sampled click. Biased unless the loss is affine in every click | 1 pass |
-| `identity` | the same passed on to the light itself, undamped (the paper's "naive" way): for comparison alone | 1 pass |
 | `exact` | expectation over all 2**d_f words | 2**d_f words, once per batch |
 | `local` | L(click i) - L(no click i), the other clicks sampled: unbiased | d_f + 1 passes, only the last layer in full |
+| `identity` | as `ste`, passed on to the light itself, undamped (the paper's "naive" way): for comparison alone | 1 pass |
 | `disarm` | antithetic pairs (Dong, Mnih, Tucker 2020): unbiased | 2 passes |
 | `loo` | REINFORCE, other samples as the baseline (Kool, van Hoof, Welling 2019): unbiased | `LOO_SAMPLES` passes |
 
 The true gradient is dp/dlambda * E[L(1) - L(0)], with dp/dlambda = exp(-lambda) for a plain detector (science of the paper's
 appendix on gradient estimation, which calls `ste` unbiased; it is not).
-
-What an exposure says, clicks or photon numbers, as one stochastic layer: its chances, its mean, samples, and all words of a shot.
-
-Owns the way from light to what the head is given: readings over the largest, from 0 to 1. Of clicks it is detection.py's; the count law
-is here in torch. `chances` are p (n, d_f) of clicks, and P(number) (n, d_f, outcomes) of photon numbers; nobody else looks into them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -44,9 +37,9 @@ SHARPNESS = 2.0  # of the soft decision in `decision_loss`
 WRONG = 3.0  # cost of a wrong decision there: about what cross-entropy charges for one
 _DARK_MIN = 1e-6  # least chance of no click that `identity` divides by: float32 knows no less; beyond 13.8 photoelectrons it is damped
 _P_MIN = 1e-4  # least chance by which a score-function gradient is divided: beyond it, one event would undo an epoch
+_MU_MAX = 100.0  # beyond it every reading is the largest one
 
 LossOf = Callable[[Tensor, Tensor], Tensor]  # scores (..., out), target (..., or broadcast) -> losses (...)
-_MU_MAX = 100.0  # beyond it every reading is the largest one
 
 
 class Head(Protocol):
@@ -55,11 +48,8 @@ class Head(Protocol):
     def __call__(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
         """Scores (n, out) of clicks (n, d_f), normalised by `mean` (d_f,)."""
 
-    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
-        """Scores (n, d_f, out): column i is that of the same clicks with click i inverted."""
-
-
-Estimator = Callable[[Tensor, Tensor, Head, LossOf, torch.Generator], Tensor]
+    def changed(self, clicks: Tensor, mean: Tensor, by: Tensor) -> Tensor:
+        """Scores (n, d_f, out): column i is that of the same clicks with `by` (n, d_f) added to click i alone."""
 
 
 def cross_entropy(scores: Tensor, labels: Tensor) -> Tensor:
@@ -107,24 +97,127 @@ def similarity_loss(weight: float, image_shape: tuple[int, int]) -> LossOf:
     return loss_of
 
 
-def straight_through(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
-    """The paper's: the gradient of a sampled click is given to its probability."""
-    return loss_of(head(sample_clicks(p, random), None), target).mean()  # normalised by the clicks of the batch
+# ---- readings ----
 
 
-def identity(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
-    """The gradient of a sampled click is given to the photoelectrons, as if d click / d lambda were 1.
+class Readings:
+    """What the head is given of an exposure: photon numbers from 0 to `outcomes` - 1 (that many or more), over the largest: 0 to 1."""
 
-    The click law behind damps by exp(-lambda), the chance of no click of a plain detector: divided by that beforehand.
+    def __init__(self, outcomes: int) -> None:
+        self.outcomes = outcomes
+
+    def chances(self, photoelectrons: Tensor, law: Law | CountLaw, slope: float = 1.0) -> Tensor:
+        """Return the chances of an exposure with `photoelectrons` (n, d_f), of their dtype and differentiable in them."""
+        assert isinstance(law, CountLaw)
+        mu = (photoelectrons.double() * slope + law.dark_per_exposure).clamp(max=_MU_MAX)
+        return outcome_chances(mu, law).to(photoelectrons.dtype)
+
+    def mean(self, chances: Tensor) -> Tensor:
+        """Return the mean of what the head is given, (n, d_f) from 0 to 1."""
+        return (chances * self._values(chances)).sum(dim=-1)
+
+    def sample(self, chances: Tensor, random: torch.Generator) -> Tensor:
+        """Return what the head is given of one exposure of each pattern, (n, d_f); its gradient is that of the mean."""
+        uniform = torch.rand(chances.shape[:-1], generator=random, dtype=torch.float64)
+        with torch.no_grad():
+            passed = uniform.unsqueeze(-1) >= chances.double().cumsum(dim=-1)[..., :-1]
+            drawn = passed.sum(dim=-1).to(chances.dtype) / (self.outcomes - 1)
+        mean = self.mean(chances)
+        return drawn + (mean - mean.detach())
+
+    def word_chances(self, chances: Tensor) -> Tensor:
+        """Return P(word | object), (n, outcomes**d_f); pattern 0 is the lowest digit."""
+        words = torch.ones(len(chances), 1, dtype=chances.dtype, device=chances.device)
+        for i in range(chances.shape[1]):  # pattern i goes above the digits that are there
+            words = torch.cat([words * chances[:, i, number, None] for number in range(self.outcomes)], dim=1)
+        return words
+
+    def words(self, n_features: int) -> Tensor:
+        """Return what the head is given of all words, float32 (outcomes**d_f, d_f), in the order of `word_chances`."""
+        index = torch.arange(self.outcomes**n_features)[:, None]
+        digits = index // self.outcomes ** torch.arange(n_features) % self.outcomes
+        return digits.float() / (self.outcomes - 1)
+
+    def local_slope(
+        self, chances: Tensor, drawn: Tensor, loss_with: Callable[[Tensor], Tensor], loss: Tensor
+    ) -> Tensor:
+        """Return the slope of the loss in `chances`, one exposure changed at a time; `loss_with(by)`: readings changed by that."""
+        of_number = [loss_with(value - drawn) for value in self._values(chances)]
+        return torch.stack(of_number, dim=-1) - loss[:, None, None]  # the chances of an exposure sum to 1
+
+    def _values(self, like: Tensor) -> Tensor:
+        return torch.arange(self.outcomes, dtype=like.dtype, device=like.device) / (self.outcomes - 1)
+
+
+class Clicks(Readings):
+    """A click or none: the chances are p (n, d_f)."""
+
+    def __init__(self) -> None:
+        super().__init__(2)
+
+    def chances(self, photoelectrons: Tensor, law: Law | CountLaw, slope: float = 1.0) -> Tensor:
+        return click_probability(photoelectrons, law, slope)
+
+    def mean(self, chances: Tensor) -> Tensor:
+        return chances
+
+    def sample(self, chances: Tensor, random: torch.Generator) -> Tensor:
+        return sample_clicks(chances, random)
+
+    def word_chances(self, chances: Tensor) -> Tensor:
+        return word_probabilities(chances)
+
+    def words(self, n_features: int) -> Tensor:
+        return click_words(n_features)
+
+    def local_slope(
+        self, chances: Tensor, drawn: Tensor, loss_with: Callable[[Tensor], Tensor], loss: Tensor
+    ) -> Tensor:
+        return (1 - 2 * drawn) * (loss_with(1 - 2 * drawn) - loss.unsqueeze(1))
+
+
+CLICKS = Clicks()
+
+
+def readings_of(outcomes: int) -> Readings:
+    """Return what an exposure of so many `outcomes` says."""
+    return CLICKS if outcomes == 2 else Readings(outcomes)
+
+
+def outcome_chances(mu: Tensor, law: CountLaw) -> Tensor:
+    """Return P(outcome), (*shape of mu, outcomes), for `mu` photoelectrons, dark ones included, float64 and at most 100.
+
+    The same as `pans.runtime.instrument.click_law.count_chances`: exp(-mu) times a polynomial for every outcome but the last.
     """
-    clicks = sample_clicks(p, random).detach()
-    undamped = p / (1 - p.detach()).clamp(min=_DARK_MIN)
-    return loss_of(head(clicks + (undamped - undamped.detach()), None), target).mean()
+    weights = outcome_weights(law)[:-1]
+    factorials = np.array([math.factorial(k) for k in range(weights.shape[1])], np.float64)
+    powers = torch.tensor(weights / factorials, dtype=mu.dtype, device=mu.device)
+    below = torch.zeros((*mu.shape, len(weights)), dtype=mu.dtype, device=mu.device)
+    for k in reversed(range(powers.shape[1])):
+        below = below * mu.unsqueeze(-1) + powers[:, k]
+    below = below * torch.exp(-mu).unsqueeze(-1)
+    last = (1.0 - below.sum(dim=-1, keepdim=True)).clamp(min=0.0)
+    return torch.cat([below, last], dim=-1)
 
 
-def exact(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: torch.Generator) -> Tensor:
-    """All click words, each once: no sampling noise in loss or gradient."""
-    return word_loss(word_probabilities(p), head(click_words(p.shape[1]), p.mean(dim=0)), target, loss_of)
+# ---- estimators ----
+
+Estimator = Callable[[Tensor, Tensor, Head, LossOf, torch.Generator, Readings], Tensor]
+
+
+def straight_through(
+    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, readings: Readings = CLICKS
+) -> Tensor:
+    """The paper's: the gradient of a sampled click is given to its probability, of a number to the mean."""
+    return loss_of(head(readings.sample(p, random), None), target).mean()  # normalised by the clicks of the batch
+
+
+def exact(
+    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: torch.Generator, readings: Readings = CLICKS
+) -> Tensor:
+    """All words, each once: no sampling noise in loss or gradient."""
+    chances = readings.word_chances(p)
+    return word_loss(chances, head(readings.words(p.shape[1]), readings.mean(p).mean(dim=0)), target, loss_of)
 
 
 def word_loss(words: Tensor, scores: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
@@ -139,17 +232,36 @@ def word_loss(words: Tensor, scores: Tensor, target: Tensor, loss_of: LossOf) ->
     return (words * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(words)
 
 
-def local_expectation(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
-    """Every click in both states, with the others as sampled."""
-    clicks, mean = _draw(p, random), p.mean(dim=0)
-    loss = loss_of(head(clicks, mean), target)
+def local_expectation(
+    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, readings: Readings = CLICKS
+) -> Tensor:
+    """Every exposure with each of its readings, the others as sampled."""
+    drawn, mean = readings.sample(p, random).detach(), readings.mean(p).mean(dim=0)
+    loss = loss_of(head(drawn, mean), target)
+
+    def loss_with(by: Tensor) -> Tensor:
+        return loss_of(head.changed(drawn, mean, by), target.unsqueeze(1))
+
     with torch.no_grad():
-        change = loss_of(head.flipped(clicks, mean), target.unsqueeze(1)) - loss.unsqueeze(1)
-        slope = (1 - 2 * clicks) * change
+        slope = readings.local_slope(p, drawn, loss_with, loss)
     return loss.mean() + gradient_only(p, slope)
 
 
-def disarm(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
+def identity(
+    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, _readings: Readings | None = None
+) -> Tensor:
+    """The gradient of a sampled click is given to the photoelectrons, as if d click / d lambda were 1.
+
+    The click law behind damps by exp(-lambda), the chance of no click of a plain detector: divided by that beforehand.
+    """
+    clicks = sample_clicks(p, random).detach()
+    undamped = p / (1 - p.detach()).clamp(min=_DARK_MIN)
+    return loss_of(head(clicks + (undamped - undamped.detach()), None), target).mean()
+
+
+def disarm(
+    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, _readings: Readings | None = None
+) -> Tensor:
     """Two words from the same random numbers, one from u and one from 1 - u; only clicks that differ get a gradient."""
     uniform = torch.rand(p.shape, generator=random, dtype=torch.float64)
     first, second = (uniform < p).to(p.dtype), (1 - uniform < p).to(p.dtype)
@@ -161,7 +273,9 @@ def disarm(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch
     return 0.5 * (losses[0] + losses[1]).mean() + gradient_only(p, slope)
 
 
-def leave_one_out(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
+def leave_one_out(
+    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, _readings: Readings | None = None
+) -> Tensor:
     """Score function times how much worse a sample is than the others."""
     mean = p.mean(dim=0)
     drawn = [_draw(p, random) for _ in range(LOO_SAMPLES)]
@@ -191,170 +305,3 @@ ESTIMATORS: dict[str, Estimator] = {
     "disarm": disarm,
     "loo": leave_one_out,
 }
-
-
-class NumberHead(Head, Protocol):
-    """A head that knows what one other number would change."""
-
-    def changed(self, clicks: Tensor, mean: Tensor, by: Tensor) -> Tensor:
-        """Scores (n, d_f, out): column i is that of the same clicks with `by` (n, d_f) added to click i alone."""
-
-
-Estimate = Callable[[Tensor, Tensor, NumberHead, LossOf, torch.Generator], Tensor]
-
-
-class Readings(Protocol):
-    """What an exposure can say."""
-
-    outcomes: int  # 2: no click and a click
-
-    def chances(self, photoelectrons: Tensor, law: Law | CountLaw, slope: float = 1.0) -> Tensor:
-        """Return the chances of an exposure with `photoelectrons` (n, d_f), of their dtype and differentiable in them."""
-
-    def mean(self, chances: Tensor) -> Tensor:
-        """Return the mean of what the head is given, (n, d_f) from 0 to 1."""
-
-    def sample(self, chances: Tensor, random: torch.Generator) -> Tensor:
-        """Return what the head is given of one exposure of each pattern, (n, d_f); its gradient is that of the mean."""
-
-    def word_chances(self, chances: Tensor) -> Tensor:
-        """Return P(word | object), (n, outcomes**d_f); pattern 0 is the lowest digit."""
-
-    def words(self, n_features: int) -> Tensor:
-        """Return what the head is given of all words, float32 (outcomes**d_f, d_f), in the order of `word_chances`."""
-
-    def estimator(self, name: str) -> Estimate:
-        """Return the estimator of that name."""
-
-
-class Clicks:
-    """A click or none."""
-
-    outcomes = 2
-
-    def chances(self, photoelectrons: Tensor, law: Law | CountLaw, slope: float = 1.0) -> Tensor:
-        """See `Readings`."""
-        return click_probability(photoelectrons, law, slope)
-
-    def mean(self, chances: Tensor) -> Tensor:
-        """See `Readings`."""
-        return chances
-
-    def sample(self, chances: Tensor, random: torch.Generator) -> Tensor:
-        """See `Readings`."""
-        return sample_clicks(chances, random)
-
-    def word_chances(self, chances: Tensor) -> Tensor:
-        """See `Readings`."""
-        return word_probabilities(chances)
-
-    def words(self, n_features: int) -> Tensor:
-        """See `Readings`."""
-        return click_words(n_features)
-
-    def estimator(self, name: str) -> Estimate:
-        """See `Readings`."""
-        return ESTIMATORS[name]
-
-
-class Numbers:
-    """Photon numbers from 0 to `outcomes` - 1, which stands for that many or more."""
-
-    def __init__(self, outcomes: int) -> None:
-        self.outcomes = outcomes
-
-    def chances(self, photoelectrons: Tensor, law: Law | CountLaw, slope: float = 1.0) -> Tensor:
-        """See `Readings`."""
-        assert isinstance(law, CountLaw)
-        mu = (photoelectrons.double() * slope + law.dark_per_exposure).clamp(max=_MU_MAX)
-        return outcome_chances(mu, law).to(photoelectrons.dtype)
-
-    def mean(self, chances: Tensor) -> Tensor:
-        """See `Readings`."""
-        return (chances * self.values(chances)).sum(dim=-1)
-
-    def sample(self, chances: Tensor, random: torch.Generator) -> Tensor:
-        """See `Readings`."""
-        uniform = torch.rand(chances.shape[:-1], generator=random, dtype=torch.float64)
-        with torch.no_grad():
-            passed = uniform.unsqueeze(-1) >= chances.double().cumsum(dim=-1)[..., :-1]
-            drawn = passed.sum(dim=-1).to(chances.dtype) / (self.outcomes - 1)
-        mean = self.mean(chances)
-        return drawn + (mean - mean.detach())
-
-    def word_chances(self, chances: Tensor) -> Tensor:
-        """See `Readings`."""
-        words = torch.ones(len(chances), 1, dtype=chances.dtype, device=chances.device)
-        for i in range(chances.shape[1]):  # pattern i goes above the digits that are there
-            words = torch.cat([words * chances[:, i, number, None] for number in range(self.outcomes)], dim=1)
-        return words
-
-    def words(self, n_features: int) -> Tensor:
-        """See `Readings`."""
-        index = torch.arange(self.outcomes**n_features)[:, None]
-        digits = index // self.outcomes ** torch.arange(n_features) % self.outcomes
-        return digits.float() / (self.outcomes - 1)
-
-    def estimator(self, name: str) -> Estimate:
-        """See `Readings`."""
-        return partial(NUMBER_ESTIMATORS[name], self)
-
-    def values(self, like: Tensor) -> Tensor:
-        """Return what the head is given of each number, (outcomes,), of the dtype and on the device of `like`."""
-        return torch.arange(self.outcomes, dtype=like.dtype, device=like.device) / (self.outcomes - 1)
-
-
-def readings_of(outcomes: int) -> Readings:
-    """Return what an exposure of so many `outcomes` says."""
-    return Clicks() if outcomes == 2 else Numbers(outcomes)
-
-
-def outcome_chances(mu: Tensor, law: CountLaw) -> Tensor:
-    """Return P(outcome), (*shape of mu, outcomes), for `mu` photoelectrons, dark ones included, float64 and at most 100.
-
-    The same as `pans.runtime.instrument.click_law.count_chances`: exp(-mu) times a polynomial for every outcome but the last.
-    """
-    weights = outcome_weights(law)[:-1]
-    factorials = np.array([math.factorial(k) for k in range(weights.shape[1])], np.float64)
-    powers = torch.tensor(weights / factorials, dtype=mu.dtype, device=mu.device)
-    below = torch.zeros((*mu.shape, len(weights)), dtype=mu.dtype, device=mu.device)
-    for k in reversed(range(powers.shape[1])):
-        below = below * mu.unsqueeze(-1) + powers[:, k]
-    below = below * torch.exp(-mu).unsqueeze(-1)
-    last = (1.0 - below.sum(dim=-1, keepdim=True)).clamp(min=0.0)
-    return torch.cat([below, last], dim=-1)
-
-
-# ---- estimators: as in estimators.py, of an outcome that is one of several ----
-
-
-def _straight_through(
-    numbers: Numbers, chances: Tensor, target: Tensor, head: NumberHead, loss_of: LossOf, random: torch.Generator
-) -> Tensor:
-    """The gradient of a sampled number is given to the mean."""
-    return loss_of(head(numbers.sample(chances, random), None), target).mean()
-
-
-def _exact(
-    numbers: Numbers, chances: Tensor, target: Tensor, head: NumberHead, loss_of: LossOf, _random: torch.Generator
-) -> Tensor:
-    """All words, each once."""
-    scores = head(numbers.words(chances.shape[1]), numbers.mean(chances).mean(dim=0))
-    return word_loss(numbers.word_chances(chances), scores, target, loss_of)
-
-
-def _local_expectation(
-    numbers: Numbers, chances: Tensor, target: Tensor, head: NumberHead, loss_of: LossOf, random: torch.Generator
-) -> Tensor:
-    """Every exposure with each of its numbers, the others as sampled: unbiased."""
-    drawn, mean = numbers.sample(chances, random).detach(), numbers.mean(chances).mean(dim=0)
-    loss = loss_of(head(drawn, mean), target)
-    with torch.no_grad():
-        of_number = [
-            loss_of(head.changed(drawn, mean, value - drawn), target.unsqueeze(1)) for value in numbers.values(chances)
-        ]
-        slope = torch.stack(of_number, dim=-1) - loss[:, None, None]  # the chances of an exposure sum to 1
-    return loss.mean() + gradient_only(chances, slope)
-
-
-NUMBER_ESTIMATORS = {"ste": _straight_through, "exact": _exact, "local": _local_expectation}

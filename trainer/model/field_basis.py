@@ -1,7 +1,5 @@
 """A few fields in which a coherent encoder finds its start: what one class has and the others lack.
 
-Owns the choice of these fields from training objects, and the way back to pixels; never trains and never sees held-out objects.
-
 Scenes with a bright, fluctuating background defeat an encoder that starts from random weights: its first job is to cancel
 the background, and every step of an optimiser in 4096 pixels undoes that. The fields w for which E[(w.x)^2] of one class is largest
 against that of the others cancel it from the start: generalised eigenvectors of the second-moment matrices. An encoder
@@ -73,18 +71,6 @@ def in_pixels(encoder: Encoder, basis: Tensor) -> CoherentField:
     with torch.no_grad():
         whole.weight.copy_(encoder.weight @ basis.T)
     return whole
-
-
-def principal_fields(fields: Tensor, image_shape: tuple[int, int], size: int) -> Tensor:
-    """Return the `size` fields that hold most of the light of `fields` (n, pixels), float32 (pixels, size).
-
-    They are orthonormal (no more than that where the last bins are cut), so that an encoder of these coordinates may be held
-    to conserve light: it then does so in pixels.
-    """
-    side = _binning(image_shape)
-    moment = _second_moment(_binned(fields, image_shape, side).double())
-    vectors = torch.linalg.eigh(moment).eigenvectors[:, -size:].flip(1)
-    return _spread(vectors, image_shape, side).float() / side
 
 
 def _binning(image_shape: tuple[int, int]) -> int:

@@ -1,7 +1,7 @@
 """Heads: from clicks to scores, with batch normalisation right after the detection.
 
-Owns the digital back end in torch; never samples. A head takes click means (n, d_f) in [0, 1] and returns scores
-(n, classes), or pixels (n, height * width); `changed` gives them for every word that differs in one click.
+A head takes click means (n, d_f) in [0, 1] and returns scores (n, classes), or pixels (n, height * width); `changed` gives them for every
+word that differs in one click.
 
 - `MlpHead`: one hidden layer, the paper's (512 units).
 - `DeepHead`: two hidden layers, the paper's for cells (512 and 512 units).
@@ -72,10 +72,6 @@ class _Head(nn.Module):
     def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
         """Return the outputs (n, out) of click means (n, d_f); `mean` as in `ClickNorm`."""
         return self.rest(torch.relu(self.hidden(self.inputs(self.norm(clicks, mean)))))
-
-    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
-        """Return the outputs (n, d_f, out): in column i click i is inverted."""
-        return self.changed(clicks, mean, 1 - 2 * clicks)
 
     def changed(self, clicks: Tensor, mean: Tensor, by: Tensor) -> Tensor:
         """Return the outputs (n, d_f, out): in column i `by` (n, d_f) is added to click i alone."""

@@ -1,9 +1,8 @@
 """Objects through drawn optics: what the pattern grid meets of every training object on tables that differ within a tolerance.
 
-Owns the draws, the form in which training sees them, and what bleaching leaves of patterns.
-Objects are parted at random into groups, each seen through optics of its own.
-Light from dark pattern pixels is linear in the object and in the light of a full pixel: it stands in one more column beside the pixels,
-which meets the brightest level of a pattern as a pixel meets its own. Never trains.
+Objects are parted at random into groups, each seen through optics of its own. Light from dark pattern pixels is linear in the object and
+in the light of a full pixel: it stands in one more column beside the pixels, which meets the brightest level of a pattern. Also what
+bleaching leaves of patterns.
 """
 
 from __future__ import annotations

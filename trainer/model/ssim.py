@@ -1,10 +1,8 @@
-"""Structural similarity of image pairs (Wang, Bovik, Sheikh and Simoncelli 2004), as the paper's release computes it.
-
-Owns one formula, differentiable; never loads or scales an image. Images are floats in [0, 1] (data range 1).
+"""Structural similarity of image pairs (Wang, Bovik, Sheikh and Simoncelli 2004), differentiable, as the paper's release computes it.
 
 The release's choices: an 11 x 11 Gaussian window with sigma 1.5, zero padding (windows at the edge see black outside, which
 raises or lowers the edge against implementations that mirror), C1 = 0.01**2, C2 = 0.03**2, population variances, mean over
-all pixels, the edge included.
+all pixels, the edge included. Images are floats in [0, 1].
 """
 
 from __future__ import annotations

@@ -38,9 +38,8 @@ from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks import barcode as task_barcode
 from pans.trainer.tasks import mmf as task_mmf
 from pans.trainer.tasks.registry import Objects, Task, load_task
-from pans.trainer.train.anomaly_search import search
-from pans.trainer.train.barcode_search import solve, solve_patterns
 from pans.trainer.train.data import CHUNK, encoder_input
+from pans.trainer.train.exact_search import search, solve, solve_patterns
 from pans.trainer.train.loop import Trained, train
 
 from . import plots

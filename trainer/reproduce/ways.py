@@ -14,12 +14,11 @@ from typing import Any
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.adaptive.options import AutomatonOptions, for_task, started_from, with_defaults
+from pans.trainer.adaptive.budget import for_task, started_from, with_defaults
 from pans.trainer.baselines.common import silent
-from pans.trainer.baselines.options import BaselineOptions
 from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.evaluate.accuracy import row_of
-from pans.trainer.options import Options
+from pans.trainer.options import AutomatonOptions, BaselineOptions, Options
 from pans.trainer.tasks.registry import Task, load_task
 
 from .active import PROFILE

@@ -10,7 +10,7 @@ any light), and 57.5 % where the classes are; that belongs to the task and canno
 
 The paper (appendix "Barcode 1010 identification") gives 4000 training and 1000 test strings, two classes, and does not say how
 they were drawn. The three priors here are the natural readings. With `balanced`, three patterns were not found to reach the paper's
-69.4 % (barcode_search.py: 68.4 %), with the other two they were.
+69.4 % (exact_search.py: 68.4 %), with the other two they were.
 
 - `uniform`: every string is equally likely; 357 of 1024 (34.9 %) contain the sequence (the default);
 - `balanced`: the classes are equally likely, and the strings of a class among themselves;

@@ -1,20 +1,6 @@
-"""More training objects than there are: distorted copies of each, against learning the training images by heart.
+"""Changes of training images that leave the class as it is: moves by whole pixels, small distortions, and variations of any size.
 
-Owns the distortions: small turns, stretches, shears and shifts of the whole image, and a smooth random displacement of its parts, all
-drawn anew per copy and the same for the same seed. Never touches the objects that choose among restarts, nor held-out ones. What comes
-in from outside repeats the edge.
-
-(LeCun, Bottou, Bengio and Haffner 1998, and Simard, Steinkraus and Platt 2003, trained on distorted digits; sizes here are ours.)
-
-Objects out of place: every training image moved a little, as one that passes by is when its window is not quite the right one.
-
-Owns the random shifts, one per image and the same for the same seed; never touches the held-out objects. What moves out is lost, what
-moves in is black.
-
-Changes of an image that leave its class as it is: turns, sizes, shifts, bends and mirrors, for trainings on few images.
-
-Owns the kinds of change and how images are changed by them; which of them suit a task is chosen in the package choose. What comes in from
-outside repeats the edge. The sizes of distort.py are fixed and small, for sets of tens of thousands of images; these are any.
+`distorted` has the fixed, small sizes for sets of tens of thousands of images; `varied` takes any (`Variation`), for few images.
 """
 
 from __future__ import annotations

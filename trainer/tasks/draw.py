@@ -1,11 +1,9 @@
 """Drawing primitives that the task generators share: random streams, soft shapes, smooth noise, speckle, grey levels.
 
-Owns how a scene is sampled and rasterised, many images at a time; never knows a task or a class. Images are float32
-(n, height, width); coordinates are pixels, y down and x right, with the origin in the middle of the frame.
-
-Objects are drawn in chunks of `CHUNK`, each with its own random stream: object i of a seed is the same however many are asked
-for, and the held-out objects come from other streams than the training objects. Another version of numpy or another processor
-may round a few pixels to the neighbouring grey level.
+Images are float32 (n, height, width); coordinates are pixels, y down and x right, with the origin in the middle of the frame. Objects are
+drawn in chunks of `CHUNK`, each with its own random stream: object i of a seed is the same however many are asked for, and the held-out
+objects come from other streams than the training objects. Another version of numpy or another processor may round a few pixels to the
+neighbouring grey level.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The tasks that are drawn, not read: their generators by name, what their grey levels mean, and what encoder suits them.
 
-Owns the list; never draws itself (each task has a module, and `draw_task` in registry.py calls it) and never reads a file. Every
-generator here is OURS: the paper's images for these tasks are not public in a form that can be reached. docs/reference/tasks.md shows
-and measures them.
+Every generator is OURS: the paper's images for these tasks are not public in a form that can be reached. docs/reference/tasks.md shows and
+measures them.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.optics import Light
 
-from . import barcode, cells, fiber, nebula, tissue, transient
+from . import barcode, cells, fields
 from .draw import Labels
 
 Draw = Callable[[int, str, int], tuple[NDArray[np.uint8], Labels]]
@@ -30,7 +29,7 @@ class Recipe:
     image_shape: tuple[int, int]
     light: Light
     encoder: str  # that the physics asks for: active, coherent or incoherent
-    n_train: int  # objects drawn unless told otherwise; the numbers of the paper stand in the modules of the tasks
+    n_train: int  # objects drawn by default; the numbers of the paper stand in the modules of the tasks
     n_test: int
     draw: Draw
 
@@ -55,9 +54,18 @@ GENERATORS: Mapping[str, Recipe] = {
     ),
     "barcode": Recipe("do ten bars contain 1010", barcode.CLASSES, *BARS, 4000, 1000, barcode.draw),
     "transient": Recipe(
-        "is there a small object in a coherently lit scene", transient.CLASSES, *COHERENT, 12_000, 2000, transient.draw
+        "is there a small object in a coherently lit scene",
+        fields.EVENTS,
+        *COHERENT,
+        12_000,
+        2000,
+        fields.draw_transient,
     ),
-    "tissue": Recipe("does laser speckle show blood flow", tissue.CLASSES, *INCOHERENT, 8000, 2000, tissue.draw),
-    "nebula": Recipe("planetary or emission nebula", nebula.CLASSES, *INCOHERENT, 12_000, 2000, nebula.draw),
-    "fiber": Recipe("is the end face of a fibre contaminated", fiber.CLASSES, *COHERENT, 12_000, 2000, fiber.draw),
+    "tissue": Recipe(
+        "does laser speckle show blood flow", fields.PERFUSION, *INCOHERENT, 8000, 2000, fields.draw_tissue
+    ),
+    "nebula": Recipe("planetary or emission nebula", fields.NEBULAE, *INCOHERENT, 12_000, 2000, fields.draw_nebula),
+    "fiber": Recipe(
+        "is the end face of a fibre contaminated", fields.END_FACES, *COHERENT, 12_000, 2000, fields.draw_fiber
+    ),
 }

@@ -1,7 +1,6 @@
 """Public data sets: IDX files with pinned sizes and SHA-256, found in a folder or fetched.
 
-Owns the pins, the reading of IDX and the fetching; never splits or labels anything (registry.py). Nothing is unpacked beyond
-the shape that it must have, and nothing unchecked is kept.
+Nothing is unpacked beyond the shape that it must have, and nothing unchecked is kept.
 """
 
 from __future__ import annotations

@@ -1,16 +1,8 @@
-"""Tasks: labelled 8-bit images, from pinned public files, from generators or from a user's own.
+"""Tasks by name, file or folder: labelled 8-bit images, split into training and held-out objects; and the task of a bundle, found again.
 
-Owns the reading of .npz files and class folders, with limits, and the split into training and held-out objects; never
-trains and never shows an image. The public sets are in public_sets.py, the drawn ones in generators.py. `load_task` returns a
-`Task` whose images are uint8 (n, height, width): 0 is black.
-
-A user's file or folder without a test part is split by position: every fifth object is held out. Both parts are then mixed, so that
-any stretch of them holds all classes in their shares: folders are read class by class, and trainings keep the last objects back.
-
-The data set that a bundle was trained on, found again.
-
-Owns where it is looked for: by its name, where it was when the bundle was written (relative to the bundle), beside the bundle and in the
-working folder. What is there must be the same data, by SHA-256.
+`load_task` returns a `Task` whose images are uint8 (n, height, width): 0 is black. A user's file or folder without a test part is split by
+position: every fifth object is held out. Both parts are then mixed, so that any stretch of them holds all classes in their shares: folders
+are read class by class, and trainings keep the last objects back.
 """
 
 from __future__ import annotations
@@ -137,7 +129,7 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_see
 
 
 def physical_encoder(task: Task) -> str:
-    """Return the encoder that the physics of `task` asks for: what `pans train` takes unless told otherwise."""
+    """Return the encoder that the physics of `task` asks for: what `pans train` takes by default."""
     if task.name in GENERATORS and task.source:
         return GENERATORS[task.name].encoder
     return "active" if task.light == "transmission" else "coherent"
@@ -314,11 +306,11 @@ def remembered_task(provenance: Mapping[str, Any], name: str, bundle: Path) -> s
 
     `provenance` is the bundle's, `name` its task, `bundle` its file.
     """
-    told = str(provenance.get("task_argument", name))
-    if told in task_names():
-        return told
+    task = str(provenance.get("task_argument", name))
+    if task in task_names():
+        return task
     kept = str(provenance.get("data_path", ""))
-    places = [Path(told), bundle.parent / told] if told else []
+    places = [Path(task), bundle.parent / task] if task else []
     places = ([bundle.parent / kept] if kept else []) + places
     places += [place.with_name(f"{place.name}.npz") for place in places if not place.suffix]
     for place in dict.fromkeys(Path(os.path.normpath(place)) for place in places):
@@ -327,6 +319,6 @@ def remembered_task(provenance: Mapping[str, Any], name: str, bundle: Path) -> s
     looked = ", ".join(dict.fromkeys(os.path.normpath(place) for place in places)) or "nothing: the bundle names none"
     digest = str(provenance.get("data_sha256", ""))[:12]
     raise UsageError(
-        f"the data set {told!r}{f' (SHA-256 {digest}…)' if digest else ''} of {bundle} was not found; looked for {looked}",
+        f"the data set {task!r}{f' (SHA-256 {digest}…)' if digest else ''} of {bundle} was not found; looked for {looked}",
         remedy="name it: --task FOLDER, FILE.npz or a name of `pans data list`",
     )

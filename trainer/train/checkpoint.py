@@ -1,6 +1,5 @@
 """Checkpoints: the state of a training on disk, so that an interrupted one goes on to the same result.
 
-Owns the file, the check that it belongs to this training, and the time that all its processes took; never knows what the state means.
 The file is torch's own and is read with `weights_only`: tensors and plain values, nothing that could run code.
 """
 
@@ -54,10 +53,10 @@ def timed(path: Path, *, resume: bool) -> Iterator[Stopwatch]:
 def _seconds_in(path: Path) -> float:
     """Return the seconds that a checkpoint tells, 0 where it tells none; what is no checkpoint is refused by who reads it."""
     try:
-        told = torch.load(path, map_location="cpu", weights_only=True)["seconds"]
+        seconds = torch.load(path, map_location="cpu", weights_only=True)["seconds"]
     except Exception:  # a damaged or foreign file makes torch raise almost anything
         return 0.0
-    return float(told) if isinstance(told, float) and 0 <= told < math.inf else 0.0
+    return float(seconds) if isinstance(seconds, float) and 0 <= seconds < math.inf else 0.0
 
 
 def _identity(options: DataclassInstance, data_sha256: str) -> dict[str, Any]:

@@ -1,8 +1,4 @@
-"""What a training sees: the objects of a task as tensors, in the form that the encoder takes.
-
-Owns the way from 8-bit images to transmissions, fields or intensities, and the part kept for validation; never trains and never
-touches the held-out objects.
-"""
+"""What a training sees: the objects of a task as transmissions, fields or intensities, and the part kept for validation."""
 
 from __future__ import annotations
 

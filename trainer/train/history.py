@@ -1,10 +1,7 @@
-"""How a training went: figures of every epoch, and the patterns after some of them. SIMULATED.
+"""How a training went: figures of every epoch, and the patterns after some of them. SIMULATED, of the training objects.
 
-`History` (`pans train --history DIR`) owns the file `history.json` and its pictures (extra `plot`). It reads the patterns of earlier
-epochs from the checkpoints, which a training writes anyway; its figures are of the training objects.
-
-`follow` trains one run epoch by epoch and measures the accuracy on training and held-out objects in between. It draws from random
-numbers of its own, so that the training gives what `train` gives.
+`History` (`pans train --history DIR`) writes `history.json` and its pictures (extra `plot`). `follow` trains one run epoch by epoch and
+measures the accuracy on training and held-out objects in between, with random numbers of its own: the training gives what `train` gives.
 """
 
 from __future__ import annotations
@@ -56,7 +53,7 @@ class Reported(Protocol):
 
 
 class History:
-    """Takes the report of every epoch; `write` leaves the file and the pictures."""
+    """The reports of all epochs; `write` makes the file and the pictures."""
 
     def __init__(self, checkpoint: Path, options: Options, data_sha256: str) -> None:
         self.epochs: list[EpochReport] = []
@@ -65,7 +62,7 @@ class History:
         last = max(1, options.epochs - 1)
         self._wanted = {round(math.exp(math.log(last) * i / (STEPS_SHOWN - 1))) for i in range(STEPS_SHOWN)}
 
-    def take(self, report: EpochReport) -> None:
+    def add(self, report: EpochReport) -> None:
         """Note one epoch. The checkpoint on disk is that of the epoch before."""
         self.epochs.append(report)
         before = report.epoch - 1
@@ -203,20 +200,20 @@ def follow(
     epochs: list[EpochFigures] = []
     patterns: dict[int, NDArray[np.float32]] = {}
     while run.epoch < options.epochs:
-        told = run.one_epoch()
-        report(told)
+        trained = run.one_epoch()
+        report(trained)
         of_training = _right(run, data.shown[:n], data.labels[:n], random)
         of_held_out = _right(run, held_out, labels, random)
         intensity = (run.encoder.weight.detach() ** 2).cpu().numpy()
         epochs.append(
             EpochFigures(
-                loss=told.loss,
+                loss=trained.loss,
                 training=100 * float(of_training.mean()),
                 held_out=100 * float(of_held_out.mean()),
                 held_out_first_200=100 * float(of_held_out[:FIRST].mean()),
-                clicks=told.clicks,
-                photons=told.photons,
-                illumination=told.illumination,
+                clicks=trained.clicks,
+                photons=trained.photons,
+                illumination=trained.illumination,
                 peak=float(intensity.max() / intensity.mean()),
             )
         )

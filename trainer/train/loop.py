@@ -1,19 +1,15 @@
-"""What changes in the course of a training: stages, learning rates_at, black_at, slope, clamp and loss.
+"""Training through the instrument: one flat loop from random patterns to whole projector levels and a finished head.
 
-Owns every schedule, as functions of the options and of `now`, the epochs that have passed (with the part of the present one);
-never holds state and never trains.
-
-Training through the instrument: one flat loop from random patterns to whole projector levels and a finished head.
-
-Owns the schedule, the photon budget and the checkpoint; never writes a bundle (the package export) and never sees the held-out
-objects. `train` returns a `Trained` whose patterns are already what the projector will show.
-
-Stages (one epoch is one pass over the training objects):
+`train` returns a `Trained` whose patterns are already what the projector will show. Stages (one epoch is one pass over the training
+objects):
 
 1. straight-through on sampled clicks (paper, algorithm for active PANS), on an object modulator with perfect black;
 2. with the exact estimator: the expectation over all 2**d_f click words, while black rises to what the modulator can do;
 3. the same with patterns rounded to levels; the photoelectrons of the top level are trained with them;
 4. the patterns stay, the head is fitted to them alone.
+
+What changes in the course of a training (stages, rates, black, slope, loss) are functions of the options and of `now`, the epochs that have
+passed.
 """
 
 from __future__ import annotations
@@ -36,7 +32,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
 from pans.trainer.model.detection import Law, trained_through, with_crosstalk, with_mean_memory
 from pans.trainer.model.encoders import ActiveIllumination, Encoder, concentration, new_encoder
-from pans.trainer.model.estimators import LossOf, cross_entropy, decision_loss, readings_of, similarity_loss
+from pans.trainer.model.estimators import ESTIMATORS, LossOf, cross_entropy, decision_loss, readings_of, similarity_loss
 from pans.trainer.model.exposure import exposure_us_of
 from pans.trainer.model.field_basis import in_pixels
 from pans.trainer.model.heads import Heads, new_head
@@ -233,7 +229,7 @@ class Run:
             self.optimiser = self._new_optimiser()  # the moments of another estimator would mislead
         if self.epoch == whole_levels(options) and isinstance(self.encoder, ActiveIllumination):
             self.encoder.start_quantising(self.profile.projector.levels)
-        readings, loss_of_clicks = self.readings, self.readings.estimator(estimator_at(options, self.epoch))
+        readings, estimate = self.readings, ESTIMATORS[estimator_at(options, self.epoch)]
         law, traps = self.law(), self.afterpulses()
         order = torch.randperm(data.n_fit, generator=self.random)
         batches = [part for part in order.split(options.batch) if len(part) > 1]
@@ -247,7 +243,7 @@ class Run:
             slope, clamp = slope_and_clamp(options, now)
             p = self._linked(readings.chances(light.clamp(max=clamp), law, slope), traps)
             loss_of = loss_at(options, now, data.picture_shape)
-            loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
+            loss = estimate(p, data.target[batch], self.head, loss_of, self.random, readings)
             if options.mix > 0 and self.epoch >= second_stage(options):
                 loss = (1 - options.mix) * loss + options.mix * self._several_shots(p, data.target[batch], loss_of)
             clicks = readings.mean(p).sum(dim=1).mean() * (readings.outcomes - 1)

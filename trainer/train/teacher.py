@@ -1,8 +1,7 @@
-"""Soft targets: what an ordinary network, which sees every image without noise, thinks of each training object.
+"""Soft targets: what an ordinary network, which sees every image without noise, thinks of each training object; and their file.
 
-Owns the network, its training on the objects to fit, and the file that keeps its answers for other trainings of the same task. An
-automaton that is trained on these probabilities learns from every object how alike the classes are, instead of one label by heart
-(distillation: Hinton, Vinyals and Dean 2015, arXiv:1503.02531). Objects held back are never shown to the network, test objects neither.
+An automaton that is trained on these probabilities learns from every object how alike the classes are (distillation: Hinton, Vinyals and
+Dean 2015, arXiv:1503.02531). Objects held back are never shown to the network, test objects neither.
 """
 
 from __future__ import annotations

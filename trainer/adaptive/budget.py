@@ -1,21 +1,21 @@
-"""What to train: the options of an automaton, their defaults from the budget, and what of them is impossible on a task or profile.
+"""The size and price of an automaton from its budget of light, and what of its options is impossible on a task or profile.
 
-Owns names, defaults and limits; never trains. `check_automaton_options` returns nothing, or raises with the numbers.
+`check_automaton_options` returns nothing, or raises with the numbers.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import CHANNELS_MAX, SLOTS_MAX, STATES_MAX
+from pans.runtime.bundle.automaton import STATES_MAX
 from pans.runtime.bundle.model import Bundle
+from pans.runtime.cli.option_fields import check_options as check_ranges
 from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.instrument.click_law import OUTCOMES_MAX, cannot_count, cannot_read_at_once
+from pans.runtime.instrument.click_law import cannot_count, cannot_read_at_once
 from pans.runtime.instrument.profile import Profile
-from pans.trainer.options import check_optics
+from pans.trainer.options import AutomatonOptions, check_optics
 from pans.trainer.tasks.registry import Task
 
 PHOTONS_PER_CLICK = 1.85  # of a trained automaton, about; only to choose defaults for a budget of clicks
@@ -29,80 +29,6 @@ GREY_EPOCHS = 3
 # by task, where they helped on held-back objects (docs/how-to/automaton.md)
 COPIES_OF = {"mnist": 20}
 SOFT_OF = {"fashion-mnist": 0.5}
-
-
-@dataclass(frozen=True, slots=True)
-class AutomatonOptions:
-    """What to train. `photons` or `clicks` is the budget of one decision, on average; 0 exposures or states stand for defaults."""
-
-    photons: float | None = None
-    clicks: float | None = None
-    exposures: int = 0
-    states: int = 0
-    seed: int = 0
-    batch: int = 250
-    grow_epochs: int = 2
-    candidates: int = 6
-    first_price: float = (
-        0.2  # nats per photoelectron of the first question, halved every `half` levels towards the last price
-    )
-    half: float = 6.0
-    tune_epochs: int | None = None  # of grey patterns; None: 3, or 0 through optics, where they brought nothing
-    epochs: int = 6  # of the patterns as they are shown
-    tune_rate: float = 0.005
-    rate: float = 0.01
-    reroutes: int = 2  # sweeps that move edges to better states, after the first epochs of the last stage
-    shift_px: int = 0  # training images are moved by up to that much along the rows, anew in every epoch
-    offset_px: int = 0  # and across them
-    copies: int | None = (
-        None  # distorted versions of every training image, which the epochs take in turn; None: COPIES_OF
-    )
-    grey: bool = False  # patterns in all levels of the projector, instead of one bit and a brightness
-    strength: float = 0.3  # of these distortions; at full strength they cost more than they bring
-    decide: float = (
-        0.7  # of the loss counts wrong decisions, from the second epoch of the last stage on; the rest is the log loss
-    )
-    exposure_price: float = 0.0  # nats per exposure: walks end early where what follows is worth less
-    patterns: int = 0  # at most so many different patterns, which states share; 0: as many as the projector holds
-    soft: float | None = None  # weight of a network's answers in the targets, the labels have the rest; None: SOFT_OF
-    teacher_epochs: int = 6  # of that network
-    dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
-    optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
-    spread: float = 0.0  # weight in the loss of how concentrated the light of a pattern is (model/concentration.py)
-    outcomes: int = 2  # of one exposure: no click and a click, or 0, 1, ... photons and the last "this many or more"
-    channels: int = 1  # detectors that are read at once, each with a pattern of its own
-    start: str | None = None  # sha256 of the bundle whose automaton is trained on, instead of one that grows
-
-    @property
-    def successors(self) -> int:
-        """Number of outcomes of one exposure."""
-        return 1 << self.channels if self.channels > 1 else self.outcomes
-
-
-LIMITS = {
-    "exposures": (0, SLOTS_MAX),
-    "states": (0, STATES_MAX),
-    "seed": (0, 2**63 - 1),
-    "batch": (2, 1 << 20),
-    "grow_epochs": (1, 1000),
-    "candidates": (1, 1000),
-    "tune_epochs": (0, 100_000),
-    "epochs": (1, 100_000),
-    "reroutes": (0, 1000),
-    "rate": (0, 1),
-    "shift_px": (0, 65536),
-    "strength": (0, 10),
-    "soft": (0, 1),
-    "decide": (0, 1),
-    "exposure_price": (0, 10),
-    "spread": (0, 10),
-    "teacher_epochs": (1, 1000),
-    "outcomes": (2, OUTCOMES_MAX),
-    "channels": (1, CHANNELS_MAX),
-    "patterns": (0, 65_535),
-    "offset_px": (0, 65536),
-    "copies": (0, 1000),
-}
 
 
 def photons_wanted(options: AutomatonOptions) -> float:
@@ -205,34 +131,20 @@ def started_from(
     most = patterns_at_most(options, profile)
     if most < automaton.n_states * automaton.channels:
         raise PlanError(
-            f"--start: {automaton.n_states} states with {_patterns_each(automaton.channels)}, {most} are allowed; "
-            "only a training that grows shares them",
+            f"--start: {automaton.n_states} states with {automaton.channels} pattern(s) each, {most} patterns are allowed; only a "
+            "training that grows shares them",
             remedy="leave out --start or --patterns, or choose a profile with a larger pattern memory",
         )
     return replace(options, exposures=exposures, states=states, start=sha256)
 
 
-def _patterns_each(channels: int) -> str:
-    return "a pattern each" if channels == 1 else f"{channels} patterns each"
-
-
 def check_automaton_options(options: AutomatonOptions, task: Task, profile: Profile) -> None:
     """Raise UsageError or PlanError for what cannot be trained for this task on this profile."""
-    for name, (low, high) in LIMITS.items():
-        value = getattr(options, name)
-        if value is not None and not low <= value <= high:
-            flag = "--" + name.replace("_", "-")
-            raise UsageError(f"{flag} is {value}, allowed: {low} to {high}")
-    for name in ("photons", "clicks"):
-        value = getattr(options, name)
-        if value is not None and not (math.isfinite(value) and 0.1 <= value <= 1000):
-            raise UsageError(f"--{name} is {value}, allowed: 0.1 to 1000")
+    check_ranges(options)
     if (options.photons is None) == (options.clicks is None):
         raise UsageError(
             "an automaton is trained for one budget, --photons or --clicks", remedy="give exactly one of them"
         )
-    if options.dark is not None and not 0 <= options.dark < math.inf:
-        raise UsageError(f"--dark is {options.dark}, allowed: finite and at least 0")
     if options.optics is not None:
         check_optics(options.optics)
     _check_task(task)
