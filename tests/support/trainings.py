@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,7 +19,7 @@ def short_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last stage of a training takes 1500 steps however small the task is; tests that ask for no good head take 30."""
     from pans.trainer.train import head_fit
 
-    monkeypatch.setattr(head_fit, "fit_head_exactly", partial(head_fit.fit_head_exactly, steps=30))
+    monkeypatch.setattr(head_fit, "STEPS", 30)
 
 
 def bars_task(n: int = 1200, seed: int = 0) -> Task:

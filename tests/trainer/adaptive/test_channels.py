@@ -15,20 +15,15 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive.budget import check_automaton_options, started_from
 from pans.trainer.adaptive.grow import GrowOptions, Growth
 from pans.trainer.adaptive.machine import Aim, Bits, Level, Machine, Sight, as_bits, backward, forward
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
-from pans.trainer.adaptive.options import (
-    AutomatonOptions,
-    check_automaton_options,
-    price_at,
-    started_from,
-    with_defaults,
-)
 from pans.trainer.adaptive.outcomes import WordLaw
 from pans.trainer.adaptive.train import train_automaton
 from pans.trainer.evaluate.walks import measured_walks, walks_of
 from pans.trainer.export.automaton import export_automaton
+from pans.trainer.options import AutomatonOptions
 
 FOUR = load_profile("dmd-four-snspd")
 GREY = torch.tensor([[0, 10, 255, 30, 7], [200, 0, 90, 255, 255], [0, 0, 0, 0, 0]], dtype=torch.float64)
@@ -115,7 +110,7 @@ def test_parts_of_a_state_keep_their_light_under_one_brightness():
     grey = (grey - 0.6).clamp(min=0)  # patterns that are dark in places, as trained ones are
     grey[::2] *= 0.3
     bits = as_bits(grey, own, parts=2)
-    mask, scale = bits.shown()
+    mask, scale = bits.displayed()
     assert (len(bits.log_light), len(scale)) == (4, 8)
     brought, wanted = ((mask * own).sum(dim=1) * scale.flatten()), (grey * own).sum(dim=1)
     assert float(((brought - wanted).abs() / scale.flatten()).max()) <= 1.0  # within one pixel
@@ -149,21 +144,6 @@ def test_a_training_ends_in_a_bundle_that_is_evaluated_and_trained_on(tmp_path):
         started_from(replace(SMALL, channels=3), bundle, digest, task, FOUR)
 
 
-def test_a_resumed_training_ends_at_the_same_automaton(tmp_path):
-    task, path = bars_task(120), tmp_path / "two.checkpoint"
-    whole = train_automaton(task, FOUR, SMALL)
-
-    def stop(told):
-        if told.stage == "shown":
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_automaton(task, FOUR, SMALL, checkpoint=path, report=stop)
-    resumed = train_automaton(task, FOUR, SMALL, checkpoint=path, resume=True)
-    for name in ("pattern_levels", "pattern", "dwell", "successors"):
-        np.testing.assert_array_equal(getattr(resumed.arrays, name), getattr(whole.arrays, name))
-
-
 @pytest.mark.parametrize(
     ("changes", "name", "error", "words"),
     [
@@ -179,24 +159,3 @@ def test_a_resumed_training_ends_at_the_same_automaton(tmp_path):
 def test_what_cannot_be_read_at_once_is_refused(changes, name, error, words):
     with pytest.raises(error, match=words):
         check_automaton_options(replace(SMALL, **changes), bars_task(20), load_profile(name))
-
-
-def test_channels_whose_clicks_are_linked_are_refused_and_need_fewer_exposures():
-    linked = replace(FOUR, detector=replace(FOUR.detector, afterpulse_probability=0.01))
-    with pytest.raises(PlanError, match=r"detector\.afterpulse_probability: their clicks are not independent"):
-        check_automaton_options(SMALL, bars_task(20), linked)
-    alone, pair = (AutomatonOptions(photons=10.0, channels=channels) for channels in (1, 2))
-    assert 2 * with_defaults(pair, FOUR)[0] == with_defaults(alone, FOUR)[0]
-    assert [price_at(pair, level) for level in range(10)] == [price_at(alone, 2 * level) for level in range(10)]
-
-
-def test_dark_counts_of_a_decision_are_those_of_all_its_detectors():
-    from pans.trainer.adaptive.train import DARK_COUNTS, _Run
-
-    tops = {}
-    for channels, exposures in ((1, 24), (2, 12), (2, 24)):
-        run = _Run(bars_task(20), FOUR, replace(SMALL, channels=channels, exposures=exposures), lambda _: None, 0)
-        tops[channels, exposures] = run._highest_top()
-    exposure_s = tops[2, 24] / FOUR.projector.peak_photoelectrons_hz
-    assert 48 * FOUR.detector.dark_rate_hz * exposure_s == pytest.approx(DARK_COUNTS)
-    assert tops[1, 24] == tops[2, 12] == pytest.approx(2 * tops[2, 24])

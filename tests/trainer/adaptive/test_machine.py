@@ -10,12 +10,10 @@ from mpmath import mp, mpf
 from naive_adaptive import every_word
 from trainings import random_machine
 
-from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click
-from pans.trainer.adaptive.machine import WRONG, Aim, Bits, Sight, as_bits, backward, brought, forward
+from pans.runtime.instrument.click_law import ClickLaw
+from pans.trainer.adaptive.machine import WRONG, Aim, Sight, as_bits, backward, brought, forward
 from pans.trainer.adaptive.objects import Block
-from pans.trainer.adaptive.outcomes import no_click
 from pans.trainer.adaptive.tune import figures
-from pans.trainer.processor import settle
 
 NOISY = ClickLaw(dark_per_exposure=0.02, read_noise_e=0.3, threshold_e=0.5)
 LAWS = (ClickLaw(), ClickLaw(0.05), NOISY)
@@ -57,18 +55,6 @@ def test_forward_keeps_tiny_and_nearly_certain_chances(light):
     assert got == pytest.approx(exact, rel=1e-12, abs=2e-16)
     assert torch.cat(passed.leaves).sum().item() == pytest.approx(1.0, abs=1e-15)
     assert all(bool((leaves >= 0).all()) for leaves in passed.leaves)
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_probability_of_no_click_is_the_runtimes(law):
-    light = np.array([0.0, 1e-7, 0.01, 0.5, 1.0, 3.0, 10.0, 40.0])
-    dark, fall = no_click(torch.from_numpy(light), law)
-    np.testing.assert_allclose(dark.numpy(), np.exp(log_no_click(law, light)), rtol=2e-7, atol=1e-12)
-    step = 1e-5
-    slope = (click_probability(law, light + step) - click_probability(law, np.maximum(0, light - step))) / (
-        np.minimum(light, step) + step
-    )
-    np.testing.assert_allclose(fall.numpy(), slope, rtol=2e-5, atol=1e-8)
 
 
 def loss_of(machine, sight, aim):
@@ -126,27 +112,6 @@ def test_gradient_of_the_brightness_of_bits(shared, aim):
             assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
 
 
-def test_gradient_of_a_bit_is_near_that_of_a_sigmoid():
-    lean = torch.linspace(-2, 2, 41, dtype=torch.float64, requires_grad=True)
-    torch.sigmoid(4 * lean).sum().backward()
-    wanted = lean.grad.clone()
-    with torch.no_grad():
-        bits = Bits(lean.detach().clone().unsqueeze(0), torch.zeros(1, 1, dtype=torch.float64))
-        bits.take(torch.full((1, 41), -3.0, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64))
-    torch.testing.assert_close(bits.lean.grad[0] / -3.0, wanted, rtol=0, atol=0.05)
-    assert float(bits.lean.grad[0, 20]) == -3.0
-
-
-@pytest.mark.skipif("bfloat16" not in settle().works, reason="bfloat16 products fail on this processor")
-def test_bfloat16_products_keep_one_bit_patterns_exact_and_light_close():
-    random = torch.Generator().manual_seed(5)
-    grey = torch.randint(0, 256, (40, 784), generator=random).float()
-    mask = (torch.rand(30, 784, generator=random) < 0.1).float()
-    exact = Sight(ClickLaw(), 1 / 255).light(mask, grey)
-    quick = Sight(ClickLaw(), 1 / 255, products=torch.bfloat16).light(mask, grey.bfloat16())
-    assert float(((quick - exact).abs() / exact).max()) < 2**-8  # the sum is rounded once, to 8 bits
-
-
 def test_figures_are_means_over_the_objects():
     machine, sight = random_machine(6), wide(ClickLaw(0.02), 0.01)
     found = figures(machine, sight, [Block(GREY[:2], ONE_HOT[:, :2]), Block(GREY[2:], ONE_HOT[:, 2:])])
@@ -173,7 +138,7 @@ def test_bits_made_from_grey_patterns_keep_their_light_within_the_top(top):
     grey = torch.rand(20, 60, generator=random, dtype=torch.float64) ** 6
     mean = torch.rand(20, 60, generator=random, dtype=torch.float64)
     bits = as_bits(grey, mean, top)
-    mask, scale = bits.shown()
+    mask, scale = bits.displayed()
     torch.testing.assert_close(scale.squeeze(1) * (mask * mean).sum(dim=1), (grey * mean).sum(dim=1))
     assert float(scale.max()) <= top * (1 + 1e-9)
     lit = mask.sum(dim=1)
@@ -200,7 +165,7 @@ def test_the_gradient_through_optics_holds_the_light_of_dark_pixels(bits):
         return total
 
     light = machine.levels[1].light
-    mask, scale = light.shown()
+    mask, scale = light.displayed()
     scale = torch.ones(len(mask), 1) if scale is None else scale
     wanted = scale * (mask @ GREY.T + light.full(mask) * torch.tensor([40.0, 90.0, 10.0])) / 255
     torch.testing.assert_close(brought(light, sight, grey), wanted)

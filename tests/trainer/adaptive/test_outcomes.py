@@ -13,19 +13,16 @@ from trainings import bars_task, random_machine
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.core.plan import build_plan
-from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.instrument.click_law import ClickLaw, CountLaw, count_chances, count_slopes
+from pans.runtime.errors import PlanError
+from pans.runtime.instrument.click_law import CountLaw, count_chances, count_slopes
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.adaptive import sweeps as module
 from pans.trainer.adaptive.grow import GrowOptions, Growth
 from pans.trainer.adaptive.machine import Aim, Sight, backward, brought, forward
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
-from pans.trainer.adaptive.options import AutomatonOptions, check_automaton_options
 from pans.trainer.adaptive.outcomes import readings
-from pans.trainer.adaptive.sweeps import reroute
 from pans.trainer.adaptive.train import train_automaton
-from pans.trainer.adaptive.tune import figures
 from pans.trainer.export.automaton import export_automaton
+from pans.trainer.options import AutomatonOptions
 
 LAWS = [CountLaw(0.0, 0.0, (0.5, 1.5)), CountLaw(0.02, 0.3, (0.5, 1.5)), CountLaw(0.01, 0.0, (0.5, 1.5, 2.5))]
 GREY = torch.tensor([[0, 10, 255, 30, 7], [200, 0, 90, 255, 255], [0, 0, 0, 0, 0]], dtype=torch.float64)
@@ -116,37 +113,6 @@ def test_gradient_is_that_of_the_loss(law):
             assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
 
 
-def test_two_outcomes_are_bit_for_bit_what_they_were():
-    """Forward and backward as they were written for a click alone, in float32."""
-    machine, sight = random_machine(5), Sight(ClickLaw(0.01), 1 / 255, 0.01)
-    for level in machine.levels:
-        level.light.root = level.light.root.float()
-    machine.counts = [counts.float() for counts in machine.counts]
-    grey, one_hot, price = GREY.float(), ONE_HOT.float(), 0.07
-    alphas, lights, leaves, alpha = [], [], [], torch.ones(1, 3)
-    for number, level in enumerate(machine.levels):
-        n_next = machine.levels[number + 1].n_states if number < 2 else 0
-        light = brought(level.light, sight, grey)
-        silent = alpha * torch.exp(-(light + 0.01))
-        nodes = torch.zeros(machine.n_nodes(number), 3).index_add_(0, level.successors[0], silent)
-        nodes.index_add_(0, level.successors[1], alpha - silent)
-        alphas, lights, leaves, alpha = [*alphas, alpha], [*lights, light], [*leaves, nodes[n_next:]], nodes[:n_next]
-    passed = forward(machine, sight, grey)
-    assert all(torch.equal(found, wanted) for found, wanted in zip(passed.leaves, leaves, strict=True))
-    backward(machine, sight, grey, one_hot, passed, Aim(price))
-    beta = -torch.log(machine.counts[-1] / machine.counts[-1].sum(dim=1, keepdim=True)) @ one_hot
-    for number in (2, 1, 0):
-        level, dark = machine.levels[number], torch.exp(-(lights[number] + 0.01))
-        click = beta[level.successors[1]]
-        gain = beta[level.successors[0]] - click
-        slope = (-(dark * gain) + price) * alphas[number] * (1.0 / 3)
-        assert torch.equal(level.light.root.grad, sight.mask_slope(slope, grey) * level.light.root * 2.0)
-        beta = (gain * dark + click).add(lights[number], alpha=price)
-        if number:
-            counts = machine.counts[number - 1]
-            beta = torch.cat([beta, -torch.log(counts / counts.sum(dim=1, keepdim=True)) @ one_hot])
-
-
 @pytest.fixture(scope="module")
 def grown():
     objects = TrainingObjects(bars_task(), load_profile("ideal"), 0, Augmentation())
@@ -157,36 +123,6 @@ def grown():
         for _ in range(4):
             growth.grow(0.02)
     return growth.machine(), sight, blocks, growth
-
-
-def test_growing_branches_by_outcome(grown):
-    machine, sight, blocks, growth = grown
-    assert [level.n_states for level in machine.levels] == [1, 3, 8, 8]
-    assert all(len(level.successors) == 3 for level in machine.levels)
-    found = figures(machine, sight, blocks)
-    assert (found.photons, found.clicks) == pytest.approx(growth.spent, rel=1e-4)
-    assert found.accuracy > 0.5  # four classes: 0.25 by chance
-    leaves = sum(forward(machine, sight, block.grey).leaves[-1] @ block.one_hot.T for block in blocks)
-    torch.testing.assert_close(leaves, growth.counts, rtol=1e-4, atol=1e-3)
-
-
-def test_edges_of_three_outcomes_are_put_right(grown, monkeypatch):
-    machine, sight, blocks, _ = grown
-    machine = replace(
-        machine, levels=[replace(level) for level in machine.levels], counts=[c.clone() for c in machine.counts]
-    )
-    monkeypatch.setattr(module, "SURE", 0.0)
-
-    def cost():
-        found = figures(machine, sight, blocks)
-        return found.loss + 0.02 * found.photons
-
-    good = cost()
-    machine.levels[2].successors = machine.levels[2].successors.roll(1, 0)
-    spoiled = cost()
-    assert spoiled > good + 0.02
-    assert reroute(machine, sight, blocks, 0.02).moved > 0
-    assert cost() < good + 0.3 * (spoiled - good)
 
 
 SMALL = AutomatonOptions(
@@ -208,16 +144,3 @@ def test_a_training_ends_in_a_bundle_that_is_evaluated(tmp_path):
     clicks_only = replace(profile, detector=replace(profile.detector, photon_number_max=1))
     with pytest.raises(PlanError, match=r"3 outcomes per exposure.*tells 2 apart"):
         build_plan(clicks_only, made.bundle)
-
-
-@pytest.mark.parametrize(
-    ("outcomes", "name", "error", "words"),
-    [
-        (1, "ideal", UsageError, "--outcomes is 1, allowed: 2 to 16"),
-        (17, "ideal", UsageError, "--outcomes is 17"),
-        (3, "dmd-spad", PlanError, r"dmd-spad tells 2 apart \(detector.photon_number_max\)"),
-    ],
-)
-def test_what_cannot_be_counted_is_refused(outcomes, name, error, words):
-    with pytest.raises(error, match=words):
-        check_automaton_options(replace(SMALL, outcomes=outcomes), bars_task(20), load_profile(name))

@@ -18,11 +18,11 @@ from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_USAGE, main
 from pans.trainer.baselines import bayes as baseline_bayes
 from pans.trainer.baselines import common as baselines
 from pans.trainer.baselines import rows as baseline_rows
-from pans.trainer.baselines.bayes import FLOORS, bayes, choose_floor, log_joint
+from pans.trainer.baselines.bayes import bayes, log_joint
 from pans.trainer.baselines.common import Trials, detect, measure, run_trials
-from pans.trainer.baselines.end_to_end import patterns_measured, quantised, train_conventionally
-from pans.trainer.baselines.networks import aware_cnn, aware_mlp, clean_cnn, clean_mlp, patterns, walsh
-from pans.trainer.tasks.registry import Objects, Task, load_task
+from pans.trainer.baselines.end_to_end import patterns_measured, train_conventionally
+from pans.trainer.baselines.networks import aware_net, clean_cnn, patterns, walsh
+from pans.trainer.tasks.registry import Objects, Task
 
 SIDE = 8
 
@@ -80,22 +80,6 @@ def test_a_source_that_follows_the_object_gives_every_object_the_photons(task: T
     assert measurement.illumination(17.0) == pytest.approx(float(np.mean(17 / brightness)) * SIDE**2, rel=1e-5)
 
 
-@pytest.mark.parametrize("brightness", baselines.BRIGHTNESS)
-def test_a_black_object_stays_dark(brightness: str) -> None:
-    measurement = measure(two_pixels((0, 0), (255, 0)), None, brightness)
-    assert measurement.photoelectrons(measurement.test, 5.0)[0].tolist() == [0.0, 0.0]
-
-
-def test_what_cannot_be_measured_is_refused(task: Task) -> None:
-    with pytest.raises(ValueError, match="black"):
-        measure(two_pixels((0, 0), (0, 0)), None)
-    for wrong in (np.ones((2, 5)), -np.ones((2, 64)), np.zeros((2, 64))):
-        with pytest.raises(ValueError, match="at least 0"):
-            measure(task, wrong)
-    with pytest.raises(ValueError, match="source, object"):
-        measure(task, None, "sun")
-
-
 def test_detectors_have_the_mean_and_variance_of_their_law() -> None:
     light, n = np.full(200_000, 0.7, np.float32), 200_000
     counts = detect(light, "counting", np.random.default_rng(0), dark=0.3)
@@ -145,37 +129,6 @@ def test_bayes_reaches_the_closed_form_of_two_objects() -> None:
     assert abs(trials.right.mean() - exact) < 5 * math.sqrt(exact * (1 - exact) / trials.right.size)
 
 
-def test_at_a_million_photons_float32_still_finds_the_object() -> None:
-    rng = np.random.default_rng(6)
-    images = rng.integers(100, 104, (50, 10, 10)).astype(np.uint8)
-    objects = Objects(images, np.arange(50))
-    task = Task("alike", tuple(map(str, range(50))), objects, objects, "0" * 64, "made here")
-    measurement = measure(task, None)
-    decide, _ = bayes(measurement, 1e7, "counting", seed=0, floor=1e-6)
-    assert run_trials(measurement, 1e7, "counting", decide, trials=1, seed=0).right.all()
-
-
-def test_a_class_without_training_objects_is_never_decided(task: Task) -> None:
-    keep = task.train.labels != 1
-    part = Objects(task.train.images[keep], task.train.labels[keep])
-    measurement = measure(Task("bars", task.classes, part, task.test, "0" * 64, "made here"), None)
-    decide, _ = bayes(measurement, 20.0, "binary", seed=0, floor=1e-3)
-    assert set(decide(measurement.photoelectrons(measurement.test, 20.0))) == {0, 2}
-
-
-def test_zero_transmission_without_dark_counts_is_refused(task: Task) -> None:
-    with pytest.raises(ValueError, match="must be above 0"):
-        log_joint(measure(task, None), np.zeros((1, 64), np.float32), 5.0, "counting", floor=0.0)
-
-
-def test_the_floor_is_chosen_without_the_test_labels(task: Task) -> None:
-    other = Objects(task.test.images, task.test.labels[::-1].copy())
-    wrong = Task(task.name, task.classes, task.train, other, task.sha256, task.split)
-    chosen = [choose_floor(measure(one, None), 30.0, "counting", np.random.default_rng(7)) for one in (task, wrong)]
-    assert chosen[0] == chosen[1]
-    assert chosen[0] in FLOORS
-
-
 # ---- the score ----
 
 
@@ -193,26 +146,6 @@ def test_spreads_over_trials_and_over_objects_are_kept_apart() -> None:
     assert (first.objects, first.accuracy_mean, first.clicks_mean) == (200, 0.75, 99.5)
 
 
-def test_the_same_seed_gives_the_same_trials(task: Task) -> None:
-    measurement = measure(task, None)
-    decide, _ = bayes(measurement, 5.0, "binary", seed=0, floor=1e-3)
-    one, two, other = (run_trials(measurement, 5.0, "binary", decide, trials=2, seed=s) for s in (3, 3, 4))
-    assert np.array_equal(one.right, two.right)
-    assert not np.array_equal(one.right, other.right)
-    assert not np.array_equal(one.right[0], one.right[1])
-
-
-def test_counting_knows_at_least_what_clicks_know(task: Task) -> None:
-    measurement, accuracy = measure(task, None), {}
-    for detector in baselines.DETECTORS:
-        decide, _ = bayes(measurement, 200.0, detector, seed=0, floor=1e-3)
-        accuracy[detector] = run_trials(measurement, 200.0, detector, decide, trials=5, seed=0).measured()
-    counting, binary = accuracy["counting"], accuracy["binary"]
-    assert counting.clicks_mean == pytest.approx(binary.clicks_mean, rel=0.02)  # pixels that saw light, either way
-    assert counting.clicks_mean < 64 < counting.photons_mean
-    assert counting.accuracy_mean > binary.accuracy_mean + 5 * binary.accuracy_se_objects
-
-
 # ---- fixed patterns ----
 
 
@@ -221,25 +154,6 @@ def test_walsh_functions_are_orthogonal_and_ordered() -> None:
     assert np.array_equal(functions @ functions.T, 8 * np.eye(8))
     assert (np.diff(functions, axis=1) != 0).sum(axis=1).tolist() == list(range(8))
     assert walsh(28).shape == (32, 32)
-
-
-def test_bins_share_the_pixels_among_them() -> None:
-    found = patterns("binning", 6, (5, 7), 0).reshape(6, 5, 7)  # 2 x 3 blocks
-    assert np.array_equal(found.sum(axis=0), np.ones((5, 7)))
-    assert sorted(found.sum(axis=(1, 2))) == [4, 4, 6, 6, 6, 9]
-    assert found[0, :3, :3].all()
-    assert found[5, 3:, 5:].all()
-    assert np.array_equal(patterns("binning", 784, (28, 28), 0), np.eye(784))
-    with pytest.raises(ValueError, match="1 x 31 blocks"):
-        patterns("binning", 31, (28, 28), 0)
-
-
-def test_gaussian_patterns_are_the_sizes_of_normal_numbers() -> None:
-    found = patterns("gaussian", 200, (28, 28), 1)
-    assert found.min() >= 0
-    assert found.mean() == pytest.approx((2 / np.pi) ** 0.5, abs=0.01)
-    assert (found**2).mean() == pytest.approx(1, abs=0.02)
-    assert not np.array_equal(found, patterns("gaussian", 200, (28, 28), 2))
 
 
 def test_hadamard_patterns_are_two_dimensional_walsh_functions() -> None:
@@ -253,16 +167,6 @@ def test_hadamard_patterns_are_two_dimensional_walsh_functions() -> None:
         patterns("hadamard", 65, (8, 8), 0)
 
 
-def test_random_patterns_are_fair_coins_of_their_seed() -> None:
-    found = patterns("binary", 50, (28, 28), 1)
-    assert set(np.unique(found)) == {0.0, 1.0}
-    assert abs(found.mean() - 0.5) < 5 * 0.5 / math.sqrt(found.size)
-    assert np.array_equal(found, patterns("binary", 50, (28, 28), 1))
-    assert not np.array_equal(found, patterns("binary", 50, (28, 28), 2))
-    with pytest.raises(ValueError, match="binary, hadamard"):
-        patterns("fourier", 5, (8, 8), 0)
-
-
 # ---- networks ----
 
 
@@ -271,7 +175,7 @@ def test_networks_that_know_the_noise_beat_those_that_do_not(task: Task) -> None
     measurement = measure(task, None)
     found, clean = {}, clean_cnn(measurement, seed=0, epochs=4)
     for name, decide in (
-        ("aware", aware_cnn(measurement, 10.0, "counting", seed=0, epochs=4)),
+        ("aware", aware_net("cnn", measurement, 10.0, "counting", seed=0, epochs=4)),
         ("clean", clean),
         ("bayes", bayes(measurement, 10.0, "counting", seed=0, floor=1e-3)[0]),
     ):
@@ -281,32 +185,6 @@ def test_networks_that_know_the_noise_beat_those_that_do_not(task: Task) -> None
     assert found["bayes"].accuracy_mean > found["clean"].accuracy_mean + 5 * error
     assert run_trials(measurement, 1e6, "counting", clean, trials=1, seed=0).right.mean() > 0.9
     assert torch.equal(before, torch.random.get_rng_state()), "the global generator belongs to the caller"
-
-
-def test_classifiers_of_fixed_patterns_learn_and_repeat(task: Task) -> None:
-    measurement = measure(task, patterns("hadamard", 16, task.image_shape, 0))
-    aware = [aware_mlp(measurement, 300.0, "counting", seed=s, epochs=12) for s in (0, 0, 1)]
-    trials = [run_trials(measurement, 300.0, "counting", decide, trials=2, seed=0) for decide in aware]
-    assert trials[0].measured().accuracy_mean > 0.8
-    assert np.array_equal(trials[0].right, trials[1].right)
-    assert not np.array_equal(trials[0].right, trials[2].right)
-    at = clean_mlp(measurement, seed=0, epochs=12)
-    accuracy = {
-        n: run_trials(measurement, n, "counting", at(n, "counting"), trials=4, seed=0).measured().accuracy_mean
-        for n in (5.0, 1e6)
-    }
-    assert accuracy[1e6] > 0.85 > accuracy[5.0] + 0.2
-
-
-def test_the_quantiser_has_its_levels_and_passes_the_gradient() -> None:
-    values = torch.linspace(-0.5, 3.0, 500, dtype=torch.float64, requires_grad=True)
-    found = quantised(values, torch.tensor(2.0, dtype=torch.float64), 4)
-    assert len(found.unique()) == 16
-    assert (found.min(), found.max()) == (0, 2)
-    inside = (values > 0) & (values < 2)
-    assert (found - values)[inside].abs().max() <= 2 / 15 / 2 + 1e-12
-    found.sum().backward()
-    assert torch.equal(values.grad, inside.double())
 
 
 @pytest.mark.parametrize("bits", [4, None])
@@ -382,20 +260,6 @@ def test_every_way_answers_with_the_keys_of_evaluate(
     assert answer["simulated"] is True
 
 
-def test_fewer_objects(task_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("--task", task_file, "--photons", 9, "--objects", 50, "--train-objects", 100, "--floor", 0.01)
-    _, answer = called(capsys, "direct", *words)
-    assert (answer["objects"], answer["train_objects"], answer["floor"]) == (50, 100, 0.01)
-
-
-def test_information_grows_with_the_photons(task_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("--task", task_file, "--photons", 2, 20, "--trials", 1, "--floor", 0.01, "--information")
-    _, answer = called(capsys, "direct", *words)
-    low, high = answer["rows"]  # type: ignore[misc]
-    assert 0 < low["information"]["lower_bits"] < high["information"]["lower_bits"] < low["information"]["label_bits"]
-    assert 0 < low["fisher"]["trace"] < high["fisher"]["trace"]
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -437,20 +301,6 @@ def test_an_interrupt_keeps_the_levels_that_are_done(
     assert code == EXIT_INTERRUPTED
     assert answer["interrupted"] is True
     assert [row["photons_asked"] for row in answer["rows"]] == [4.0]  # type: ignore[attr-defined]
-
-
-@pytest.mark.data
-@pytest.mark.parametrize(("name", "wanted"), [("fashion-mnist", (45.8, 73.8)), ("mnist", (51.3, 88.3))])
-def test_the_strong_baseline_is_as_strong_as_known(name: str, wanted: tuple[float, float], data_dir: Path) -> None:
-    whole = load_task(name, data_dir)
-    task = Task(name, whole.classes, whole.train, Objects(whole.test.images[:1000], whole.test.labels[:1000]), "", "")
-    measurement = measure(task, None)
-    for photons, accuracy in zip((5.0, 30.0), wanted):
-        decide, _ = bayes(measurement, photons, "counting", seed=0, floor=1e-3)
-        found = run_trials(measurement, photons, "counting", decide, trials=1, seed=0).measured()
-        # known from 3000 other readouts: both errors count
-        error = math.hypot(found.accuracy_se_objects, math.sqrt(accuracy / 100 * (1 - accuracy / 100) / 3000))
-        assert abs(found.accuracy_mean - accuracy / 100) < 5 * error
 
 
 def test_frames_of_a_field_are_intensities_and_take_no_patterns():

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pans.runtime.cli import EXIT_USAGE, main
-from pans.trainer.baselines import bayes, stopping
+from pans.trainer.baselines import stopping
 from pans.trainer.baselines.common import measure
-from pans.trainer.baselines.stopping import Arrivals, Course, arrivals, follow, mixture, rules, threshold_for
+from pans.trainer.baselines.stopping import Course, arrivals, follow, mixture, threshold_for
 from pans.trainer.tasks.registry import Objects, Task
 
 FLOOR = 0.02
@@ -57,21 +57,6 @@ def test_the_posterior_after_each_photon_is_that_of_plain_loops(drawn: Task, bri
         wanted = posterior_in_loops(drawn, scale, heard.pixels[i, : k + 1].tolist(), float(heard.times[i, k]))
         assert course.doubt[i, k] == pytest.approx(1 - max(wanted), abs=2e-5) or course.doubt[i, k] < stopping.SURE
         assert wanted[course.labels[i, k]] == pytest.approx(max(wanted), abs=2e-5) or course.doubt[i, k] < stopping.SURE
-
-
-def test_what_is_sure_is_followed_no_further(drawn: Task, monkeypatch: pytest.MonkeyPatch) -> None:
-    measurement = measure(drawn, None)
-    heard, known = (
-        arrivals(measurement, measurement.test, np.random.default_rng(2), most=40),
-        mixture(measurement, FLOOR),
-    )
-    part = follow(known, heard)
-    monkeypatch.setattr(stopping, "SURE", 0.0)
-    whole = follow(known, heard)
-    for doubt in (0.5, 0.1, 0.01, 1e-3):
-        np.testing.assert_array_equal(part.stops(doubt), whole.stops(doubt))
-    assert (part.doubt[:, -1] < 1e-3).any()
-    assert not np.array_equal(part.doubt, whole.doubt)
 
 
 def test_photons_fall_where_the_light_is_and_take_their_time(drawn: Task) -> None:
@@ -125,53 +110,6 @@ def test_a_threshold_takes_the_mean_photons_it_was_asked_for() -> None:
         assert course.stops(threshold_for(course, photons)).mean() == pytest.approx(wanted)
     with pytest.raises(ValueError, match="photons is 5, allowed when stopping: 1 to 4"):
         threshold_for(course, 5.0)
-
-
-def test_objects_held_out_choose_and_no_test_object_does(drawn: Task) -> None:
-    rng = np.random.default_rng(5)
-    big = task_of(
-        rng.integers(0, 256, (60, 2, 3)), rng.integers(0, 3, 60).tolist(), drawn.test.images, drawn.test.labels.tolist()
-    )
-    other = task_of(big.train.images, big.train.labels.tolist(), 255 - drawn.test.images, [0] * 9)
-    chosen = rules(measure(big, None, "object"), (2.0, 5.0), seed=0)
-    assert [rule.photons for rule in chosen] == [2.0, 5.0]
-    assert chosen[0].doubt > chosen[1].doubt
-    assert chosen == rules(measure(other, None, "object"), (2.0, 5.0), seed=0)
-
-
-def test_an_object_without_light_is_decided_at_once(drawn: Task) -> None:
-    dark = task_of(
-        drawn.train.images,
-        drawn.train.labels.tolist(),
-        np.concatenate([drawn.test.images, np.zeros((1, 2, 3))]),
-        [0] * 10,
-    )
-    measurement = measure(dark, None)
-    heard = arrivals(measurement, measurement.test, np.random.default_rng(6), most=4)
-    assert np.isinf(heard.times[-1]).all()
-    course = follow(mixture(measurement, FLOOR), heard)
-    assert course.labels[-1].tolist() == [0] * 4  # the most frequent class
-    rows = list(stopping.stopping(measurement, [1.5], seed=0))
-    assert [done.photons[-1] for _, done in rows] == [0.0]
-    assert all(math.isfinite(done.illumination) for _, done in rows)
-
-
-def test_no_light_at_all_and_no_photons_are_refused_or_empty(drawn: Task) -> None:
-    measurement = measure(drawn, None)
-    with pytest.raises(ValueError, match="floor is 0, allowed: above 0"):
-        mixture(measurement, 0.0)
-    empty = Arrivals(np.zeros((2, 0), np.int32), np.zeros((2, 0), np.float32))
-    assert follow(mixture(measurement, FLOOR), empty).doubt.shape == (2, 0)
-
-
-@pytest.mark.uncompiled
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.5])
-def test_products_of_few_readouts_are_those_of_all(share: float) -> None:
-    rng = np.random.default_rng(7)
-    readouts = (rng.poisson(2.0, (13, 90)) * (rng.random((13, 90)) < share)).astype(np.float32)
-    weights = rng.normal(size=(8, 90)).astype(np.float32)
-    found = bayes.products(readouts, weights)
-    np.testing.assert_allclose(found, readouts.astype(np.float64) @ weights.T.astype(np.float64), rtol=1e-4, atol=1e-4)
 
 
 def test_the_command_stops_when_sure(tmp_path, capsys) -> None:

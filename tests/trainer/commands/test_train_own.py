@@ -1,6 +1,5 @@
 """`pans train FOLDER`: what is chosen is told and kept, and the commands that it ends with run the bundle."""
 
-import argparse
 import json
 import shlex
 
@@ -10,11 +9,10 @@ import pytest
 pytest.importorskip("torch", reason="needs the train extra")
 pytest.importorskip("PIL", reason="needs the train extra")
 
-from trainings import bars_task, practice_folder
+from trainings import practice_folder
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
-from pans.runtime.instrument.profile import load_profile
 from pans.trainer.choose import recipe
 from pans.trainer.commands import train_own
 from pans.trainer.commands.arguments import curve
@@ -121,31 +119,6 @@ def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, mon
     said = capsys.readouterr()
     assert "not better than always naming the largest class" in said.err
     assert "balanced accuracy       33.33 %; recall bar 0.00 %, cross 0.00 %, square 100.00 %" in said.out
-
-
-def test_a_negative_seed_is_refused(letters, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        main(["train", letters, *QUICK, "--seed", "-1", "-o", "letters.pans"])
-    assert "--seed: '-1' is not a whole number from 0" in capsys.readouterr().err
-
-
-def test_a_sensor_without_light_is_not_compared(capsys):
-    figures = {"clicks_mean": 0.0, "photons_mean": 0.0, "illumination": 0.0}
-    budgets = {"clicks": None, "photons": 10.0, "illumination": 5.0}
-    args = argparse.Namespace(task="t", encoder="active", out="t.pans", **budgets, seed=0)
-    found = train_own.finish(args, bars_task(20), load_profile("ideal"), figures)
-    assert found.payload == {}
-    assert "next:" in found.words
-    told = capsys.readouterr().err
-    assert "--photons 10 was not met" in told
-    assert "--illumination 5 was not met" in told
-
-
-def test_a_budget_that_was_not_met_is_told(capsys):
-    train_own.warn_of_budget(argparse.Namespace(clicks=None, photons=10.0, illumination=None), 3.0, 12.0, 90.0)
-    assert "--photons 10 was not met: a decision takes 12.00" in capsys.readouterr().err
-    train_own.warn_of_budget(argparse.Namespace(clicks=3.0, photons=None, illumination=None), 3.1, 12.0, 90.0)
-    assert capsys.readouterr().err == ""
 
 
 def test_a_curve_is_thinned_and_says_its_ends():

@@ -11,10 +11,8 @@ import pytest
 from bundles import made_bundle
 
 from pans.runtime.bundle.model import write_bundle
-from pans.runtime.cli import main
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate import Conditions, evaluate
+from pans.trainer.evaluate import evaluate
 from pans.trainer.evaluate.accuracy import (
     among_classes,
     evaluate_exactly,
@@ -23,6 +21,7 @@ from pans.trainer.evaluate.accuracy import (
     outcome_probabilities,
 )
 from pans.trainer.evaluate.held_out import held_out_of
+from pans.trainer.options import Conditions
 
 RNG = np.random.default_rng(0)
 PROFILE = load_profile("oled-qcmos")
@@ -99,14 +98,6 @@ def test_sampled_agrees_with_exact(shots):
     assert sampled.accuracy_std == pytest.approx(exact.accuracy_std, rel=5 / math.sqrt(2 * 400))
 
 
-def test_trials_repeat_with_the_seed():
-    model = bundle()
-    light = light_of(model, PROFILE, IMAGES)
-    first, again, other = (evaluate_sampled(model, light, LABELS, trials=5, seed=seed) for seed in (1, 1, 2))
-    assert first == again
-    assert first.accuracy_mean != other.accuracy_mean
-
-
 def test_light_and_dark_options():
     model = bundle()
     plain, double = light_of(model, PROFILE, IMAGES), light_of(model, PROFILE, IMAGES, eta=2.0)
@@ -117,19 +108,6 @@ def test_light_and_dark_options():
     assert nothing.law.dark_per_exposure == 0.5
     assert np.all(nothing.probability == nothing.probability[0, 0])
     assert nothing.probability[0, 0] > 0.2
-
-
-def test_impossible_requests_are_refused():
-    model = bundle()
-    light = light_of(model, PROFILE, IMAGES)
-    with pytest.raises(ValueError, match="allowed"):
-        light_of(model, PROFILE, IMAGES[:, :3])
-    with pytest.raises(ValueError, match="eta"):
-        light_of(model, PROFILE, IMAGES, eta=-1.0)
-    with pytest.raises(ValueError, match="trials"):
-        evaluate_sampled(model, light, LABELS, trials=0)
-    with pytest.raises(ValueError, match="outcomes"):
-        evaluate_exactly(model, light, LABELS, shots=40)
 
 
 @pytest.fixture
@@ -155,29 +133,6 @@ def test_a_bundle_is_judged_by_one_call(own_task, tmp_path):
     light = light_of(model, load_profile("ideal"), held_out.images, eta=2.0, dark=0.1)
     wanted = evaluate_sampled(model, light, held_out.labels, shots=2, trials=5, seed=3)
     assert evaluate(model, task=own_task, shots=2, trials=5, objects=7, conditions=doubled) == wanted
-
-
-def test_one_call_refuses_what_it_cannot_judge(own_task):
-    with pytest.raises(ValueError, match="objects is 0"):
-        evaluate(bundle(), task=own_task, objects=0)
-    with pytest.raises(ValueError, match="decides among 3 classes"):
-        evaluate(bundle(), task="barcode")
-    with pytest.raises(UsageError, match="neither"):
-        evaluate(bundle())  # its provenance names no task that can be found
-
-
-def test_the_command_says_what_was_asked_wrongly(own_task, tmp_path, capsys):
-    path = tmp_path / "small.pans"
-    write_bundle(bundle(), path)
-    words = ["evaluate", str(path), "--task", own_task]
-    for more, said in (
-        (["--exact", "--shots", "40"], "outcomes"),
-        (["--trials", "0"], "trials is 0"),
-        (["--eta", "-1"], "eta is -1"),
-        (["--objects", "0"], "--objects is 0"),
-    ):
-        assert main([*words, *more]) == 2
-        assert said in capsys.readouterr().err
 
 
 def test_evaluation_loads_no_torch():

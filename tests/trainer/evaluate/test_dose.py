@@ -27,9 +27,10 @@ from pans.trainer.evaluate.dose import (
     training_readings,
     within_cap,
 )
-from pans.trainer.evaluate.held_out import Conditions, HeldOut
+from pans.trainer.evaluate.held_out import HeldOut
 from pans.trainer.evaluate.pictures import draw_dose
 from pans.trainer.evaluate.walks import walks_of
+from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task
 
 IDEAL = load_profile("ideal")

@@ -15,9 +15,10 @@ from pans.runtime.imaging import IDENTITY, Imaging, imaging_of, tolerance_of
 from pans.runtime.instrument.profile import Optics, load_profile
 from pans.trainer.commands.evaluate import optics_curve_words, several_tables
 from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.evaluate.held_out import Conditions, HeldOut, held_out_of, imaging_on
+from pans.trainer.evaluate.held_out import HeldOut, held_out_of
 from pans.trainer.evaluate.optics import CURVES, drawn_tables, figures_under, misalignment_curves, over_optics
 from pans.trainer.evaluate.walks import measured_walks, walks_of
+from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task
 
 IDEAL = load_profile("ideal")
@@ -89,15 +90,15 @@ def test_curves_start_from_the_table_that_they_are_about() -> None:
 def test_without_optics_a_table_is_as_the_profile_states() -> None:
     stated = replace(IDEAL, optics=Optics(right_px=-1.0, down_px=1.0))
     held_out = HeldOut(TASK, TASK.test, stated)
-    assert imaging_on(held_out, Conditions()).numbers() == TABLE.numbers()
-    assert imaging_on(held_out, Conditions(imaging=IDENTITY)).is_identity
+    assert Conditions().imaging_on(held_out.profile).numbers() == TABLE.numbers()
+    assert Conditions(imaging=IDENTITY).imaging_on(held_out.profile).is_identity
 
 
 def test_options_that_contradict_each_other_are_refused() -> None:
     plain = {"optics": None, "draws": None, "trials": None, "shots": 1}
     assert not several_tables(argparse.Namespace(**plain))
     assert several_tables(argparse.Namespace(**plain | {"draws": 2}))
-    for wrong in ({"draws": 0}, {"draws": 2, "optics": "tolerance"}, {"optics": "tolerance", "shots": 2}):
+    for wrong in ({"draws": 2, "optics": "tolerance"}, {"optics": "tolerance", "shots": 2}):
         with pytest.raises(UsageError):
             several_tables(argparse.Namespace(**plain | wrong))
 

@@ -9,7 +9,6 @@ torch = pytest.importorskip("torch")
 
 from pans.trainer.evaluate.picture_samples import (  # noqa: E402
     PARTS,
-    SAMPLES,
     first_of_each_class,
     keep_samples,
     read_samples,
@@ -38,18 +37,6 @@ def test_the_first_object_of_every_class_with_what_lies_behind_it():
     assert chosen.labels.tolist() == [0, 1, 2]
     assert np.array_equal(chosen.images, every.images[[1, 3, 0]])
     assert np.array_equal(chosen.pictures, every.behind[[1, 3, 0]])
-
-
-def test_certain_clicks_give_the_picture_of_the_head():
-    chosen = first_of_each_class(objects())
-    p = torch.tensor([[0, 1, 1, 0, 1], [1, 1, 1, 1, 1], [0, 0, 0, 0, 0]], dtype=torch.float64)
-    samples = take_samples(head(), p, chosen)
-    assert samples.given_back.shape == (3, SAMPLES, SIDE, SIDE)
-    assert samples.clicks.tolist() == [[3] * SAMPLES, [5] * SAMPLES, [0] * SAMPLES]
-    with torch.no_grad():
-        wanted = (255 * head()(p.float()).clamp(0, 1)).round().reshape(3, SIDE, SIDE).numpy()
-    for i in range(SAMPLES):
-        assert np.array_equal(samples.given_back[:, i], wanted)
 
 
 def test_samples_are_of_single_shots_and_the_same_again():

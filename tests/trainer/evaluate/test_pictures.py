@@ -29,17 +29,6 @@ def test_clusters_stay_apart_and_the_map_repeats():
     assert np.array_equal(place, tsne(features, perplexity=15.0))
 
 
-def test_equal_clicks_do_not_break_the_map():
-    place = tsne(RNG.integers(0, 2, (150, 3)).astype(float), perplexity=20.0)
-    assert np.isfinite(place).all()
-
-
-@pytest.mark.parametrize("n", [10, 3000])
-def test_too_few_or_too_many_points_are_refused(n):
-    with pytest.raises(ValueError, match="allowed for a map"):
-        tsne(np.zeros((n, 2)))
-
-
 def own_images(path):
     rng = np.random.default_rng(1)
     labels = np.arange(150) % 2
@@ -69,15 +58,3 @@ def test_a_training_leaves_its_history(tmp_path, capsys):
     drawn = json.loads(capsys.readouterr().out)["pictures"]
     assert {path.name for path in map(Path, drawn)} == {"patterns.png", "confusion.png"}  # too few objects for a map
     assert all(Path(path).read_bytes().startswith(b"\x89PNG") for path in drawn)
-
-
-@pytest.mark.usefixtures("short_fits")
-def test_more_weight_on_light_means_less_light(tmp_path, capsys):
-    task = own_images(tmp_path / "own.npz")
-    light = []
-    for alpha in ("1e-4", "0.3"):
-        out = str(tmp_path / f"{alpha}.pans")
-        words = ["--features", "2", "--epochs", "15", "--hidden", "8", "--alpha", alpha, "-o", out]
-        assert main(["train", task, *words, "--json"]) == 0
-        light.append(json.loads(capsys.readouterr().out)["illumination"])
-    assert light[1] < light[0]

@@ -15,11 +15,10 @@ from automata import automaton_bundle, random_automaton
 from commands import json_of
 
 from pans.runtime.bundle import Automaton, Bundle, with_expected, write_bundle
-from pans.runtime.cli import main
 from pans.runtime.decide import make_decider
 from pans.runtime.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate import Conditions, evaluate
+from pans.trainer.evaluate import evaluate
 from pans.trainer.evaluate.accuracy import law_of
 from pans.trainer.evaluate.walks import (
     calibration_bins,
@@ -28,6 +27,7 @@ from pans.trainer.evaluate.walks import (
     measured_walks,
     walks_of,
 )
+from pans.trainer.options import Conditions
 
 RNG = np.random.default_rng(0)
 PROFILE = load_profile("oled-qcmos")
@@ -100,16 +100,6 @@ def test_trials_agree_with_the_expectation_within_their_error(afterpulse: float)
     assert (sampled.trials, exact.trials) == (trials, 0)
 
 
-def test_the_spread_over_trials_is_that_of_trials() -> None:
-    model = bundle()
-    exact = measured_walks(walks_of(model, PROFILE, IMAGES, LABELS, Conditions(confidence=0.7)))
-    runs = [
-        walks_of(model, PROFILE, IMAGES, LABELS, Conditions(confidence=0.7, seed=seed), trials=1) for seed in range(300)
-    ]
-    spread = float(np.std([measured_walks(run).accuracy_mean for run in runs], ddof=1))
-    assert spread == pytest.approx(exact.accuracy_std, rel=0.2)  # five times 1 / sqrt(2 * 300)
-
-
 def two_leaves(sure: float) -> Bundle:
     """A click says class 1, no click class 0, each with the probability `sure`."""
     posteriors = [[0.5, 0.5], [sure, 1 - sure], [1 - sure, sure]]
@@ -129,13 +119,6 @@ def test_calibration_compares_probability_and_accuracy() -> None:
         assert (only.share, only.accuracy) == pytest.approx((1.0, 0.75), abs=1e-9)
         assert only.probability == pytest.approx(sure, abs=1e-6)
         assert measured_walks(walks).expected_calibration_error == pytest.approx(sure - 0.75, abs=1e-6)
-
-
-def test_nothing_decided_is_no_accuracy() -> None:
-    found = measured_walks(walks_of(two_leaves(0.6), PROFILE, IMAGES, LABELS % 2, Conditions(confidence=0.99)))
-    assert found.accuracy_mean is None
-    assert found.accuracy_std is None
-    assert found.abstained == 1.0
 
 
 @pytest.fixture
@@ -197,24 +180,6 @@ def test_expected_figures_are_held_against_what_is_found(
     assert expected_differences(named | figures, named | figures | {"objects": 3, "accuracy": 0.0}) == []
 
 
-def test_the_command_says_what_was_asked_wrongly(
-    own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_bundle(bundle(), tmp_path / "a.pans")
-    for more, said in (
-        (["--shots", "2"], "shots is 2"),
-        (["--trials", "0"], "trials is 0"),
-        (["--dark", "-1"], "dark is -1"),
-        (["--confidence", "1.5"], "'1.5' is not"),
-    ):
-        try:
-            code = main(["evaluate", str(tmp_path / "a.pans"), "--task", own_task, *more])
-        except SystemExit as stop:
-            code = stop.code  # type: ignore[assignment]
-        assert code == 2
-        assert said in capsys.readouterr().err
-
-
 def test_pictures_of_an_automaton(own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
     write_bundle(bundle(), tmp_path / "a.pans")
@@ -269,8 +234,3 @@ def test_photon_numbers_are_summed_over_all_words() -> None:
     drawn = measured_walks(walks_of(model, COUNTING, images, labels, Conditions(dark=0.02, seed=1), trials=3000))
     assert abs(drawn.clicks_mean - found.clicks_mean) < 5 * 3 * 4 / math.sqrt(6 * 3000)
     assert abs(drawn.accuracy_mean - found.accuracy_mean) < 5 * found.accuracy_std / math.sqrt(3000)
-
-
-def test_photon_numbers_need_a_detector_that_tells_them_apart() -> None:
-    with pytest.raises(ValueError, match=r"tells 2 apart \(detector\.photon_number_max\)"):
-        walks_of(counting_bundle(), load_profile("dmd-spad"), IMAGES, LABELS)

@@ -1,7 +1,5 @@
 """The order of patterns: information held against sums over all words written out, and bundles that decide as before."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path
@@ -19,7 +17,8 @@ from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.export.ordering import _Samples, information_order, reordered
+from pans.trainer.evaluate.dose import of_first, training_readings
+from pans.trainer.export.ordering import information_order, reordered
 from pans.trainer.tasks.registry import Objects
 
 IDEAL = load_profile("ideal")
@@ -72,16 +71,6 @@ def test_the_order_takes_what_tells_most_next(by: str) -> None:
     assert found.bits == pytest.approx(bits, abs=1e-12)
 
 
-def test_sampled_words_estimate_the_same_information() -> None:
-    probability = RNG.random((24, 4)) ** 2
-    known = _Samples(np.tile(LABELS, 60), 3, 0)
-    many = np.tile(np.stack([1 - probability, probability], axis=2), (60, 1, 1))
-    for number in range(3):
-        wanted = [bits_of(probability[:, [*range(number), j]]) for j in range(number, 4)]
-        assert known.bits_with(many[:, number:]) == pytest.approx(wanted, abs=0.03)
-        known.take(many[:, number])
-
-
 def test_a_sample_that_bleaches_changes_the_order() -> None:
     # pattern 0 tells most and, where it bleaches, leaves nothing for its twin, pattern 1: the dim pattern 2 then comes before it
     images = np.zeros((24, 2, 3), np.uint8)
@@ -119,19 +108,6 @@ def test_a_reordered_bundle_decides_as_before(tmp_path: Path) -> None:
         reordered(bundle, [0, 1, 2, 3, 3], {})
 
 
-def test_a_table_alone_is_reordered_and_found_in_the_file() -> None:
-    table = RNG.normal(size=(8, 3))
-    levels = RNG.integers(1, 16, (3, 6))
-    bundle = made_bundle(3, 3, image_shape=(2, 3), levels=16, pattern_levels=levels, photons_per_level=0.1, table=table)
-    new = reordered(bundle, [2, 0, 1], {})
-    assert new.table is not None
-    assert bundle.table is not None
-    for word in itertools.product((0, 1), repeat=3):
-        own = np.array(word) @ (1, 2, 4)
-        moved = np.array([word[2], word[0], word[1]]) @ (1, 2, 4)
-        np.testing.assert_array_equal(new.table[moved], bundle.table[own])
-
-
 def test_the_command_orders_and_caps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     labels = np.arange(60) % 3
     images = RNG.integers(0, 256, (60, 2, 3), dtype=np.uint8)
@@ -161,3 +137,97 @@ def test_the_command_orders_and_caps(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def bundle_file(folder: Path) -> Path:
     return folder / "old.pans"
+
+
+PROFILE = load_profile("dmd-qcmos")
+RNG_ORDERED_NUMBERS = np.random.default_rng(33)
+OUTCOMES = 3
+
+
+def bundle_of_ordered_numbers(d_f: int = 3) -> Bundle:
+    layers = (
+        Layer(
+            RNG_ORDERED_NUMBERS.normal(size=(d_f, 6)).astype(np.float32),
+            RNG_ORDERED_NUMBERS.normal(size=6).astype(np.float32),
+            True,
+        ),
+        Layer(
+            RNG_ORDERED_NUMBERS.normal(size=(6, 3)).astype(np.float32),
+            RNG_ORDERED_NUMBERS.normal(size=3).astype(np.float32),
+            False,
+        ),
+    )
+    levels = RNG_ORDERED_NUMBERS.integers(0, 2, (d_f, 6)) | np.eye(d_f, 6, dtype=np.int64)
+    facts = {"image_shape": (2, 3), "levels": 2, "pattern_levels": levels, "photons_per_level": 1.3}
+    return made_bundle(d_f, 3, head_onnx=chain_onnx(layers), outcomes=OUTCOMES, **facts)
+
+
+def row_of(word: np.ndarray) -> int:
+    return int(sum(int(number) * OUTCOMES**place for place, number in enumerate(word)))
+
+
+def bits_of_ordered_numbers(chances: np.ndarray) -> float:
+    """I(class; numbers) in bits, by the definition, of chances (n, patterns, outcomes)."""
+    n, d_f, _ = chances.shape
+    of_class, total = np.bincount(LABELS, minlength=3) / n, 0.0
+    for word in itertools.product(range(OUTCOMES), repeat=d_f):
+        chance = [math.prod(row[i][number] for i, number in enumerate(word)) / n for row in chances]
+        for label in range(3):
+            joint = sum(c for c, own in zip(chance, LABELS) if own == label)
+            if joint > 0:
+                total += joint * math.log2(joint / (sum(chance) * of_class[label]))
+    return total
+
+
+@pytest.mark.parametrize("by", ["information", "dose"])
+def test_numbers_that_tell_most_come_first(by: str) -> None:
+    bundle = bundle_of_ordered_numbers()
+    chances, light = light_of(bundle, PROFILE, IMAGES).chances, bundle.patterns().sum(axis=1)
+    assert chances.sum(axis=2) == pytest.approx(1.0)
+    chosen: list[int] = []
+    bits: list[float] = []
+    while len(chosen) < 3:
+        rest = [j for j in range(3) if j not in chosen]
+        after = {j: bits_of_ordered_numbers(chances[:, [*chosen, j]]) for j in rest}
+        before = bits[-1] if bits else 0.0
+        best = max(rest, key=lambda j: (after[j] - before) / (light[j] if by == "dose" else 1.0))
+        chosen.append(best)
+        bits.append(after[best])
+    found = information_order(bundle, PROFILE, OBJECTS, by=by)
+    assert found.patterns == tuple(chosen)
+    assert found.exact
+    assert found.bits == pytest.approx(bits, abs=1e-12)
+    bleached = information_order(bundle, PROFILE, OBJECTS, by=by, bleaching=Bleaching(3.0))
+    left = light_of(reordered(bundle, bleached.patterns, {}), PROFILE, IMAGES, bleaching=Bleaching(3.0))
+    assert bleached.bits[-1] == pytest.approx(bits_of_ordered_numbers(left.chances), abs=1e-12)
+
+
+def test_what_is_left_of_numbers_sums_over_the_others() -> None:
+    bundle = bundle_of_ordered_numbers()
+    assert bundle.table is not None
+    readings = training_readings(bundle, PROFILE, OBJECTS)
+    found = of_first(bundle, 2, readings)
+    assert (found.n_features, found.outcomes) == (2, OUTCOMES)
+    assert found.table is not None
+    for seen in itertools.product(range(OUTCOMES), repeat=2):
+        joint = np.zeros(3)
+        for last in range(OUTCOMES):
+            word = np.array([*seen, last])
+            chance = np.mean([math.prod(row[i][number] for i, number in enumerate(word)) for row in readings])
+            odds = np.exp(bundle.table[row_of(word)].astype(np.float64))
+            joint += chance * odds / odds.sum()
+        np.testing.assert_allclose(np.exp(found.table[row_of(np.array(seen))]), joint / joint.sum(), rtol=2e-6)
+    many = bundle_of_ordered_numbers(8)  # 6561 words: the head takes the means
+    readings = training_readings(many, PROFILE, OBJECTS)
+    shorter = of_first(many, 2, readings)
+    mean = readings.mean(axis=0) @ [0, 1, 2]
+    wanted = _head_at(many, np.array([[1.0, 2.0, *mean[2:]]]) / 2)
+    np.testing.assert_allclose(make_decider(shorter).scores_batch([[1, 2]], 1), wanted, atol=1e-4)
+
+
+def _head_at(bundle: Bundle, means: np.ndarray) -> np.ndarray:
+    import onnxruntime
+
+    assert bundle.head_onnx is not None
+    session = onnxruntime.InferenceSession(bundle.head_onnx)
+    return np.asarray(session.run(None, {session.get_inputs()[0].name: means.astype(np.float32)})[0])

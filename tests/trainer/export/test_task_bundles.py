@@ -15,11 +15,8 @@ from trainings import short_fits  # noqa: F401  a fixture
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.decide.onnx import PictureDecider
-from pans.runtime.errors import PansError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate.accuracy import evaluate_pictures, light_of
-from pans.trainer.export import writer as export_module
 from pans.trainer.export.writer import export_trained, reference_scores
 from pans.trainer.options import Options
 from pans.trainer.tasks.public_sets import PUBLIC_SETS
@@ -97,14 +94,6 @@ def test_the_light_of_a_passive_bundle_is_the_trained_encoder_s(changed, tmp_pat
     assert np.iscomplexobj(exported.bundle.analyser.matrix) == trained.options.complex_field
 
 
-def test_other_optics_than_trained_never_leave_the_export(tmp_path, monkeypatch):
-    right = export_module.analyser_of
-    monkeypatch.setattr(export_module, "analyser_of", lambda *facts: replace(right(*facts), light="transmission"))
-    with pytest.raises(PansError, match="other light than the trained encoder"):
-        made(tmp_path, "transient")
-    assert not (tmp_path / "transient.pans").exists()
-
-
 def scene(tmp_path, task):
     path = tmp_path / "scene.npz"
     classes = np.array(task.classes)
@@ -165,24 +154,3 @@ def test_a_picture_bundle_runs_and_its_pictures_are_recomputed(tmp_path, capsys)
     page = (tmp_path / "run.html").read_text()
     assert "row 0" in page
     assert "modulus of W" in page
-
-
-def test_ssim_is_that_of_the_trainer():
-    from pans.runtime.images import likeness
-    from pans.trainer.model.ssim import ssim
-
-    rng = np.random.default_rng(0)
-    truth = rng.integers(0, 256, (3, 20, 28), dtype=np.uint8)
-    pictures = np.clip(truth / 255 + rng.normal(0, 0.2, truth.shape), 0, 1)
-    wanted = ssim(torch.from_numpy(pictures), torch.from_numpy(truth / 255.0)).numpy()
-    assert likeness(pictures, truth).ssim == pytest.approx(wanted, abs=1e-12)
-    assert likeness(truth / 255.0, truth).ssim == pytest.approx(np.ones(3))
-    with pytest.raises(UsageError, match="equal shapes"):
-        likeness(pictures, truth[:2])
-
-
-def test_a_picture_head_refuses_other_back_ends(tmp_path):
-    _, _, _, exported = made(tmp_path, "mmf-mnist-image")
-    with pytest.raises(UsageError, match="from the head alone"):
-        make_decider(exported.bundle, backend="table")
-    assert isinstance(make_decider(exported.bundle, shots=3), PictureDecider)

@@ -1,18 +1,38 @@
 """Export: folded normalisation with dead and saturated channels, the ONNX graph, and parity of the written file."""
 
 # ruff: noqa: E402  (what follows needs torch)
-import numpy as np
+
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
-onnx = pytest.importorskip("onnx", reason="needs the train extra")
 
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from heads import head_bundle, random_layers
+from naive_decide import int8_reference
+from trainings import bars_task, short_fits  # noqa: F401 - a fixture
+
+from pans.runtime.bundle.layers import quantise_head
+from pans.runtime.bundle.layers import reference_scores as layer_scores
 from pans.runtime.bundle.model import Shown, load_bundle
-from pans.runtime.errors import PansError
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import PansError, UsageError
+from pans.runtime.imaging import imaging_of
+from pans.runtime.instrument.click_law import CountLaw
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.evaluate.accuracy import evaluate_exactly, light_of
+from pans.trainer.evaluate.held_out import HeldOut
+from pans.trainer.evaluate.optics import figures_under, misalignment_curves
 from pans.trainer.export import onnx_heads
-from pans.trainer.export.onnx_heads import DEAD_VARIANCE, IR_VERSION, fold_normalisation, head_onnx
-from pans.trainer.export.writer import Description, compare, export, reference_scores
-from pans.trainer.model.heads import EPSILON, ConvHead, DeepHead, MlpHead
+from pans.trainer.export.automaton import export_automaton
+from pans.trainer.export.onnx_heads import fold_normalisation, int8_onnx
+from pans.trainer.export.writer import Description, compare, export, export_trained, reference_scores
+from pans.trainer.model.heads import EPSILON, ConvHead, MlpHead
+from pans.trainer.options import AutomatonOptions, Conditions, Options, check_options
+from pans.trainer.train.loop import train
 
 RNG = np.random.default_rng(0)
 
@@ -57,21 +77,6 @@ def test_dead_and_saturated_channels_are_dropped_not_blown_up(value):
     assert clicks @ folded.T + folded_bias == pytest.approx(wanted, rel=1e-10)
 
 
-def test_variance_of_a_barely_live_channel_is_kept():
-    mean = np.array([2 * DEAD_VARIANCE])
-    folded, _, dead = fold_normalisation(np.ones((1, 1)), np.zeros(1), np.ones(1), np.zeros(1), mean)
-    assert dead == ()
-    assert folded[0, 0] == pytest.approx(1 / np.sqrt(mean[0] * (1 - mean[0]) + EPSILON))
-
-
-def test_graph_is_conservative():
-    graph, _ = head_onnx(trained_head(5), np.full(5, 0.4))
-    model = onnx.load_from_string(graph)
-    assert model.ir_version == IR_VERSION <= 10  # what onnxruntime 1.18 reads
-    assert model.opset_import[0].version <= 21
-    assert [node.op_type for node in model.graph.node] == ["Gemm", "Relu", "Gemm"]
-
-
 @pytest.mark.parametrize(
     "mean", [np.full(6, 0.4), np.array([0.0, 1.0, 0.5, 1e-9, 0.2, 0.9])], ids=["live", "dead ones"]
 )
@@ -85,12 +90,6 @@ def test_written_bundle_decides_as_the_model_on_all_words(tmp_path, mean):
     words = (np.arange(64)[:, None] >> np.arange(6)) & 1
     wanted = reference_scores(head, mean, words.astype(np.float32))
     assert again.table == pytest.approx(wanted, abs=1e-5 * max(1, np.abs(wanted).max()))
-
-
-def test_beyond_twelve_patterns_random_words_are_compared(tmp_path):
-    done = written(tmp_path / "wide.pans", trained_head(14), np.full(14, 0.3), 14)
-    assert done.words_compared == 10_000
-    assert done.bundle.table is None
 
 
 def test_patterns_in_another_order_are_held_against_the_model(tmp_path):
@@ -142,9 +141,102 @@ def test_a_convolutional_head_is_exported_and_compared(d_f, tmp_path):
     assert done.words_compared == (1 << d_f if d_f <= 12 else 10_000)
 
 
-def test_a_head_of_two_hidden_layers_is_exported_and_compared(tmp_path):
-    done = written(
-        tmp_path / "deep.pans", DeepHead(5, 8, 4, torch.Generator().manual_seed(0)).eval(), np.full(5, 0.3), 5
-    )
-    assert done.score_difference <= 1e-5
-    assert done.words_compared == 32
+def test_the_model_gives_the_scores_of_the_integers() -> None:
+    layers = random_layers([16, 48, 10], seed=2)
+    head = quantise_head(layers)
+    bundle = head_bundle(layers, int8_head=head, int8_onnx=int8_onnx(head))
+    counts = np.random.default_rng(0).integers(0, 2, (500, 16))
+    found = make_decider(bundle, backend="int8-onnx").scores_batch(counts, 1)
+    own = make_decider(bundle, backend="int8").scores_batch(counts, 1)
+    wanted = int8_reference(head, counts, 1)
+    steps = np.abs(head.matrices()[1][1]).max() * 127  # a hidden value at a half may round either way
+    assert np.abs(found - wanted).max() <= 2 * steps
+    assert (np.abs(found - wanted).max(axis=1) < 1e-5).mean() > 0.98
+    assert (found.argmax(axis=1) == own.argmax(axis=1)).mean() > 0.99
+    assert (layer_scores(layers, counts).argmax(axis=1) == own.argmax(axis=1)).mean() > 0.97
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_trained_numbers_are_exported_as_they_were_trained(tmp_path: Path) -> None:
+    task, profile = bars_task(), load_profile("dmd-qcmos")
+    options = Options(3, photons=8.0, outcomes=4, estimator="local", epochs=6, hidden=16, batch=64, warm=0.5)
+    trained = train(task, profile, options)
+    assert isinstance(trained.law, CountLaw)
+    assert trained.law.outcomes == 4
+    exported = export_trained(tmp_path / "n.pans", trained, task, profile, name="n", provenance={})
+    bundle, _ = load_bundle(tmp_path / "n.pans")
+    assert (bundle.outcomes, exported.words_compared) == (4, 64)
+    assert bundle.table is not None
+    words = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[:, ::-1]
+    with torch.no_grad():
+        scores = trained.head(torch.from_numpy((words / 3).astype(np.float32))).numpy()
+    assert np.allclose(bundle.table, scores, atol=1e-4)
+    light = light_of(bundle, profile, task.test.images)
+    found = evaluate_exactly(bundle, light, task.test.labels)
+    assert found.accuracy_mean > 1.5 / len(task.classes)
+    mean = trained.click_mean.numpy() * 3  # of the training objects, which the test objects are like
+    assert np.allclose(mean, light_of(bundle, profile, task.train.images).probability.mean(axis=0), atol=0.02)
+
+
+IDEAL = load_profile("ideal")
+TABLE = "shift=0.2:psf=0.6:black=0.02"
+HIDDEN = imaging_of("psf=0.6:black=0.02")
+SMALL = AutomatonOptions(photons=4.0, exposures=5, states=8, batch=64, tune_epochs=2, epochs=4, first_price=0.1, soft=0)
+
+
+def accuracy(bundle, task):
+    return figures_under(bundle, HeldOut(task, task.test, IDEAL), HIDDEN, Conditions()).accuracy_mean
+
+
+@pytest.mark.slow
+def test_an_automaton_trained_through_optics_is_better_there_and_says_what_it_tolerates(tmp_path):
+    task = bars_task()
+    bundles = {}
+    for name, optics in (("perfect", None), ("through", TABLE)):
+        trained = train_automaton(task, IDEAL, replace(SMALL, optics=optics))
+        made = export_automaton(tmp_path / f"{name}.pans", trained, task, IDEAL, name=name, provenance={})
+        bundles[name] = made.bundle
+    assert accuracy(bundles["through"], task) > accuracy(bundles["perfect"], task) + 0.03
+    assert "tolerates" not in bundles["perfect"].provenance
+    told = bundles["through"].provenance["tolerates"]
+    assert told["optics"] == TABLE
+    assert told["simulated"] is True
+    assert (told["edge"]["tables"], told["middle"]["tables"]) == (4, 1)
+    middle = figures_under(bundles["through"], HeldOut(task, task.test, IDEAL), HIDDEN, Conditions())
+    assert told["middle"]["accuracy"] == pytest.approx(middle.accuracy_mean, abs=1e-5)
+    assert told["edge"]["accuracy_worst"] <= told["edge"]["accuracy"]
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_fixed_patterns_are_trained_through_optics_too(tmp_path):
+    task = bars_task()
+    options = Options(features=3, epochs=6, batch=64, hidden=16, alpha=0.0, optics=TABLE)
+    check_options(options, IDEAL)
+    trained = train(task, IDEAL, options)
+    bundle = export_trained(tmp_path / "fixed.pans", trained, task, IDEAL, name="fixed", provenance={}).bundle
+    told = bundle.provenance["tolerates"]
+    assert told["within"]["tables"] == 16
+    assert (
+        told["within"]["accuracy"] > 0.25 + 5 * told["within"]["accuracy_se_objects"]
+    )  # of four classes, in six epochs
+    curves = misalignment_curves(bundle, HeldOut(task, task.test.first(50), IDEAL), HIDDEN)
+    assert curves["black"][0]["value"] == 0.0
+    assert np.diff([point["photons_mean"] for point in curves["black"]]).min() > 0  # dark pixels bring light
+    with pytest.raises(UsageError, match="coherent encoder shows no patterns"):
+        check_options(replace(options, encoder="coherent", optics="psf=0.5"), IDEAL)
+
+
+def test_the_trainer_puts_both_into_the_bundle(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    torch = pytest.importorskip("torch")
+    from pans.runtime.bundle.model import Shown, load_bundle
+    from pans.trainer.export.writer import Description, export
+    from pans.trainer.model.heads import MlpHead
+
+    head = MlpHead(4, 8, 3, torch.Generator().manual_seed(1)).eval()
+    about = Description("a", "t", ("x", "y", "z"), (2, 3), {})
+    export(tmp_path / "a.pans", head, np.full(4, 0.4), Shown(2, np.ones((4, 6), np.uint16), 0.1), about)
+    bundle, _ = load_bundle(tmp_path / "a.pans")
+    counts = np.array([[r >> i & 1 for i in range(4)] for r in range(16)])
+    for backend in ("int8", "int8-onnx"):
+        found = make_decider(bundle, backend=backend).scores_batch(counts, 1)
+        assert np.abs(found - make_decider(bundle, backend="float64").scores_batch(counts, 1)).max() < 0.05

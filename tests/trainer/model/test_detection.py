@@ -1,15 +1,28 @@
 """Detection in torch: the click law, the damped straight-through gradient, exact enumeration."""
 
 # ruff: noqa: E402  (what follows needs torch)
-import mpmath
-import numpy as np
+
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
+from itertools import product
+
+import numpy as np
+from trainings import random_machine
+
+from pans.runtime.detector import Afterpulses
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.click_law import click_probability as reference_probability
-from pans.trainer.model.detection import ThermalLaw, click_probability, click_words, sample_clicks, word_probabilities
+from pans.trainer.adaptive.machine import Sight, forward
+from pans.trainer.evaluate.readings import Chain
+from pans.trainer.model.detection import (
+    click_probability,
+    click_words,
+    sample_clicks,
+    with_mean_memory,
+    word_probabilities,
+)
 
 PLAIN = ClickLaw()
 READ_NOISE = ClickLaw(dark_per_exposure=1.8e-5, read_noise_e=0.2, threshold_e=0.84)
@@ -21,10 +34,6 @@ def test_probability_is_the_law_of_the_runtime(law):
     light = np.concatenate([[0.0, 1e-30, 1e-7], np.geomspace(1e-3, 60, 50), [1e4]])
     found = click_probability(torch.from_numpy(light), law).numpy()
     assert found == pytest.approx(reference_probability(law, light), rel=1e-8, abs=1e-12)
-
-
-def test_plain_probability_of_faint_light_keeps_its_digits():
-    assert float(click_probability(torch.tensor([1e-30], dtype=torch.float64), PLAIN)) == 1e-30
 
 
 @pytest.mark.parametrize("slope", [1.0, 0.5])
@@ -55,14 +64,6 @@ def test_sampled_clicks_have_the_right_rate_and_are_independent():
     assert abs(np.corrcoef(clicks[:-1, 3], clicks[1:, 3])[0, 1]) < 5 / np.sqrt(len(clicks))
 
 
-def test_sampling_repeats_with_the_seed():
-    p = torch.full((100, 4), 0.4)
-    first, again = (sample_clicks(p, torch.Generator().manual_seed(3)) for _ in range(2))
-    other = sample_clicks(p, torch.Generator().manual_seed(4))
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-
-
 def test_words_are_products_in_the_order_of_the_table():
     p = np.random.default_rng(0).uniform(size=(3, 4))
     found = word_probabilities(torch.from_numpy(p)).numpy()
@@ -76,25 +77,74 @@ def test_words_are_products_in_the_order_of_the_table():
     assert found.sum(axis=1) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("modes", [1.0, 2.0, 7.5])
-def test_thermal_law_is_the_sum_over_its_photon_numbers(modes):
-    light = torch.tensor([0.0, 1e-9, 0.3, 4.0], dtype=torch.float64)
-    found = click_probability(light, ThermalLaw(modes, dark_per_exposure=0.02)).numpy()
-    for value, p in zip(light.tolist(), found):
-        none = float(mpmath.power(1 + mpmath.mpf(value) / modes, -modes) * mpmath.exp(-0.02))
-        assert p == pytest.approx(1 - none, rel=1e-9)
+LAW = Afterpulses(0.15, 2.0, 0.1)
 
 
-def test_thermal_light_of_many_modes_is_poisson_and_of_one_clicks_less():
-    light = torch.linspace(0.01, 5, 20, dtype=torch.float64)
-    poisson = click_probability(light, PLAIN)
-    assert torch.allclose(click_probability(light, ThermalLaw(1e9)), poisson, atol=1e-7)
-    assert bool((click_probability(light, ThermalLaw(1.0)) < poisson).all())
+def chances_of_words(first: list[float], law: Afterpulses, begins: np.ndarray) -> dict[tuple[int, ...], float]:
+    """The chance of every word, one at a time: the memory follows from its clicks."""
+    found = {}
+    for word in product((0, 1), repeat=len(first)):
+        chance, memory = 1.0, begins
+        for p, clicked in zip(first, word):
+            click = float(law.chance(p, memory))
+            chance *= click if clicked else 1 - click
+            memory = law.after(-np.log1p(-p), memory, clicked)
+        found[word] = chance
+    return found
 
 
-def test_a_law_of_ones_own_is_differentiated():
-    light = torch.tensor([0.5, 2.0], dtype=torch.float32, requires_grad=True)
-    p = click_probability(light, lambda mu: mu / (1 + mu))
-    p.sum().backward()
-    assert p.dtype == torch.float32
-    assert light.grad.numpy() == pytest.approx(1 / (1 + light.detach().numpy()) ** 2, rel=1e-6)
+@pytest.mark.parametrize("law", [LAW, Afterpulses(0.2), Afterpulses(0.05, 1.0, 0.3, True)])
+def test_words_and_their_draws_are_those_of_the_chain(law: Afterpulses) -> None:
+    first = np.random.default_rng(0).random((3, 5)) * 0.8
+    chain = Chain.of(first, law)
+    assert chain.begins[0] > 0
+    words = chain.word_chances(slice(None))
+    for i, row in enumerate(first.tolist()):
+        for word, chance in chances_of_words(row, law, chain.begins).items():
+            assert words[i, sum(bit << k for k, bit in enumerate(word))] == pytest.approx(chance, rel=1e-9)
+    bits = (np.arange(32)[:, None] >> np.arange(5)) & 1
+    assert chain.mean_chances() == pytest.approx(words @ bits, abs=2e-3)
+    many = Chain.of(np.repeat(first, 20_000, axis=0), law)
+    drawn = many.counts(1, np.random.default_rng(1), slice(None)).reshape(3, 20_000, 5).mean(axis=1)
+    assert drawn == pytest.approx(words @ bits, abs=4.5 * 0.5 / np.sqrt(20_000))
+    assert (words @ bits > first).all()
+
+
+def test_training_has_the_mean_chances_of_the_evaluation_and_their_gradient() -> None:
+    first = np.random.default_rng(2).random((4, 6)) * 0.7 + 0.05
+    found, law = with_mean_memory(torch.tensor(first), LAW), Afterpulses(0.05, 2.0, 0.1)
+    assert found.numpy() == pytest.approx(Chain.of(first, LAW).mean_chances(), abs=4e-3)
+    assert with_mean_memory(torch.tensor(first), law).numpy() == pytest.approx(
+        Chain.of(first, law).mean_chances(), abs=5e-4
+    )
+    few = torch.tensor(first[:1], requires_grad=True)
+    one = torch.tensor(first[:1], requires_grad=True)
+    with_mean_memory(few, LAW)[0, 5].backward()
+    assert few.grad is not None
+    assert (few.grad[0, :5] > 0).all()  # more light before means more clicks behind
+    step = 1e-6
+    for i in (1, 4):  # the memory of the begin stands still in the gradient, and is the same to first order
+        up, down = one.detach().clone(), one.detach().clone()
+        up[0, i] += step
+        down[0, i] -= step
+        slope = float(with_mean_memory(up, LAW)[0, 5] - with_mean_memory(down, LAW)[0, 5]) / (2 * step)
+        assert float(few.grad[0, i]) == pytest.approx(slope, rel=0.1)
+    assert with_mean_memory(few, None) is few
+
+
+def test_a_machine_in_training_clicks_as_its_expectation() -> None:
+    machine, grey = random_machine(1), torch.tensor([[0, 10, 255, 30, 7]], dtype=torch.float64)
+    sight = Sight(ClickLaw(0.05), 1 / 255, 0.0, torch.float64, afterpulses=LAW)
+    passed, plain = forward(machine, sight, grey), forward(machine, sight.exact(), grey)
+    assert torch.cat(passed.leaves).sum().item() == pytest.approx(1.0, abs=1e-12)
+    first, second = passed.steps[0], passed.steps[1]
+    assert torch.equal(first.dark, plain.steps[0].dark)  # nothing before the first exposure
+    silent = float(first.dark[0, 0])
+    after_click = float(LAW.sight(LAW.after(-np.log(silent), np.zeros(2), 1)))
+    ways = machine.levels[0].successors[:, 0].tolist()
+    if ways[0] != ways[1]:
+        for clicked, node in enumerate(ways):
+            if node < len(second.dark):
+                wanted = float(plain.steps[1].dark[node, 0]) * np.exp(-after_click * clicked)
+                assert float(second.dark[node, 0]) == pytest.approx(wanted, rel=1e-9)
+    assert float(passed.clicks()) > 1.01 * float(plain.clicks())

@@ -1,16 +1,28 @@
 """Active illumination: squared weights inside the limits of the projector, whole levels, gradients through the rounding."""
 
 # ruff: noqa: E402  (what follows needs torch)
-import math
 
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.runtime.bundle.optics import Analyser, amplification
+import numpy as np
+from trainings import random_machine
+
+from pans.runtime.bundle.optics import amplification
+from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.model.encoders import ActiveIllumination, CoherentField, IncoherentIntensity, new_encoder
+from pans.trainer.adaptive.machine import Aim, Sight, backward, forward
+from pans.trainer.model.encoders import (
+    ActiveIllumination,
+    CoherentField,
+    IncoherentIntensity,
+    concentration,
+    concentration_slope,
+    concentrations,
+    new_encoder,
+)
+from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.options import Options
 
 
@@ -23,38 +35,6 @@ def test_photoelectrons_are_squared_weights_times_transmission():
     transmission = torch.rand(5, 20, generator=torch.Generator().manual_seed(1))
     wanted = transmission.numpy() @ (light.weight.detach().numpy() ** 2).T
     assert light(transmission).detach().numpy() == pytest.approx(wanted, rel=1e-6)
-
-
-def test_gradient_of_the_illumination_is_twice_the_weight():
-    light = encoder(limits=(0.1, 100.0))
-    light.patterns().sum().backward()
-    assert torch.allclose(light.weight.grad, 2 * light.weight.detach())
-
-
-def test_initial_weights_are_kaiming_uniform():
-    wide = ActiveIllumination(10, 784, (0.1, 2.0), torch.Generator().manual_seed(2))
-    bound = math.sqrt(6 / ((1 + 1.2**2) * 784))
-    weights = wide.weight.detach().numpy()
-    assert np.abs(weights).max() <= bound
-    assert weights.std() == pytest.approx(bound / math.sqrt(3), rel=0.03)
-    assert abs(weights.mean()) < 5 * bound / math.sqrt(3 * weights.size)
-
-
-def test_no_pixel_is_brighter_than_the_projector():
-    light = encoder()
-    with torch.no_grad():
-        light.weight[0, 0] = 5.0
-    assert float(light.patterns().detach().max()) == 2.0
-
-
-def test_a_pixel_at_the_limit_can_become_darker_again():
-    light = encoder()
-    with torch.no_grad():
-        light.weight[0, 0] = -5.0
-    light.dim_to_top()
-    assert float(light.weight.detach()[0, 0]) == pytest.approx(-math.sqrt(2.0))
-    light.patterns().sum().backward()
-    assert float(light.weight.grad[0, 0]) != 0
 
 
 def test_patterns_are_whole_levels_once_quantised():
@@ -79,15 +59,6 @@ def test_the_gradient_passes_the_rounding_and_reaches_the_top_level():
     inside = light.weight.detach() ** 2 < float(light.top().detach())
     assert torch.allclose(light.weight.grad[inside], 2 * light.weight.detach()[inside])
     assert float(light.log_top.grad) != 0
-
-
-def test_the_top_level_stays_within_its_limits():
-    light = encoder()
-    light.start_quantising(4)
-    assert 0.1 <= float(light.top().detach()) <= 2.0
-    with torch.no_grad():
-        light.log_top.fill_(10.0)
-    assert float(light.top().detach()) == pytest.approx(2.0)
 
 
 def rng_field(n=5, pixels=9, seed=0):
@@ -180,7 +151,59 @@ def test_no_light_in_gives_more_than_the_amplification(kind):
     assert light_out[0] / light_in[0] == pytest.approx(found, rel=1e-5)
 
 
-def test_what_must_reach_the_optics_grows_with_the_light_that_they_make():
-    images = np.full((3, 2, 2), 255, np.uint8)
-    seen = Analyser("coherent", 3 * np.eye(4, dtype=np.float32)[:2], "field", "none", 0.5, 100.0)
-    assert seen.reaching(images) == pytest.approx(9 * 0.5 * 4)  # amplitude 3, half a photoelectron in each of 4 pixels
+def stated(pattern):
+    """The brightness that the light of a pattern meets on average, over the mean of all pixels, as a logarithm."""
+    return np.log((pattern * pattern / pattern.sum()).sum() / pattern.mean())
+
+
+@pytest.mark.parametrize("lit", [1, 7, 50])
+def test_pixels_that_are_lit_alike_are_counted_and_their_brightness_does_not_matter(lit):
+    patterns = torch.zeros(2, 50, dtype=torch.float64)
+    patterns[0, :lit], patterns[1, 50 - lit :] = 1e-3, 80.0
+    np.testing.assert_allclose(concentrations(patterns).numpy(), np.log(50 / lit), rtol=1e-12, atol=1e-12)
+
+
+def test_slope_is_that_of_the_stated_measure():
+    patterns = np.random.default_rng(0).random((3, 12))
+    found, step = concentration_slope(torch.from_numpy(patterns)).numpy(), 1e-6
+    assert float(concentration(torch.from_numpy(patterns))) == pytest.approx(np.mean([stated(p) for p in patterns]))
+    for row, pixel in np.ndindex(*patterns.shape):
+        above, below = patterns[row].copy(), patterns[row].copy()
+        above[pixel] += step
+        below[pixel] -= step
+        assert found[row, pixel] == pytest.approx((stated(above) - stated(below)) / (2 * step), rel=1e-6, abs=1e-7)
+
+
+def test_an_automaton_takes_the_slope_by_how_often_a_state_is_reached():
+    machine, sight = random_machine(3), Sight(ClickLaw(), 1 / 255, 0.0, torch.float64)
+    grey = torch.tensor([[0, 10, 255, 30, 7], [200, 0, 90, 255, 255]], dtype=torch.float64)
+    one_hot = torch.tensor([[1, 0], [0, 1], [0, 0], [0, 0]], dtype=torch.float64)
+    passed = forward(machine, sight, grey)
+    backward(machine, sight, grey, one_hot, passed, Aim(0.07))
+    without = [level.light.root.grad.clone() for level in machine.levels]
+    backward(machine, sight, grey, one_hot, passed, Aim(0.07, spread=0.3))
+    step = 1e-6
+    for level, before, seen in zip(machine.levels, without, passed.steps):
+        added = (level.light.root.grad - before).numpy()
+        roots, reached = level.light.root.numpy(), seen.alpha.mean(dim=1).numpy()
+        for state, pixel in np.ndindex(*roots.shape):
+            above, below = roots[state].copy(), roots[state].copy()
+            above[pixel] += step
+            below[pixel] -= step
+            slope = (stated(above**2) - stated(below**2)) / (2 * step)
+            wanted = 0.3 / len(machine.levels) * reached[state] * slope
+            assert added[state, pixel] == pytest.approx(wanted, rel=1e-4, abs=1e-8)
+
+
+def test_limits_of_the_top_level_are_those_of_the_exposure():
+    profile = load_profile("oled-qcmos")
+    low, high = top_limits(profile)
+    assert exposure_us_of(profile, low) == pytest.approx(profile.exposure.min_us)
+    assert exposure_us_of(profile, high) == pytest.approx(profile.exposure.max_us)
+
+
+def test_exposures_full_of_dark_counts_are_not_used():
+    profile = load_profile("dmd-spad")  # 100 dark counts per second, exposures up to 10 ms
+    low, high = top_limits(profile)
+    assert exposure_us_of(profile, high) * 1e-6 * profile.detector.dark_rate_hz == pytest.approx(0.05)
+    assert exposure_us_of(profile, low) == pytest.approx(profile.exposure.min_us)

@@ -1,15 +1,29 @@
 """Gradient estimators: exact against finite differences, the unbiased ones against exact, the flips against plain passes."""
 
 # ruff: noqa: E402  (what follows needs torch)
-import naive_ssim
-import numpy as np
+
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
-from pans.trainer.model.estimators import ESTIMATORS, cross_entropy, exact, similarity_loss, squared_error
+import itertools
+import math
+
+import naive_ssim
+import numpy as np
+
+from pans.runtime.instrument.click_law import ClickLaw, CountLaw, count_chances
+from pans.trainer.model.detection import click_probability, click_words, word_probabilities
+from pans.trainer.model.estimators import (
+    CLICKS,
+    ESTIMATORS,
+    Readings,
+    cross_entropy,
+    exact,
+    readings_of,
+    similarity_loss,
+    squared_error,
+)
 from pans.trainer.model.heads import MlpHead
 
 READ_NOISE = ClickLaw(dark_per_exposure=1.8e-5, read_noise_e=0.2, threshold_e=0.84)
@@ -26,7 +40,7 @@ class TableHead:
         index = (clicks @ (2.0 ** torch.arange(clicks.shape[-1], dtype=clicks.dtype))).long()
         return self.scores[index]
 
-    def flipped(self, clicks, mean):
+    def changed(self, clicks, mean, by):
         columns = []
         for i in range(clicks.shape[1]):
             other = clicks.clone()
@@ -50,7 +64,7 @@ def gradient(name, light, head, labels, random, repeats=1, loss_of=cross_entropy
     found = []
     for _ in range(repeats):
         at = light.clone().requires_grad_()
-        ESTIMATORS[name](click_probability(at, READ_NOISE), labels, head, loss_of, random).backward()
+        ESTIMATORS[name](click_probability(at, READ_NOISE), labels, head, loss_of, random, CLICKS).backward()
         found.append(at.grad)
     stacked = torch.stack(found)
     return stacked.mean(dim=0).numpy(), stacked.std(dim=0, correction=0).numpy() / np.sqrt(repeats)
@@ -67,15 +81,6 @@ def test_exact_gradient_is_the_finite_difference():
         step = torch.zeros_like(light)
         step[i, j] = 1e-6
         assert found[i, j] == pytest.approx((loss(light + step) - loss(light - step)) / 2e-6, rel=1e-6, abs=1e-10)
-
-
-def test_exact_loss_is_the_mean_of_sampled_losses():
-    light, head, labels = problem(1)
-    p = click_probability(light, READ_NOISE)
-    wanted = float(exact(p, labels, head, cross_entropy, None))
-    clicks = sample_clicks(p.expand(20_000, N, D_F), torch.Generator().manual_seed(5))
-    losses = cross_entropy(head(clicks), labels.unsqueeze(0)).mean(dim=1)
-    assert abs(float(losses.mean()) - wanted) < 5 * float(losses.std()) / np.sqrt(len(losses))
 
 
 def test_exact_loss_of_pictures_is_the_sum_over_words():
@@ -128,7 +133,7 @@ def test_identity_passes_the_gradient_of_a_click_to_its_light_undamped():
     def found(name, at):
         at = at.clone().requires_grad_()
         p = click_probability(at, law)
-        ESTIMATORS[name](p, None, affine, lambda scores, _: scores, torch.Generator().manual_seed(1)).backward()
+        ESTIMATORS[name](p, None, affine, lambda scores, _: scores, torch.Generator().manual_seed(1), CLICKS).backward()
         return at.grad * len(at)
 
     assert torch.allclose(found("identity", light), weights.expand(N, D_F))
@@ -160,42 +165,8 @@ class _FixedMean:
     def __call__(self, clicks, mean=None):
         return self.head(clicks.to(self.head.hidden.weight.dtype))
 
-    def flipped(self, clicks, mean):
-        return self.head.flipped(clicks, self.head.norm.running_mean)
-
-
-def test_local_expectation_has_less_variance_than_the_score_function():
-    light, _, labels = problem(4)
-    weights = torch.randn(D_F, CLASSES, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    head = TableHead(click_words(D_F).double() @ weights)  # clicks that hardly interact, as behind a trained front end
-    spread = {
-        name: float(np.square(gradient(name, light, head, labels, torch.Generator().manual_seed(2), 400)[1]).sum())
-        for name in ("local", "disarm", "loo")
-    }
-    assert spread["local"] < 0.5 * spread["disarm"]
-    assert spread["local"] < 0.5 * spread["loo"]
-
-
-def test_gradient_through_the_mean_is_part_of_the_estimate():
-    random = torch.Generator().manual_seed(6)
-    head = MlpHead(D_F, 8, CLASSES, torch.Generator().manual_seed(0)).double()
-    light, _, labels = problem(5)
-    wanted, _ = gradient("exact", light, _Wide(head), labels, None)
-    found, error = gradient("local", light, _Wide(head), labels, random, repeats=3000)
-    assert np.all(np.abs(found - wanted) < 5 * error + 1e-12)
-
-
-class _Wide:
-    """A head in float64, normalised by the mean it is given."""
-
-    def __init__(self, head):
-        self.head = head
-
-    def __call__(self, clicks, mean=None):
-        return self.head(clicks.double(), mean)
-
-    def flipped(self, clicks, mean):
-        return self.head.flipped(clicks, mean)
+    def changed(self, clicks, mean, by):
+        return self.head.changed(clicks, self.head.norm.running_mean, by)
 
 
 def test_flipped_scores_are_those_of_the_flipped_words():
@@ -205,8 +176,105 @@ def test_flipped_scores_are_those_of_the_flipped_words():
     with torch.no_grad():
         head.norm.gain.copy_(torch.linspace(0.5, 2, 5))
         head.norm.bias.copy_(torch.linspace(-1, 1, 5))
-        found = head.flipped(clicks, mean)
+        found = head.changed(clicks, mean, 1 - 2 * clicks)
         for i in range(5):
             other = clicks.clone()
             other[:, i] = 1 - other[:, i]
             assert torch.allclose(found[:, i], head(other, mean), atol=1e-12)
+
+
+LAW = CountLaw(0.02, 0.3, (0.7, 1.5))
+COUNTED, OBJECTS = 3, 5
+
+
+def problem_readings(seed: int = 0):
+    rng = np.random.default_rng(seed)
+    light = torch.from_numpy(rng.uniform(0.1, 3.0, (OBJECTS, COUNTED)))
+    head = MlpHead(COUNTED, 6, CLASSES, torch.Generator().manual_seed(seed)).double().eval()
+    return light, head, torch.from_numpy(rng.integers(0, CLASSES, OBJECTS))
+
+
+def test_chances_are_those_of_the_law() -> None:
+    light = np.array([0.0, 1e-6, 0.3, 2.0, 9.0, 60.0, 400.0])
+    for edges in ((0.7,), (0.7, 1.5), (0.6, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5)):
+        law = CountLaw(0.02, 0.3, edges)
+        found = Readings(law.outcomes).chances(torch.from_numpy(light), law).numpy()
+        assert np.allclose(found.T, count_chances(law, light), rtol=0, atol=1e-12)
+
+
+def test_samples_have_the_chances_and_the_mean() -> None:
+    numbers, random = readings_of(3), torch.Generator().manual_seed(1)
+    chances = torch.tensor([[[0.2, 0.5, 0.3], [0.9, 0.0, 0.1]]], dtype=torch.float64).expand(40_000, 2, 3)
+    drawn = numbers.sample(chances, random).numpy()
+    share = np.stack([(drawn == value).mean(axis=0) for value in (0.0, 0.5, 1.0)], axis=-1)
+    assert np.abs(share - chances[0].numpy()).max() < 5 * math.sqrt(0.25 / 40_000)
+    assert numbers.mean(chances)[0].tolist() == pytest.approx([0.55, 0.1])
+
+
+def test_words_are_all_numbers_in_order_and_their_chances_products() -> None:
+    numbers = readings_of(3)
+    chances = torch.rand((4, 2, 3), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    words, found = numbers.words(2), numbers.word_chances(chances)
+    for place, (high, low) in enumerate(itertools.product(range(3), repeat=2)):
+        assert words[place].tolist() == [low / 2, high / 2]
+        assert torch.allclose(found[:, place], chances[:, 0, low] * chances[:, 1, high])
+
+
+def expected_loss(light, head, labels) -> float:
+    """By hand: every word of every object."""
+    chances = count_chances(LAW, light.numpy())
+    mean = ((chances[1] + 2 * chances[2]) / 2).mean(axis=0)
+    total = 0.0
+    for word in itertools.product(range(3), repeat=COUNTED):
+        with torch.no_grad():
+            scores = head(torch.tensor([word], dtype=torch.float64) / 2, torch.from_numpy(mean))
+            losses = cross_entropy(scores.expand(OBJECTS, CLASSES), labels).numpy()
+        weight = np.prod([chances[number, :, i] for i, number in enumerate(word)], axis=0)
+        total += float((weight * losses).sum())
+    return total / OBJECTS
+
+
+def gradient_readings(name: str, light, head, labels, random) -> tuple[float, np.ndarray]:
+    at, numbers = light.clone().requires_grad_(), readings_of(3)
+    loss = ESTIMATORS[name](numbers.chances(at, LAW), labels, head, cross_entropy, random, numbers)
+    loss.backward()
+    return float(loss.detach()), at.grad.numpy()
+
+
+def test_the_exact_gradient_is_the_finite_difference() -> None:
+    light, head, labels = problem_readings()
+    loss, found = gradient_readings("exact", light, head, labels, torch.Generator())
+    assert loss == pytest.approx(expected_loss(light, head, labels), abs=1e-9)
+    for i, j in ((0, 0), (2, 1), (4, 2)):
+        moved = [light.clone(), light.clone()]
+        moved[0][i, j] += 1e-5
+        moved[1][i, j] -= 1e-5
+        wanted = (expected_loss(moved[0], head, labels) - expected_loss(moved[1], head, labels)) / 2e-5
+        assert found[i, j] == pytest.approx(wanted, abs=2e-6)
+
+
+def test_the_local_gradient_is_unbiased() -> None:
+    light, head, labels = problem_readings(1)
+    numbers, random = readings_of(3), torch.Generator().manual_seed(4)
+    chances = numbers.chances(light, LAW).clone()
+    fixed = torch.tensor(
+        [0.3, 0.5, 0.4], dtype=torch.float64
+    )  # of the normalisation: both estimates go through the chances alone
+
+    class Fixed:
+        def __call__(self, clicks, mean=None):
+            return head(clicks, fixed)
+
+        def changed(self, clicks, mean, by):
+            return head.changed(clicks, fixed, by)
+
+    def one(name: str) -> np.ndarray:
+        at = chances.clone().requires_grad_()
+        ESTIMATORS[name](at, labels, Fixed(), cross_entropy, random, numbers).backward()
+        return (at.grad - at.grad.mean(dim=-1, keepdim=True)).numpy()  # chances of an exposure sum to 1
+
+    wanted = one("exact")
+    drawn = np.stack([one("local") for _ in range(600)])
+    error = drawn.std(axis=0) / math.sqrt(len(drawn))
+    assert (np.abs(drawn.mean(axis=0) - wanted) < 5 * error + 1e-12).all()
+    assert np.abs(wanted).max() > 20 * error.max()

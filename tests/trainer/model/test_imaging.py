@@ -6,9 +6,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.runtime.imaging import Bleaching, Imaging, bleached, met, tolerance_of
+from pans.runtime.imaging import Bleaching, Imaging, bleached, met
 from pans.trainer.model.encoders import ActiveIllumination
-from pans.trainer.model.imaging import DrawnOptics, bleached_patterns, through
+from pans.trainer.model.imaging import bleached_patterns, through
 
 SHAPE = (6, 7)
 FLAT = np.linspace(0.5, 1.5, 42).reshape(SHAPE)
@@ -39,26 +39,6 @@ def test_an_encoder_lights_dark_pixels_by_its_brightest_level(low):
         np.testing.assert_allclose(found, wanted, rtol=1e-5)
 
 
-def test_the_same_number_draws_the_same_optics_and_another_one_others():
-    drawn = DrawnOptics(tolerance_of("shift=1:rotate=2:psf=0.5..0.8:black=0.002"), SHAPE, 3)
-    objects = torch.rand((90, 42), generator=torch.Generator().manual_seed(1))
-    first, again, other = drawn.through(objects, 5), drawn.through(objects, 5), drawn.through(objects, 6)
-    torch.testing.assert_close(first, again, rtol=0, atol=0)
-    assert first.shape == (90, 43)
-    assert (first - other).abs().max() > 0.05
-    # every object is seen by one of some forty tables: those of one group alone share theirs
-    one = torch.ones(90, 42)
-    columns = drawn.through(one, 5)[:, 0]
-    assert len(columns.unique()) > 20
-
-
-def test_an_exact_tolerance_is_one_table():
-    drawn = DrawnOptics(tolerance_of("shift=0.5..0.5,-0.25..-0.25:psf=0.5"), SHAPE, 0)
-    objects = torch.rand((50, 42), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    wanted = through(Imaging(0.5, -0.25, psf_px=0.5), objects, SHAPE)
-    torch.testing.assert_close(drawn.through(objects, 9), wanted)
-
-
 @pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("dose", [1e-2, 0.7, 1e5])
 def test_patterns_bleach_in_training_as_they_do_elsewhere(dose: float, mixed: bool) -> None:
@@ -68,26 +48,6 @@ def test_patterns_bleach_in_training_as_they_do_elsewhere(dose: float, mixed: bo
     np.testing.assert_allclose(bleached_patterns(law, light).numpy(), bleached(law, light.numpy()), rtol=1e-9)
     small = light.float()[:3, :2].double().requires_grad_()
     assert torch.autograd.gradcheck(lambda x: bleached_patterns(law, x), (small,), eps=1e-6 * min(1.0, dose), rtol=1e-3)
-
-
-def test_pixels_at_the_brightest_level_raise_it_by_what_they_lack():
-    random = torch.Generator().manual_seed(2)
-    encoder = ActiveIllumination(2, 42, (0.1, 2.0), random)
-    encoder.start_quantising(1 << 16)
-    encoder.pulled = True
-    with torch.no_grad():
-        encoder.weight[0, 3], encoder.weight[1, 5] = 1.0, -1.0  # brighter than the level of 0.1: they are dimmed to it
-    encoder.dim_to_top()
-    seen = through(TABLE, torch.rand((1, 42), generator=random), SHAPE)
-    encoder(seen).sum().backward()
-    found = float(encoder.log_top.grad)
-    # the light that a level one part in a thousand brighter brings, with the two pixels as bright as it
-    before = float(encoder(seen).detach().double().sum())
-    with torch.no_grad():
-        encoder.log_top += 1e-3
-        encoder.weight[0, 3], encoder.weight[1, 5] = encoder.top().sqrt(), -encoder.top().sqrt()
-    more = float(encoder(seen).detach().double().sum()) - before
-    assert found == pytest.approx(more / 1e-3, rel=0.02)
 
 
 def test_training_can_raise_the_brightest_level_from_its_least():

@@ -2,7 +2,6 @@
 
 # ruff: noqa: E402  (what follows needs torch)
 import dataclasses
-from functools import partial
 
 import numpy as np
 import pytest
@@ -207,7 +206,7 @@ def test_a_table_of_words_is_their_chance_under_every_class():
 @pytest.fixture
 def short_fits(monkeypatch):
     """The last stage of a training takes 1500 steps however small the task is; nothing here asks for a good head."""
-    monkeypatch.setattr(head_fit, "fit_head_exactly", partial(head_fit.fit_head_exactly, steps=30))
+    monkeypatch.setattr(head_fit, "STEPS", 30)
 
 
 SMALL = Options(features=3, estimator="ste", alpha=1e-3, epochs=6, hidden=8, batch=25, front_rate=5e-2, head_rate=2e-2)

@@ -14,9 +14,7 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import train as adaptive_train
-from pans.trainer.adaptive.options import AutomatonOptions
-from pans.trainer.baselines.options import METHODS, BaselineOptions
-from pans.trainer.options import Options, check_options
+from pans.trainer.options import METHODS, AutomatonOptions, BaselineOptions, Options, check_options
 from pans.trainer.reproduce import curves, ways
 from pans.trainer.reproduce.curves import EXACT, STOPPING
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page

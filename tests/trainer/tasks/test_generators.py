@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from brightness import brightness_rows, decide_on_total, total_intensity
+from brightness import brightness_rows, total_intensity
 
-from pans.runtime.errors import UsageError
+from pans.trainer.tasks import draw, fields
 from pans.trainer.tasks.draw import CHUNK
 from pans.trainer.tasks.generators import GENERATORS
-from pans.trainer.tasks.registry import draw_task
+from pans.trainer.tasks.registry import draw_task, load_task
 
 SCENES = [name for name in GENERATORS if name != "barcode"]
 
@@ -66,36 +66,89 @@ def test_images_use_the_grey_scale_and_hardly_saturate(name):
     assert np.median(images.max(axis=(1, 2))) > 50
 
 
-def test_the_brightness_check_finds_what_there_is():
-    rng = np.random.default_rng(0)
-    labels = rng.integers(0, 2, 4000)
-    inside = np.where(
-        labels == 1, rng.uniform(1, 2, 4000), rng.choice([0.5, 2.5], 4000)
-    )  # no single threshold parts them
-    assert brightness_rows(inside[:2000], labels[:2000], inside[2000:], labels[2000:])[0].accuracy > 0.99
-    noise = rng.uniform(0, 1, 4000)
-    assert abs(brightness_rows(noise[:2000], labels[:2000], noise[2000:], labels[2000:])[0].accuracy - 0.5) < 0.056
+NONE, ALL = np.zeros(draw.CHUNK, np.int64), np.ones(draw.CHUNK, np.int64)
 
 
-def test_equal_totals_are_one_interval():
-    totals, labels = np.array([1.0, 1.0, 1.0, 2.0]), np.array([1, 1, 0, 0])
-    assert decide_on_total(totals, labels, np.array([1.0, 2.0, 5.0])).tolist() == [1, 0, 0]
+def with_and_without(scenes):
+    """The same 60 scenes, drawn as class 0 and as class 1 from the same random numbers; amplitudes."""
+    return [scenes(draw.random_stream(2, "x", "test", 0), labels) / 255.0 for labels in (NONE, ALL)]
 
 
-def test_total_intensity_squares_amplitudes():
-    images = np.array([[[255, 0]], [[51, 51]]], np.uint8)
-    assert total_intensity(images, "transmission") == pytest.approx([0.5, 0.2])
-    assert total_intensity(images, "field") == pytest.approx([0.5, 0.04])
+def power(amplitude):
+    return (amplitude**2).mean(axis=(1, 2))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"name": "cell"}, UsageError, "no generator"),
-        ({"name": "fiber", "seed": -1}, UsageError, "seed -1"),
-        ({"name": "fiber", "n_train": 0}, ValueError, "0 objects"),
-    ],
-)
-def test_what_cannot_be_drawn_is_refused(arguments, error, message):
-    with pytest.raises(error, match=message):
-        draw_task(**arguments)
+def test_an_event_is_small_compact_and_of_either_sign():
+    without, event = with_and_without(fields._scenes)
+    change = power(event) / power(without) - 1
+    assert np.abs(change).max() < 0.06
+    assert 10 <= (change > 0).sum() <= 50
+    assert power(without).std() / power(without).mean() > 0.2  # the background fluctuates far more
+    touched = (np.abs(event - without) > 0.02).sum(axis=(1, 2))
+    assert (touched > 0).all()
+    assert touched.max() < 0.06 * 64 * 64
+
+
+def test_defects_lie_on_the_mode_and_leave_the_power_alone():
+    clean, dirty = with_and_without(fields._end_faces)
+    assert power(dirty) == pytest.approx(power(clean), rel=0.01)
+    away = np.abs(dirty - clean)
+    assert (away.max(axis=(1, 2)) > 0.1).all()
+    y, x = np.mgrid[:64, :64] - 31.5
+    centroid = (clean**2 * x).sum(axis=(1, 2)) / (clean**2).sum(axis=(1, 2))
+    assert np.abs(centroid).max() < 2.2
+    assert away[:, np.hypot(y, x) > 28].max() < 0.1
+
+
+def test_perfused_speckle_has_less_contrast():
+    images, labels = fields.draw_tissue(4, "test", 120)
+    intensity = (images / 255.0) ** 2
+    contrast = intensity.std(axis=(1, 2)) / intensity.mean(axis=(1, 2))
+    assert contrast[labels == 0].min() > 0.7
+    assert contrast[labels == 1].max() < 0.5
+
+
+@pytest.mark.parametrize("name", ["barcode", "transient"])
+def test_a_drawn_task_by_name(name):
+    task = draw_task(name, seed=3, n_train=30, n_test=20)
+    recipe = GENERATORS[name]
+    assert (task.name, task.classes, task.image_shape) == (name, recipe.classes, recipe.image_shape)
+    assert (task.light, task.optics, task.target) == (recipe.light, "none", "class")
+    assert not task.split_here
+    assert "OUR generator" in task.source
+    assert "seed 3" in task.source
+    assert task.sha256 != draw_task(name, seed=4, n_train=30, n_test=20).sha256
+
+
+def test_load_task_draws_the_recipe():
+    task = load_task("barcode")
+    assert (len(task.train), len(task.test)) == (4000, 1000)
+    assert task.sha256 == load_task("barcode").sha256
+
+
+def rng():
+    return np.random.default_rng(7)
+
+
+def test_spots_are_gaussians_where_they_were_put():
+    y, x = np.array([[3.25, -6.0], [0.0, 40.0]]), np.array([[-2.5, 9.0], [0.0, 0.0]])
+    sigma, weight = np.array([[1.5, 2.0], [1.0, 1.0]]), np.array([[1.0, 0.5], [2.0, 1.0]])
+    found = draw.spots(20, 30, y, x, sigma, weight)
+    rows, columns = np.arange(20) - 9.5, np.arange(30) - 14.5
+    for i in range(2):
+        wanted = np.zeros((20, 30))
+        for k in range(2):
+            away = (rows[:, None] - y[i, k]) ** 2 + (columns[None, :] - x[i, k]) ** 2
+            wanted += weight[i, k] * np.exp(-away / (2 * sigma[i, k] ** 2))
+        assert np.abs(found[i] - wanted).max() < 1e-4
+
+
+def test_speckle_is_circular_gaussian_of_mean_one():
+    field = draw.speckle(rng(), 200, 32, 32, 3.0).astype(np.complex128)
+    intensity = np.abs(field) ** 2
+    grains = 200 * 32 * 32 * np.pi * (0.61 / 3) ** 2  # independent modes
+    assert abs(intensity.mean() - 1) < 5 / np.sqrt(grains)
+    assert intensity.std() == pytest.approx(1, abs=0.05)  # contrast of fully developed speckle
+    assert abs((field**2).mean()) < 0.02  # no preferred phase
+    correlation = (field[:, :, 3:] * field[:, :, :-3].conj()).mean().real
+    assert abs(correlation) < 0.05  # the first zero of the Airy amplitude is one grain away

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from pans.runtime.bundle.optics import incident_field, incident_intensity
-from pans.runtime.errors import UsageError
 from pans.trainer.tasks import mmf as task_mmf
 from pans.trainer.tasks.registry import FIBRE_TASKS, load_task
 
@@ -37,34 +35,10 @@ def test_the_speckle_by_the_definition_of_the_fourier_transform():
     assert np.abs(task_mmf.scatter(IMAGES[:1])[0] - wanted).max() < 1e-5
 
 
-def test_no_object_depends_on_another_except_in_the_release():
-    assert np.array_equal(task_mmf.scatter(IMAGES)[:2], task_mmf.scatter(IMAGES[:2]))
-    whole, part = task_mmf.release_intensity(IMAGES), task_mmf.release_intensity(IMAGES[:2])
-    assert (whole.min(), whole.max()) == (0, 1)
-    assert (part.min(), part.max()) == (0, 1)
-    assert not np.allclose(whole[:2], part)  # the leak, kept for comparison
-
-
 def test_the_release_normalises_every_batch_by_itself():
     batched = task_mmf.release_intensity(IMAGES, batch=2)
     for start in (0, 2, 4):
         assert np.allclose(batched[start : start + 2], task_mmf.release_intensity(IMAGES[start : start + 2]))
-
-
-def test_other_sizes_are_refused():
-    with pytest.raises(UsageError, match="28, 28"):
-        task_mmf.scatter(IMAGES[:, :27])
-
-
-def test_incident_light():
-    grey = np.array([[[0, 51, 255]]], np.uint8)
-    assert incident_field(grey, "field").ravel() == pytest.approx([0, 0.2, 1])
-    assert incident_field(grey, "intensity").ravel() == pytest.approx([0, 0.2**0.5, 1])
-    assert incident_intensity(grey, "field").ravel() == pytest.approx([0, 0.04, 1])
-    assert incident_intensity(grey, "transmission").ravel() == pytest.approx([0, 0.2, 1])
-    behind = incident_field(IMAGES, "field", "mmf")
-    assert behind.dtype == np.complex64
-    assert incident_intensity(IMAGES, "field", "mmf") == pytest.approx(np.abs(behind) ** 2, rel=1e-5, abs=1e-7)
 
 
 @pytest.mark.data

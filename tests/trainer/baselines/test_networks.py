@@ -1,18 +1,18 @@
 """Hadamard pairs: the matrix, the patterns, what their differences measure, and a case whose best accuracy is known."""
 
 # ruff: noqa: E402  (what follows needs torch)
-from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
 
 import itertools
 import math
 
 import numpy as np
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.baselines.common import measure, run_trials
-from pans.trainer.baselines.networks import FIELDS, PAIRS_MAX, hadamard_12, pair_net, pairs
+from pans.trainer.baselines.networks import aware_net, hadamard_12, pairs
 from pans.trainer.tasks.registry import Objects, Task
 
 
@@ -36,21 +36,6 @@ def test_pairs_are_binary_inverse_to_each_other_and_coarsest_first(shape: tuple[
     assert edges[1] < edges[-1]
 
 
-def test_differences_of_all_pairs_are_a_transform_that_can_be_undone() -> None:
-    image = np.random.default_rng(0).random(PAIRS_MAX)
-    shown = pairs(PAIRS_MAX, (FIELDS, FIELDS))
-    signs = shown[:PAIRS_MAX] - shown[PAIRS_MAX:]
-    readings = shown @ image
-    differences = readings[:PAIRS_MAX] - readings[PAIRS_MAX:]
-    np.testing.assert_allclose(signs.T @ differences / PAIRS_MAX, image, atol=1e-12)
-
-
-@pytest.mark.parametrize("n", [0, 145])
-def test_no_other_number_of_pairs(n: int) -> None:
-    with pytest.raises(ValueError, match="1 to 144"):
-        pairs(n, (28, 28))
-
-
 @pytest.mark.parametrize("differences", [True, False])
 def test_the_network_reaches_what_the_counts_of_two_pairs_allow(differences: bool) -> None:
     """Upper or lower half bright: of the first pairs one tells, the others see the same of both. The best decision is by its difference."""
@@ -64,7 +49,8 @@ def test_the_network_reaches_what_the_counts_of_two_pairs_allow(differences: boo
     measurement = measure(task, shown)
     photons = 20.0
     rates = photons * half / half.sum(axis=0).mean()
-    decide = pair_net(measurement, photons, "counting", seed=0, differences=differences, epochs=8)
+    method = "differences" if differences else "counts"
+    decide = aware_net(method, measurement, photons, "counting", seed=0, epochs=8)
     found = run_trials(measurement, photons, "counting", decide, trials=4, seed=1).right.mean()
     # the Bayes decision on draws of all counts: sum of n log(rate_0 / rate_1), a floor for dark patterns
     rng, draws = np.random.default_rng(3), 20_000

@@ -1,9 +1,12 @@
 """Posteriors of the nodes: smoothing, calibration on held-back objects, and the calibration error."""
 
-import numpy as np
+# ruff: noqa: E402  (what follows needs torch)
+
 import pytest
 
-pytest.importorskip("torch", reason="needs the train extra")
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+import numpy as np
 
 from pans.trainer.adaptive.finish import calibrated, calibration_error, log_loss, smoothed
 
