@@ -1,4 +1,4 @@
-"""A bar on the terminal while a command reads a long file: `replay`, `verify`, `report`, `info`, `export`, `compare`.
+"""Bars on the terminal: while a command reads a long file (`replay`, `verify`, `report`, `info`, `export`, `compare`), and of any work.
 
 There is none for a pass over a file that ends within a second, for a command whose standard error is no terminal, and with `--quiet`.
 """
@@ -84,3 +84,18 @@ def reading_bar() -> Iterator[None]:
             yield
     finally:
         bar.close()
+
+
+@contextmanager
+def progress_bar(what: str, total: float, *, threaded: bool = True) -> Iterator[Callable[[float], None]]:
+    """Yield a call that displays on a terminal how much of `total` is done; `threaded` draws in a thread of its own."""
+    if is_quiet() or not sys.stderr.isatty():
+        yield lambda done: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn(what), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=threaded) as progress:
+        task = progress.add_task("", total=total)
+        yield lambda done: progress.update(task, completed=min(done, total), refresh=not threaded)

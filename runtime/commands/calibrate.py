@@ -11,14 +11,12 @@ import math
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_TIMING, Command, add_force, emit, say
 from pans.runtime.cli.option_fields import refuse_without
-from pans.runtime.cli.printing import is_quiet
+from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import LinkError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import check_outputs
@@ -139,7 +137,7 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     seconds = design.n_cycles * design.plan.cycle_us * 1e-6
     say(f"calibrating: {len(design.drives)} patterns, {seconds:.1f} s of instrument time")
     config = RunOptions(n_cycles=design.n_cycles, lease_ms=profile.timing.lease_ms)
-    with _bar(design.n_cycles * design.plan.slots_per_cycle) as report:
+    with progress_bar("exposures", design.n_cycles * design.plan.slots_per_cycle) as report:
         seen = Observers(lambda run, _: report(run.core.tracker.next_exposure), acts=False)
         result = run_live(open_link(device), profile, design.bundle, design.plan, core, config, observers=seen)
     if result.ended == INTERRUPTED:
@@ -149,21 +147,6 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     keep = ("serial", "firmware", "name", "simulated")
     facts = {key: result.device[key] for key in keep if key in result.device}
     return core, facts, Counter(contradictions_of(result))
-
-
-@contextmanager
-def _bar(total: int) -> Iterator[Callable[[int], None]]:
-    """Yield a call that displays on a terminal how many exposures have come."""
-    if is_quiet() or not sys.stderr.isatty():
-        yield lambda done: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("exposures"), BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=total)
-        yield lambda done: progress.update(task, completed=min(done, total))
 
 
 def _register(args: argparse.Namespace) -> int:

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -24,7 +23,7 @@ import numpy as np
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
-from pans.runtime.cli.printing import is_quiet
+from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import UsageError
 from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
 
@@ -425,20 +424,6 @@ def _cell(values: dict[str, Any]) -> str:
     return f"{values['p50_us']:.1f} / {values['p99_us']:.1f} / {values['p999_us']:.0f} / {values['max_us']:.0f}"
 
 
-@contextmanager
-def _bar() -> Iterator[Callable[[float], None]]:
-    if is_quiet() or not sys.stderr.isatty():
-        yield lambda share: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    # no thread that draws: it would take part in what is measured
-    with Progress(console=Console(stderr=True), transient=True, auto_refresh=False) as progress:
-        task = progress.add_task("real time", total=1.0)
-        yield lambda share: progress.update(task, completed=share, refresh=True)
-
-
 # -- the commands ------------------------------------------------------------------------------------------------------
 
 
@@ -503,7 +488,8 @@ def _realtime(payload: dict[str, Any]) -> str:
     say(
         f"pans: measuring wake-ups for about {SECONDS:.0f} s; what else runs now takes part, and a live run would suffer"
     )
-    with _bar() as report:
+    # no thread that draws: it would take part in what is measured
+    with progress_bar("real time", 1.0, threaded=False) as report:
         found = rehearse(SECONDS, report)
     rows = settings_of(found)
     for row in rows:

@@ -20,7 +20,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -29,6 +29,7 @@ from typing import Any
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
+from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
@@ -366,29 +367,15 @@ def _work(args: argparse.Namespace, journal: Journal, todo: list[Item]) -> None:
     folder, began_s = str(Path.cwd()), time.monotonic()
     results = results_of_dask(todo, folder, args.dask) if args.dask else results_here(todo, folder, args.workers or 1)
     reported_s = began_s
-    with closing(results), _bar(len(todo)) as step:  # type: ignore[type-var]
+    with closing(results), progress_bar("batch", len(todo)) as report:  # type: ignore[type-var]
         for number, (item, row) in enumerate(results, 1):
             journal.add(item, row)
-            step()
+            report(number)
             now_s = time.monotonic()
             if not sys.stderr.isatty() and now_s - reported_s > REPORT_EVERY_S and number < len(todo):
                 reported_s = now_s
                 left_s = (now_s - began_s) / number * (len(todo) - number)
                 say(f"{number} of {len(todo)} done, about {left_s:.0f} s left")
-
-
-@contextmanager
-def _bar(total: int) -> Iterator[Any]:
-    if not sys.stderr.isatty():
-        yield lambda: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("batch"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=total)
-        yield lambda: progress.advance(task)
 
 
 BATCH = Command(

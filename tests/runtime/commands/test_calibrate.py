@@ -15,7 +15,7 @@ from pans.runtime.errors import DamagedFileError
 from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc, save_calibration
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link import base
-from pans.runtime.live import reconnect, second_device
+from pans.runtime.live import gates, reconnect
 
 URL = "sim:ideal?scene=uniform&pace=fast&seed=1"
 
@@ -24,7 +24,7 @@ def test_contradictions_are_a_fault_and_stand_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     opened = base.open_link
-    for module in (one_run, reconnect, second_device):  # imported before: else they would keep the false one for good
+    for module in (one_run, reconnect, gates):  # imported before: else they would keep the false one for good
         assert module.open_link is opened
     lie = Mutation("CLICKS", "object_index", *by(17), most=3)
     monkeypatch.setattr(base, "open_link", lambda url: MutatedLink(opened(url), (lie,), Evidence(1 << 40, 2, 10**6)))
