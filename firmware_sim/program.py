@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.wire.commands import PARALLEL
-from pans.runtime.wire.fields import LARGEST_TICK
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN
+from pans.runtime.wire.schema import LARGEST_TICK
 
 I64 = NDArray[np.int64]
 LONG_CYCLE = 4096  # exposures: so many are computed in one piece, without a division for each

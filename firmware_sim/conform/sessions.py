@@ -6,10 +6,9 @@ from contextlib import suppress
 
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, pack_arm
-from pans.runtime.wire.fields import wrong_facts
 from pans.runtime.wire.framing import encode_frame
 from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode
-from pans.runtime.wire.schema import AUTOMATON_SCHEMA
+from pans.runtime.wire.schema import AUTOMATON_SCHEMA, wrong_facts
 
 from .bench import LEASE_MS, PATIENCE_S, Bench
 from .rules import Silent, beyond_the_link, need, rule

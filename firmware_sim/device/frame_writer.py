@@ -21,9 +21,9 @@ from pans.firmware_sim.scene.marks import (
     Stamp,
     no_marks,
 )
-from pans.runtime.wire.kernels import crc32_span
 from pans.runtime.wire.messages import BLOCK_HEADER_BYTES, NO_OBJECT
 from pans.runtime.wire.schema import HEADER, SCHEMA, MessageType
+from pans.runtime.wire.wire_kernels import crc32_span
 
 I64 = NDArray[np.int64]
 

@@ -84,7 +84,6 @@ class Instrument:
         self.view.check_and_warm_up()
         self.counters = InstrumentCounters()
         self.decoder = wire.FrameDecoder()
-        self.decoder.use_kernels()
         self.state, self.reason = DeviceState.IDLE, StateReason.POWER_ON
         self.session = 0  # the host's nonce; 0 before the first HELLO
         self.gates = Gates()

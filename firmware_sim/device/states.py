@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program, States
 from pans.runtime.wire.commands import CountStateChunk, Extension, ReadCounts, Show, StateChunk
-from pans.runtime.wire.fields import MAX_LEAVES, MAX_STATES
 from pans.runtime.wire.messages import (
     ADAPTIVE_PATTERN,
     BLOCK_HEADER_BYTES,
@@ -23,6 +22,7 @@ from pans.runtime.wire.messages import (
     MAX_PAYLOAD_BYTES,
     AckStatus,
 )
+from pans.runtime.wire.schema import MAX_LEAVES, MAX_STATES
 
 from .upload import Refused
 

@@ -26,10 +26,8 @@ from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.record.recorder import repeated_setup
 from pans.runtime.watch.state_file import resources_used
-from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.commands import Arm
-from pans.runtime.wire.frame import pack_body
-from pans.runtime.wire.framing import FrameDecoder
+from pans.runtime.wire.framing import FrameDecoder, pack_body
 from pans.runtime.wire.messages import FrameBlock, encode_frames
 
 from .rows import BenchOptions, Row, copy_ns, cpu_time
@@ -95,7 +93,7 @@ def _decode_row(zeros: float) -> Row:
     reads = reads_of(data)
 
     def decode() -> None:
-        decoder = BulkDecoder()
+        decoder = FrameDecoder()
         found = sum(len(spans) for read in reads for spans in decoder.bodies(read))
         if found != n_frames or decoder.counters.bytes_discarded:
             raise RuntimeError(f"{found} of {n_frames} frames decoded: the benchmark is wrong")

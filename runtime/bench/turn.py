@@ -33,9 +33,7 @@ from pans.runtime.kernel.calls import Kernel, Limits, StreamCore
 from pans.runtime.kernel.system import now_ns, offered, read_now, wait_for, write_now
 from pans.runtime.link.base import Link, descriptor_of, open_link
 from pans.runtime.live.drive import HostDriver, WalkPlace
-from pans.runtime.wire.bulk import BulkDecoder
-from pans.runtime.wire.frame import unpack_body
-from pans.runtime.wire.framing import FrameDecoder
+from pans.runtime.wire.framing import FrameDecoder, unpack_body
 from pans.runtime.wire.messages import Ack, ClickBlock, Opcode, encode_ack, encode_clicks, encode_command
 from pans.runtime.wire.schema import SCHEMA
 
@@ -143,7 +141,7 @@ def flow_row(bundle: Bundle, quick: bool) -> Row:
     plain.begin(0, 0)
     wanted = np.array([one for data in reads for frame in decoder.feed(data) for one in plain.step(frame).decisions],
                       DECISION_DTYPE)  # fmt: skip
-    turn = Kernel(core.steps(SESSION), BulkDecoder())
+    turn = Kernel(core.steps(SESSION), FrameDecoder())
 
     def compiled() -> Rows:
         core.begin(0, 0)
@@ -264,7 +262,7 @@ def _framed(trips: Trips) -> tuple[NDArray[np.int64], int, int, float]:
     steps = core.steps(SESSION)
     assert plan.automaton is not None
     driver = HostDriver(core, WalkPlace(plan, plan.automaton))
-    turn = Kernel(steps, BulkDecoder(), driver.arrays(SESSION))
+    turn = Kernel(steps, FrameDecoder(), driver.arrays(SESSION))
     turn.warm_up()
     control = turn.control
     first = encode_command(1, Opcode.SHOW, driver.body(0, 0), SESSION)

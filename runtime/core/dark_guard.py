@@ -22,9 +22,16 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.table import TableDecider, count_table, fits_count_table, n_features_of
 from pans.runtime.decide.verdict import Decider, Verdict, softmax_winner
 from pans.runtime.errors import UsageError
-from pans.runtime.instrument.channel_health import LEVELS, ChannelHealth, DarkMonitor, DarkReport, Finding
+from pans.runtime.instrument.channel_health import (
+    LEVELS,
+    ChannelHealth,
+    DarkMonitor,
+    DarkReport,
+    DeadChannelTest,
+    Finding,
+    Silence,
+)
 from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch, WatchSettings
-from pans.runtime.instrument.dead_channels import DeadChannelTest, Silence
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
@@ -279,8 +286,6 @@ class DarkGuard:
     def warm_up(self) -> None:
         """Compile or load the kernels, before arming."""
         self.watch.warm_up()
-        if self.lit is not None:
-            self.lit.warm_up()
 
     def restart(self) -> None:
         """Follow another stream: its exposures count from 0 again, the rates go on."""

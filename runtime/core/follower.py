@@ -31,7 +31,8 @@ from pans.runtime.wire.messages import (
     Status,
     decode_status,
 )
-from pans.runtime.wire.tracker import MAX_GAP_EXPOSURES, MEMORY_BYTES, StreamTracker
+from pans.runtime.wire.schema import MAX_GAP_EXPOSURES
+from pans.runtime.wire.tracker import MEMORY_BYTES, StreamTracker
 
 from .decision import BeyondPlan, CoreEvent, Output, StreamEndUnknown, joined
 from .plan import Plan

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.decide.verdict import Decider, verdicts_of
-from pans.runtime.wire import walk as place
+from pans.runtime.wire import wire_kernels as place
 from pans.runtime.wire.messages import Mark
 
 from . import stream_kernels as kernels

@@ -27,9 +27,9 @@ from pans.runtime.detector.limits import BRIGHT, law_warnings
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.click_law import cannot_count
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.wire.fields import U32_MAX
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN as ADAPTIVE_PATTERN
 from pans.runtime.wire.messages import DARK_PATTERN as DARK_PATTERN
+from pans.runtime.wire.schema import U32_MAX
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.automaton import Automaton

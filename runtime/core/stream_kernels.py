@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.wire import walk as stream
+from pans.runtime.wire import wire_kernels as stream
 from pans.runtime.wire.bare import load4, load8
 from pans.runtime.wire.inner import inner
 from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.errors import PlanError
-from pans.runtime.wire.frame import read_only
+from pans.runtime.wire.framing import read_only
 from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 

@@ -37,7 +37,7 @@ from pans.runtime.decide.backends import Decider
 from pans.runtime.decide.verdict import Verdict, log_evidence, softmax_winner
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import Finding
-from pans.runtime.wire import walk as place
+from pans.runtime.wire import wire_kernels as place
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock, Mark, Status
 
 from . import kernels

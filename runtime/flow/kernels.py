@@ -20,7 +20,7 @@ from pans.runtime.core import stream_kernels as core
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.stream_kernels import DecisionTables
 from pans.runtime.core.window import sum_up
-from pans.runtime.wire import walk as stream
+from pans.runtime.wire import wire_kernels as stream
 from pans.runtime.wire.bare import bare, load4
 from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import NO_OBJECT, UNKNOWN_TRUTH

@@ -1,7 +1,7 @@
-"""What an instrument can do, when its detector clicks, how it was measured, and whether it still is so.
+"""One instrument as numbers: its profile, the laws of its clicks, its calibration, and tests of whether it still is as it was.
 
-Owns hardware profiles, the click law, calibrations and the statistical tests that a run holds against them (dark counts, dead channels,
-the level of light). It talks to no device and decides nothing: a test returns findings, core/dark_guard.py acts on them.
+What comes in are TOML profiles, calibration files and counts of clicks; what goes out are frozen facts, probabilities, estimates and
+findings. Start with profile.py, then click_law.py; cusum.py, channel_health.py and light_level.py watch a run.
 
 >>> from pans.runtime.instrument import load_profile
 >>> load_profile("oled-qcmos").mode
@@ -9,9 +9,9 @@ the level of light). It talks to no device and decides nothing: a test returns f
 """
 
 from .calibration import Calibration, load_calibration
+from .channel_health import DeadChannelTest
 from .click_law import ClickLaw, click_law, click_probability
 from .cusum import ChannelWatch
-from .dead_channels import DeadChannelTest
 from .dead_time import DeadTime
 from .profile import Profile, load_profile, parse_profile, shipped_profiles
 

@@ -1,12 +1,23 @@
-"""What is wrong with the detector, in plain words: hot and silent channels, light leaks, drift, told apart from the watch's alarms.
+"""What is wrong with the detector, in plain words: hot and silent channels, light leaks, drift, told apart.
 
-Owns the naming of causes, their levels, which state lasts, and the dark rate of a whole run beside the profile's (`DarkMonitor`); never
-counts clicks (cusum.py) and never acts (dark_guard.py). `ChannelHealth.take` turns alarms into `Finding`s: one when a state begins
-and one when it ends, however often a test passes its threshold meanwhile.
+`ChannelHealth.take` turns the alarms of cusum.py into `Finding`s: one when a state begins and one when it ends, however often a test passes
+its threshold meanwhile. It tells states apart by which channels differ and how strongly: one channel with most of the excess is *hot*; all
+of them at once, five times or more, is a *burst* (a light leak); all of them by less is a *drift*; fewer clicks than expected is *quiet*
+(none at all: *dead*). With one detector "all" and "one" are the same, and strength alone decides. `DarkMonitor` compares the dark rate of a
+whole run with the profile's.
 
-Told apart by who is concerned and how strongly: one channel with most of the excess is *hot*; all of them at once, five times
-or more, is a *burst* (a light leak); all of them by less is a *drift*; fewer clicks than expected is *quiet* (none at all:
-*dead*). With one detector "all" and "one" are the same, and strength alone decides.
+`DeadChannelTest` finds dead channels in exposures with light; in the dark silence is no news for a long time. It has two tests, each with a
+stated number of exposures or objects between false alarms, all channels together:
+
+- *Proved.* Whatever the scene, a living channel clicks at least at its dark rate r in every exposure, lit or not. A silence of n
+  exposures has probability (1 - r)^n after each click, so that false alarms come every 1 / (r (1 - r)^n) exposures. For r half the
+  lower end of what is expected is taken: a channel that has become quiet is not dead.
+- *Inferred*, much sooner. A channel that clicked in a share q of the objects is silent in m of them in a row with probability
+  (1 - q)^m after each click; q is the run's own running mean up to its last click, at the lower end of its interval. A scene that
+  has come to give a pattern no light looks the same to this channel, but not to the others: a dead channel changes nothing in them,
+  other objects do. So the shares of the others since the last click are compared with those before; where they differ the test says
+  nothing, and the proof must decide. It assumes that objects come in no order, and that objects without light on one pattern differ from
+  the others in other patterns too.
 """
 
 from __future__ import annotations
@@ -14,17 +25,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.intervals import binomial_tail, wilson_interval
 
-from .cusum import ALL_CHANNELS, Alarm, ChannelWatch
+from .cusum import ALL_CHANNELS, FLOOR_RATE, Alarm, ChannelWatch
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
 ALARM_PROBABILITY = 1e-6  # of seeing this many dark clicks or more, if the profile's dark rate were right
 BURST_RATIO = 5.0  # of the present to the expected rate, from which an excess is an alarm, and of all channels a burst
 WARNING_RATIO = 1.5  # the least ratio that a test looks for (WatchSettings.drift_ratio)
@@ -32,6 +44,18 @@ MOST = 0.5  # of the excess: a channel with more of it is the cause
 RETURN_EVIDENCE = 14.0  # log likelihood ratio for the expected rate at which a state is over: e^14 to one
 LEAST_CHANGE = 1.5  # times, that a state which lasts is taken to differ from what is expected
 _UNIT = 1e-6  # of the log likelihood ratio, so that sums are whole numbers
+QUIET = 0.5  # of the expected dark rate: less often clicks only a dead channel
+MAX_COMPARED = 64  # other channels that are compared, evenly spread
+# objects in which a channel has clicked before it is judged by them: its share is then known to about a fifth
+LEAST_CLICKED = 30
+LEAST_OBJECTS = 8  # in a row without a click
+LOOK_AGAIN = 1.25  # times the objects, where the others have changed
+# Of the others' changes, in squared standard errors, beyond which the scene is another. One change alone is chi-square with one degree
+# of freedom: 12.0 is passed with probability 5e-4. Their mean over d channels has standard deviation sqrt(2 / d): 1.6 lies 1.3 of them
+# above 1 for ten channels and 3.4 for MAX_COMPARED. The test errs to the side of saying nothing: then the proof decides, later.
+MEAN_Z2_MAX, Z2_MAX = 1.6, 12.0
+RETURN_BLOCKS = 3  # with a click: the channel lives
+_NEVER = 1 << 62
 LEVELS = ("notice", "warning", "alarm")
 
 
@@ -112,7 +136,7 @@ class ChannelHealth:
         return findings
 
     def note_dead(self, channels: tuple[int, ...], words: str) -> list[Finding]:
-        """Channels have been found dead by other means (dead_channels.py): return the finding, none where the state is known."""
+        """Channels have been found dead in the light (`DeadChannelTest`): return the finding, none where the state is known."""
         known = [state.finding for held, state in self._states.items() if set(channels) <= set(held)]
         if any(finding.kind == "dead" for finding in known):
             return []
@@ -242,13 +266,11 @@ class DarkReport:
     expected: float
     alarm: str
     policy: str = "warn"
-    findings: tuple[
-        dict[str, Any], ...
-    ] = ()  # states of the detector that began or ended (channel_health.py), in order
+    findings: tuple[dict[str, Any], ...] = ()  # states of the detector that began or ended, in order
     present: tuple[str, ...] = ()  # those that last, in words
     channels: tuple[
         dict[str, float], ...
-    ] = ()  # exposures, clicks, rate and its interval by channel, where a guard watched
+    ] = ()  # exposures, clicks, rate and interval by channel, where a guard watched
 
 
 class DarkMonitor:
@@ -268,3 +290,152 @@ class DarkMonitor:
                 "look for stray light, a warm detector or a wrong threshold"
             )
         return DarkReport(exposures, clicks, rate, low, high, self.expected, alarm)
+
+
+class Silence(NamedTuple):
+    """A channel found dead: `length` exposures (proved) or objects (inferred) without a click, `rate` per one of them expected."""
+
+    channel: int
+    proved: bool
+    length: int
+    rate: float
+
+
+class DeadChannelTest:
+    """Follows the silence of `n` channels; all memory is allocated here, before arming.
+
+    `dark_low` float64 (n,) are the lower ends of their dark rates; `arl_exposures` lie between false proofs and `arl_objects`
+    between false inferences, of any channel, in the mean.
+    """
+
+    def __init__(self, dark_low: F64, arl_exposures: float, arl_objects: float) -> None:
+        n = len(dark_low)
+        self.n_channels = n
+        self.silent: I64 = np.zeros(n, np.int64)  # exposures since the last block with a click
+        self.clicking: I64 = np.zeros(n, np.int64)  # blocks with a click
+        self.objects = 0
+        self.clicked: I64 = np.zeros(n, np.int64)  # objects with a click
+        self._proofs = np.array(
+            [silence_limit(max(FLOOR_RATE, QUIET * float(low)), n, arl_exposures) for low in dark_low], np.int64
+        )
+        self._dark, self._limits = dark_low, self._proofs.copy()
+        self._arl_objects = arl_objects
+        self._compared: I64 = np.unique(np.linspace(0, n - 1, min(n, MAX_COMPARED)).round().astype(np.int64))
+        self._clicks = np.zeros(n, np.bool_)  # which channels have clicked in the object under way
+        self._object, self._open = -1, False
+        self._quiet: I64 = np.zeros(n, np.int64)  # objects since the one of the last click
+        self._then: I64 = np.zeros((n, len(self._compared)), np.int64)  # `clicked` of the compared channels at that one
+        self._first: I64 = np.full(n, LEAST_OBJECTS, np.int64)  # objects of silence at which a channel is looked at
+        self._due: I64 = self._first.copy()
+        self._told: I64 = np.full(n, -1, np.int64)  # of the dead: `clicking` when they were told of
+        self._any_due, self._n_told = False, 0
+
+    def take_exposures(self, words: U8) -> None:
+        """Take the exposures of a block, lit or dark: words uint8 (n, bytes), bit c is channel c.
+
+        A channel that clicked in the block is silent for 0 exposures at its end: no silence is ever counted too long.
+        """
+        clicked = np.unpackbits(np.bitwise_or.reduce(words, axis=0), count=self.n_channels, bitorder="little")
+        self.take_counts(len(words), clicked)
+
+    def take_counts(self, exposures: int, clicks: NDArray[np.integer]) -> None:
+        """Take exposures of which only the clicks of each channel are known, (n,)."""
+        silent = clicks == 0
+        self.clicking += ~silent
+        self.silent += exposures
+        self.silent *= silent
+        self._any_due |= bool((self.silent >= self._limits).any())
+
+    @property
+    def has_news(self) -> bool:
+        """Whether `look` or `returned` may have something to tell; cheap."""
+        return self._any_due or self._n_told > 0
+
+    def take_object(self, counts: I64, number: int) -> None:
+        """Take one window's clicks, int64 (n,); windows of the same object `number` are one object, -1 is always another."""
+        if self._open and (number < 0 or number != self._object):
+            self.end_object()
+        self._object, self._open = number, True
+        self._clicks |= counts > 0
+
+    def end_object(self) -> None:
+        """The object under way has gone: what comes next is another."""
+        if self._open:
+            clicks = self._clicks
+            self.objects += 1
+            self.clicked += clicks
+            self._quiet += 1
+            self._quiet[clicks] = 0
+            self._due[clicks] = self._first[clicks]
+            self._then[clicks] = self.clicked[self._compared]
+            self._any_due |= bool((self._quiet >= self._due).any())
+            clicks[:] = False
+            self._open = False
+
+    def look(self) -> list[Silence]:
+        """Return the channels that have been found dead since the last look; no work where none has been silent for long."""
+        if not self._any_due:
+            return []
+        self._any_due = False
+        found = [
+            Silence(channel, True, int(self.silent[channel]), float(self._dark[channel]))
+            for channel in np.flatnonzero(self.silent >= self._limits).tolist()
+        ]
+        for channel in np.flatnonzero((self._quiet >= self._due) & (self.silent < self._limits)).tolist():
+            found += self._judge(channel)
+        self._n_told += len(found)
+        for silence in found:
+            self._told[silence.channel] = self.clicking[silence.channel]
+            self._limits[silence.channel] = self._due[silence.channel] = _NEVER  # until it has clicked again
+        return found
+
+    def returned(self) -> list[int]:
+        """Return the dead channels that click again, once."""
+        dead = np.flatnonzero(self._told >= 0)
+        if not len(dead):
+            return []
+        back = dead[self.clicking[dead] >= self._told[dead] + RETURN_BLOCKS]
+        self._told[back], self._limits[back] = -1, self._proofs[back]
+        self._n_told -= len(back)
+        return [int(channel) for channel in back]
+
+    def _judge(self, channel: int) -> list[Silence]:
+        """Is a channel that was silent in the last objects dead? Set when it is looked at again where that cannot be said."""
+        quiet = int(self._quiet[channel])
+        before, clicked = self.objects - quiet, int(self.clicked[channel])
+        rate = wilson_interval(clicked, before)[0] if clicked >= LEAST_CLICKED else 0.0
+        limit = silence_limit(rate, self.n_channels, self._arl_objects) if rate > 0 else 2 * quiet
+        self._first[channel] = max(LEAST_OBJECTS, min(limit, _NEVER))
+        if quiet < limit:
+            self._due[channel] = self._first[channel]
+            return []
+        if not self._others_as_before(channel, before, quiet):
+            self._due[channel] = math.ceil(LOOK_AGAIN * quiet)
+            return []
+        return [Silence(channel, False, quiet, clicked / before)]
+
+    def _others_as_before(self, channel: int, before: int, quiet: int) -> bool:
+        others = self._compared != channel
+        if not others.any():
+            return True  # one detector
+        then = self._then[channel, others].astype(np.float64)
+        since = self.clicked[self._compared[others]] - then
+        share = (then + since) / (before + quiet)
+        varies = (share > 0) & (share < 1)
+        if not varies.any():
+            return False  # nothing else clicks, or all do: they say nothing
+        error2 = (share * (1 - share) * (1 / before + 1 / quiet))[varies]
+        z2 = (since[varies] / quiet - then[varies] / before) ** 2 / error2
+        return bool(z2.mean() <= MEAN_Z2_MAX and z2.max() <= Z2_MAX)
+
+
+def silence_limit(rate: float, n_channels: int, arl: float) -> int:
+    """Return after how many silent trials in a row a channel that clicks with probability `rate` is taken for dead.
+
+    False alarms of `n_channels` such channels lie `arl` trials apart in the mean: a silence of n begins with each click, so
+    they come every 1 / (n_channels rate (1 - rate)^n) trials.
+    """
+    if rate >= 1.0:
+        return 1
+    needed = math.log(max(1.0, arl * n_channels * rate)) / -math.log1p(-rate)
+    return max(1, math.ceil(min(needed, float(_NEVER))))

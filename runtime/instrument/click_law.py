@@ -233,19 +233,6 @@ def count_chances(law: CountLaw, photoelectrons: ArrayLike) -> F64:
     return found
 
 
-def count_slopes(law: CountLaw, photoelectrons: ArrayLike) -> F64:
-    """d P(outcome) / d photoelectrons, (outcomes, *shape): sum_k (w_j(k + 1) - w_j(k)) exp(-mu) mu^k / k!, a finite sum."""
-    mu = _light(photoelectrons) + law.dark_per_exposure
-    weights = outcome_weights(law)
-    last = np.zeros(law.outcomes)
-    last[-1] = 1.0
-    rise = np.diff(np.column_stack([weights, last]), axis=1)
-    found = np.zeros((law.outcomes, *mu.shape))
-    for k in range(weights.shape[1]):
-        found += _each(rise[:, k], mu) * _poisson(mu, k)
-    return found
-
-
 def _is_plain(law: ClickLaw) -> bool:
     return law.read_noise_e == 0 and law.threshold_e <= 1
 

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.intervals import bisect
-from pans.runtime.wire.frame import read_only
+from pans.runtime.wire.framing import read_only
 from pans.runtime.wire.inner import inner, outer
 
 I64 = npt.NDArray[np.int64]
@@ -245,16 +245,6 @@ class ChannelWatch:
         )
         self.exposures += len(words)
         return self._alarms(int(n))
-
-    @property
-    def arrays(self) -> tuple[I64, I64, I64, I64, I64]:
-        """What compiled code hands to `take_words`, behind the number of exposures before."""
-        return self.clicks, self._state, self._channel_of, self._at_zero, self._room
-
-    def went_on(self, exposures: int, alarms: int) -> list[Alarm]:
-        """Take over what compiled code has given to `take_words`: the exposures of now, and how many alarms it found."""
-        self.exposures = exposures
-        return self._alarms(alarms)
 
     def update(self, dark_exposures: int, clicks_per_channel: I64) -> list[Alarm]:
         """Take a block of which only the counts are known: clicks int64 (n,) in `dark_exposures` exposures.

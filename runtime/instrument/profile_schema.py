@@ -10,7 +10,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from typing import Annotated, Any, get_type_hints
 
 from pans.runtime.imaging import Tolerance
-from pans.runtime.wire.fields import MAX_STATES
+from pans.runtime.wire.schema import MAX_STATES
 
 from .checked_toml import Key
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from pans.runtime.core import stream_kernels as core
-from pans.runtime.wire import walk as stream
+from pans.runtime.wire import wire_kernels as stream
 from pans.runtime.wire.bare import load4
 from pans.runtime.wire.inner import inner
-from pans.runtime.wire.kernels import crc32_span
 from pans.runtime.wire.schema import HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS
 from pans.runtime.wire.session import COMMAND_WINDOW
+from pans.runtime.wire.wire_kernels import crc32_span
 
 from . import state as ring
 from .system import AGAIN, INTERRUPTED, now_ns, wait_for, write_now

@@ -19,8 +19,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.stream_kernels import DecisionTables
 from pans.runtime.decide.verdict import Decider
-from pans.runtime.wire.bulk import CHUNK_BYTES, BulkDecoder
-from pans.runtime.wire.frame import Frame, Messages, unpack_body
+from pans.runtime.wire.framing import CHUNK_BYTES, Frame, FrameDecoder, Messages, unpack_body
 from pans.runtime.wire.messages import Mark, MessageType, decode_mark
 from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES
@@ -92,7 +91,7 @@ _MARK = int(MessageType.MARK)
 class Kernel:
     """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming."""
 
-    def __init__(self, steps: Steps, decoder: BulkDecoder, drive: Drive | None = None) -> None:
+    def __init__(self, steps: Steps, decoder: FrameDecoder, drive: Drive | None = None) -> None:
         from .receive import turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
@@ -261,7 +260,7 @@ class StreamCore:
         return streamed
 
     def _take_over(self, core: Core, session: int) -> None:
-        self.core, self.decoder, self.wrong_session, self._session = core, BulkDecoder(), 0, session
+        self.core, self.decoder, self.wrong_session, self._session = core, FrameDecoder(), 0, session
         self.turn = Kernel(core.steps(session), self.decoder)
 
     @property

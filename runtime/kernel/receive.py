@@ -19,8 +19,8 @@ from pans.runtime.core import stream_kernels as core
 from pans.runtime.core.stream_kernels import FrameWalkArrays, IdleArrays, WalkArrays
 from pans.runtime.flow.kernels import FlowWalk
 from pans.runtime.timing.evidence import OVERSLEPT_NS
-from pans.runtime.wire import kernels as wire
-from pans.runtime.wire import walk as stream
+from pans.runtime.wire import wire_kernels as stream
+from pans.runtime.wire import wire_kernels as wire
 from pans.runtime.wire.bare import bare, copy_span, load4
 from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, MessageType

@@ -58,7 +58,7 @@ class Rings(NamedTuple):
 
 
 class Decoder(NamedTuple):
-    """The arrays of a wire.bulk.BulkDecoder."""
+    """The arrays of a wire.framing.FrameDecoder."""
 
     buffer: U8
     bodies: I64

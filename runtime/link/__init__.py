@@ -1,7 +1,7 @@
-"""A port: from a device URL to stamped bytes, and a session on them.
+"""From a device URL to stamped bytes, and a session on them up to arming.
 
-Owns the schemes (`serial:`, `usb:`, and those of the entry points `pans.devices`), the thread that reads, and the conversation before
-arming. It never interprets clicks and never decides how a run goes on when a device is lost (live).
+What comes in are URLs (`serial:`, `usb:`, and the schemes of the entry points `pans.devices`), a plan and a bundle; what goes out are
+frames with the time of their arrival. Start with base.py, then connection.py; what a run does when a device is lost is in live.
 
 >>> from pans.runtime.link import open_link
 >>> open_link("nothing")

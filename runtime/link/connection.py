@@ -1,8 +1,7 @@
 """A session on an open link: moves bytes between them, and does the steps before arming.
 
-Owns the pump (read, decode, answer, send) and the conversation of set-up: handshake, checks, uploads, clock. Never interprets
-clicks. `pump` returns the stream frames that came, stamped; the set-up calls return when the device has agreed, or raise
-LinkError (it is silent or gone) or DeviceError (it refused).
+`pump` reads, decodes, answers and sends; it returns the stream frames that came, stamped. The calls of the set-up (handshake, upload,
+clock) return when the device has agreed, or raise LinkError (it is silent or gone) or DeviceError (it refused).
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.errors import DeviceError, LinkError, PansError
 from pans.runtime.timing.clock import ClockModel, ClockStep
 from pans.runtime.timing.evidence import Evidence, Stamped
-from pans.runtime.wire.fields import wrong_facts
 from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome, pack_body
+from pans.runtime.wire.schema import wrong_facts
 from pans.runtime.wire.session import ANSWER_TYPES, HostSession
 
 from .base import Link

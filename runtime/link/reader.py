@@ -1,6 +1,6 @@
 """Stamped chunks from a link: the loop reads for itself while it waits, and a helper thread reads while the loop is busy.
 
-Owns who reads, the queue between the two, and the reader's death; never looks into the bytes. A hand-over between threads costs more
+A hand-over between threads costs more
 than a round trip to the instrument, so whoever waits for bytes reads them: `wait` takes the lock on reading. When the loop has been
 busy for longer than LOOK_EVERY_S, the helper thread reads into the queue, and hands reading back when `wait` is called. Every
 chunk is stamped right after its read by whoever read it, and one reader at a time keeps their order.

@@ -1,6 +1,6 @@
 """pyserial behind the Link protocol: device files, COM ports, pseudo-terminals, `socket://`, and URL handlers of other packages.
 
-Owns the port and what its errors mean; never looks into the bytes. Devices are named by VID:PID:SERIAL, since ttyUSB0 may be another
+Devices are named by VID:PID:SERIAL, since ttyUSB0 may be another
 one tomorrow. Opening raises LinkError that tells apart: not there, no permission, busy.
 """
 

@@ -1,6 +1,6 @@
 """pyusb behind the Link protocol: one bulk endpoint in each direction of the first interface that has both.
 
-Owns the claimed interface and what USB errors mean; never looks into the bytes. Opening raises LinkError that tells apart: no libusb, not
+Opening raises LinkError that tells apart: no libusb, not
 there, several, no permission, busy.
 """
 

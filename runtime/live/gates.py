@@ -100,7 +100,6 @@ class SecondInstrument:
             connection.session.submit(Opcode.LOAD_PLAN, pack_plan(chunk))
         connection.settle()
         connection.synchronise()
-        connection.decoder.use_kernels()
         self._arm()
         connection.settle()
 

@@ -190,7 +190,6 @@ def open_session(
         if uploaded is not None:
             uploaded()
         connection.synchronise()
-        connection.decoder.use_kernels()
     except BaseException:
         connection.detach()
         failed.append(connection)

@@ -87,7 +87,7 @@ class Receiver:
         if self._attached is run.connection:
             return
         self._attached = run.connection
-        nonce, bulk = run.connection.session.nonce, run.connection.decoder.bulk
+        nonce, bulk = run.connection.session.nonce, run.connection.decoder
         assert bulk is not None
         drive = None if run.driver is None else run.driver.arrays(nonce)
         self._kernel = Kernel(self._core.steps(nonce), bulk, drive)

@@ -27,10 +27,9 @@ from pans.runtime.record.recorder import repeated_setup
 from pans.runtime.timing.clock_check import future_tick
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
-from pans.runtime.wire.fields import LARGEST_TICK
-from pans.runtime.wire.frame import Frame
+from pans.runtime.wire.framing import Frame
 from pans.runtime.wire.messages import DeviceState, MessageType, Opcode, StateReason, decode_status, pack_body
-from pans.runtime.wire.schema import MalformedMessage
+from pans.runtime.wire.schema import LARGEST_TICK, MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
 from .config import Receives

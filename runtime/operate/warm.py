@@ -64,10 +64,10 @@ def load_ahead() -> None:
 
     from pans.runtime.kernel.receive import unpack_blocks
     from pans.runtime.record.recorder import load_kernels
-    from pans.runtime.wire.bulk import BulkDecoder
+    from pans.runtime.wire.framing import FrameDecoder
 
     load_kernels()
-    BulkDecoder().warm_up()
+    FrameDecoder().warm_up()
     unpack_blocks(np.zeros(8, np.uint8), np.zeros((0, 4), np.int64), np.zeros(1, np.uint16), np.zeros(1, np.uint8))
     for name in LATER:
         import_module(f"pans.runtime.{name}")

@@ -15,12 +15,19 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan
-from pans.runtime.wire.fields import MAX_PHOTON_NUMBER
-from pans.runtime.wire.frame import Messages
+from pans.runtime.wire.framing import Messages
 from pans.runtime.wire.messages import DARK_PATTERN, MessageType
-from pans.runtime.wire.schema import BLOCK_DTYPE, BLOCK_HEADER_BYTES, HEADER, MARK_DTYPE
+from pans.runtime.wire.schema import (
+    BLOCK_DTYPE,
+    BLOCK_HEADER_BYTES,
+    HEADER,
+    MARK_DTYPE,
+    MAX_GAP_EXPOSURES,
+    MAX_PHOTON_NUMBER,
+    RECEIVE_WINDOW,
+)
 from pans.runtime.wire.session import STREAM_TYPES
-from pans.runtime.wire.tracker import MAX_GAP_EXPOSURES, RECEIVE_WINDOW, SEQUENCE, StreamTracker
+from pans.runtime.wire.tracker import SEQUENCE, StreamTracker
 
 from .recording import Recording
 

@@ -31,7 +31,7 @@ from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.html_card import html_card
 from pans.runtime.timing.clock import CLOCK_DTYPE
-from pans.runtime.wire.frame import Messages
+from pans.runtime.wire.framing import Messages
 
 from .format import (
     FORMAT_VERSION,

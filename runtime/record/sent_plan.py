@@ -28,7 +28,6 @@ from pans.runtime.wire.commands import (
     unpack_show,
     unpack_states,
 )
-from pans.runtime.wire.fields import MAX_PHOTON_NUMBER
 from pans.runtime.wire.messages import (
     CommandMessage,
     Frame,
@@ -38,6 +37,7 @@ from pans.runtime.wire.messages import (
     Opcode,
     decode_command,
 )
+from pans.runtime.wire.schema import MAX_PHOTON_NUMBER
 
 from .recording import Recording
 

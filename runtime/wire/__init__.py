@@ -1,8 +1,7 @@
-"""Protocol 1 without I/O, for both ends: bytes to messages and back, the host's session, and what of a stream was lost.
+"""The wire protocol, version 1, without I/O and for both ends: bytes to messages and back, the host's session, the account of losses.
 
-Owns the layouts of docs/reference/protocol.md, framing and checksums, and the account of sequence numbers. Opens no port and reads no
-clock: bytes and times are arguments. Nothing is compiled until `FrameDecoder.use_kernels`. Messages have an `encode_*` and a `decode_*`
-each in wire.messages, the bodies of commands a `pack_*` and an `unpack_*` in wire.commands.
+What comes in are bytes and times; what goes out are frames, named tuples, bytes to send and gaps. docs/reference/protocol.md is the
+specification; start with framing.py, then messages.py, commands.py and session.py.
 
 >>> from pans.runtime.wire import FrameDecoder, Mark, MessageType, encode_mark
 >>> sent = encode_mark(Mark(seq=0, object_index=7, truth=2, exposure_index=0, tick=1000, photons=4.5), session=1)
@@ -10,8 +9,7 @@ each in wire.messages, the bodies of commands a `pack_*` and an `unpack_*` in wi
 [('MARK', 1)]
 """
 
-from .frame import Frame, Messages
-from .framing import FrameDecoder, encode_frame
+from .framing import Frame, FrameDecoder, Messages, encode_frame
 from .messages import (
     ClickBlock,
     FrameBlock,

@@ -1,11 +1,11 @@
 """What kernels need and numba has not: arrays without a count of references, bytes as numbers.
 
-Owns the intrinsics. A kernel that takes an array out of a tuple counts a reference, and again when it lets go: two locked
+A kernel that takes an array out of a tuple counts a reference, and again when it lets go: two locked
 additions each time, which for a block of one exposure added up to most of its time. A bare array owns nothing and counts nothing; its
 memory must outlive the call, as the arguments of a call do.
 
-What they do could be said in loops over bytes, too. Those would be inlined into every kernel that calls them, and optimised there once
-more: intrinsics are one instruction from the beginning.
+Loops over bytes could do the same, but would be inlined and optimised anew in every kernel that calls them; an intrinsic is one
+instruction from the beginning.
 """
 
 from __future__ import annotations

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .fields import MAX_PHOTON_NUMBER, U16_MAX
 from .messages import MAX_PAYLOAD_BYTES, SLOT_DTYPE, STRUCTS, U8, U16, MalformedMessage, fields
-from .schema import AUTOMATON_SCHEMA, COUNT_SCHEMA, STATE_DTYPE
+from .schema import AUTOMATON_SCHEMA, COUNT_SCHEMA, MAX_PHOTON_NUMBER, STATE_DTYPE, U16_MAX
 
 SEQUENTIAL, PARALLEL = 0, 1
 MODES = {"sequential": SEQUENTIAL, "parallel": PARALLEL}

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from .frame import DecoderCounters, Frame
 from .schema import HEADER, MAX_FRAME_BYTES, MAX_PAYLOAD_BYTES, SCHEMA, UNSEEDED, MalformedMessage
 
 CHUNK_BYTES = 1 << 18  # decoded at a time: large against a frame, small against a level-2 cache
@@ -20,10 +21,78 @@ SMALLEST_FRAME_BYTES = 14  # on the wire: header, CRC, a code byte and the delim
 
 U8 = npt.NDArray[np.uint8]
 I64 = npt.NDArray[np.int64]
-
+Scalar = TypeVar("Scalar", bound=np.generic)
 _LONG = 512  # from about here on arrays are quicker: ten microseconds in any case
 _CODES = tuple(bytes((length + 1,)) for length in range(254))
 _CRC_SEEDS = tuple(0 if message_type in UNSEEDED else SCHEMA for message_type in range(256))
+
+
+class Frame(NamedTuple):
+    """One whole frame whose CRC was right."""
+
+    type: int
+    flags: int
+    session: int
+    payload: bytes
+
+
+def pack_body(frame: Frame) -> bytes:
+    """Return header and payload as they stood inside the frame: what a recording keeps."""
+    return HEADER.pack(frame.type, frame.flags, 0, frame.session) + frame.payload
+
+
+def unpack_body(body: bytes) -> Frame:
+    """Invert `pack_body`; MalformedMessage when there is no whole header."""
+    if len(body) < HEADER.size:
+        raise MalformedMessage(f"a message has {len(body)} bytes, at least {HEADER.size} expected")
+    message_type, flags, _, session = HEADER.unpack_from(body)
+    return Frame(message_type, flags, session, body[HEADER.size :])
+
+
+def content_crc(frame: Frame) -> int:
+    """Return the CRC-32 that a stream frame has on the wire with flags and reserved bits 0: those are ignored (rule 1.10)."""
+    return zlib.crc32(frame.payload, zlib.crc32(HEADER.pack(frame.type, 0, 0, frame.session), SCHEMA))
+
+
+class Messages(NamedTuple):
+    """Stream messages of one read, decoded: bodies (header and payload) at the spans int64 (n, 2) of `buffer` uint8.
+
+    Both belong to the decoder and are valid until it is given the next bytes.
+    """
+
+    buffer: npt.NDArray[np.uint8]
+    spans: npt.NDArray[np.int64]
+
+    def frame(self, place: int) -> Frame:
+        """Return message `place` as a frame of its own."""
+        first, stop = self.spans[place].tolist()
+        return unpack_body(self.buffer[first:stop].tobytes())
+
+
+@dataclass(slots=True)
+class DecoderCounters:
+    """What the decoder has seen since it was made; every byte is in a good frame or counted as discarded."""
+
+    frames: int = 0
+    bytes_in: int = 0
+    crc_errors: int = 0
+    cobs_errors: int = 0
+    short_frames: int = 0
+    oversized_frames: int = 0
+    bytes_discarded: int = 0
+
+
+def read_only(array: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
+    """Return a view that cannot be written to, as those of a message are.
+
+    To the compiler an array that can be written to is another type, for which it compiles every kernel that the array reaches once more.
+
+    >>> read_only(np.zeros(2)).flags.writeable
+    False
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def cobs_encode(data: bytes) -> bytes:
@@ -66,7 +135,7 @@ class FrameDecoder:
     """
 
     def __init__(self) -> None:
-        from . import kernels  # numba is loaded only by who decodes
+        from . import wire_kernels as kernels  # numba is loaded only by who decodes
 
         self._kernels = kernels
         self._raw = bytearray(MAX_FRAME_BYTES + CHUNK_BYTES)
@@ -81,7 +150,7 @@ class FrameDecoder:
         """What has been seen since the decoder was made."""
         kernels, tally = self._kernels, self._tally.tolist()
         return DecoderCounters(
-            frames=tally[kernels.FRAMES],
+            frames=tally[kernels.GOOD_FRAMES],
             bytes_in=tally[kernels.BYTES_IN],
             crc_errors=tally[kernels.CRC_ERRORS],
             cobs_errors=tally[kernels.COBS_ERRORS],
@@ -109,8 +178,13 @@ class FrameDecoder:
 
         The iterator must be used up: it takes `data` in as it goes.
         """
-        for first in range(0, len(data), CHUNK_BYTES):
-            yield self.take(bytes(data[first : first + CHUNK_BYTES]))
+        for piece in self.pieces(bytes(data)):
+            yield self.take(piece)
+
+    @staticmethod
+    def pieces(data: bytes) -> list[bytes]:
+        """Return `data` in pieces that `take` takes."""
+        return [data[first : first + CHUNK_BYTES] for first in range(0, max(1, len(data)), CHUNK_BYTES)]
 
     def take(self, data: bytes) -> I64:
         """Return the spans (n, 2) in `buffer` of what at most CHUNK_BYTES of `data` complete, valid until the next bytes."""
@@ -125,23 +199,3 @@ class FrameDecoder:
     def warm_up(self) -> None:
         """Compile or load the kernels, without counting anything."""
         self._kernels.take_in(b"", self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, np.zeros_like(self._tally))
-
-    # until the live loop has one kernel
-
-    @property
-    def bulk(self) -> FrameDecoder:
-        """Return the decoder itself."""
-        return self
-
-    def use_kernels(self) -> None:
-        """Compile or load the kernels."""
-        self.warm_up()
-
-    @staticmethod
-    def pieces(data: bytes) -> list[bytes]:
-        """Return `data` in pieces that `take` takes."""
-        return [data[first : first + CHUNK_BYTES] for first in range(0, max(1, len(data)), CHUNK_BYTES)]
-
-    def stream_stop(self, spans: I64, first: int, session: int) -> int:
-        """Return the place of the first of `spans` from `first` on that is no stream message of `session`."""
-        return int(self._kernels.stream_stop(self.buffer, spans, first, session))

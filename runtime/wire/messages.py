@@ -1,8 +1,7 @@
-"""The wire protocol's messages, version 1: named tuples <-> bytes, both ends (docs/reference/protocol.md is its specification).
+"""The wire protocol's messages, version 1: named tuples to bytes and back, for both ends (docs/reference/protocol.md specifies them).
 
-Owns what a message means; the tables are schema.py's and the framing framing.py's, and both are offered from here too. Never reads
-a clock, opens a port or keeps click state. `encode_*` return bytes ready to send; `decode_*` turn a frame's payload into a named tuple
-or raise `MalformedMessage`, which callers count.
+`encode_*` return bytes ready to send; `decode_*` turn a frame's payload into a named tuple or raise `MalformedMessage`, which callers
+count. The names of schema.py and framing.py are offered from here too.
 """
 
 from __future__ import annotations
@@ -15,16 +14,16 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
-from .fields import FACTS, FROM_DEVICE, LARGEST_TICK, narrow_fields
-from .frame import Frame as Frame
-from .frame import pack_body as pack_body
-from .frame import unpack_body as unpack_body
+from .framing import Frame as Frame
 from .framing import FrameDecoder as FrameDecoder
 from .framing import cobs_encode as cobs_encode
 from .framing import encode_frame as encode_frame
+from .framing import pack_body as pack_body
+from .framing import unpack_body as unpack_body
 from .schema import ADAPTIVE_PATTERN as ADAPTIVE_PATTERN
 from .schema import BLOCK_HEADER_BYTES as BLOCK_HEADER_BYTES
 from .schema import DARK_PATTERN as DARK_PATTERN
+from .schema import FACTS, FROM_DEVICE, LARGEST_TICK, narrow_fields
 from .schema import HEADER as HEADER
 from .schema import LAYOUTS as LAYOUTS
 from .schema import MAX_ACK_TEXT_BYTES as MAX_ACK_TEXT_BYTES

@@ -1,7 +1,7 @@
 """The host's end of a session, sans-I/O: handshake, commands until acknowledged, window and lease.
 
-Owns command ids and retransmission; never opens a port, reads a clock or keeps clicks. Frames and times go in through `on_frame`
-and `poll`; bytes to send come out of `take_output`. Failures that end the session raise LinkError or DeviceError.
+Frames and times go in through `on_frame` and `poll`; bytes to send come out of `take_output`. Failures that end the session raise
+LinkError or DeviceError.
 """
 
 from __future__ import annotations

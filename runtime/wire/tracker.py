@@ -1,6 +1,6 @@
 """Stream messages -> blocks in order, with every gap made visible.
 
-Owns the stream's sequence and the loss accounting; never retransmits, never decides. `StreamTracker.accept` returns the block or
+`StreamTracker.accept` returns the block or
 mark of a stream frame (None when it is damaged or repeated) and the gap before it (None when there is none). A repeat is compared with
 the message whose number it has: `differs` says where it holds something else.
 """
@@ -14,15 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from . import messages as wire
-from .frame import content_crc
+from .framing import content_crc
 from .messages import ClickBlock, Frame, FrameBlock, Mark, MessageType, decode_counts
+from .schema import MAX_GAP_EXPOSURES, RECEIVE_WINDOW
 
 SEQUENCE = 1 << 32
 HALF_SEQUENCE = 1 << 31
-# a number further ahead is nonsense: believing it would mean seconds of empty windows at once
-MAX_GAP_EXPOSURES = 1 << 18
-# no device sends beyond the host's window, which begins at the next sequence number
-RECEIVE_WINDOW = 4096
 MEMORY_BYTES = RECEIVE_WINDOW * 4 + RECEIVE_WINDOW // 8  # of StreamTracker.memory
 
 
@@ -40,7 +37,7 @@ class Gap(NamedTuple):
 
 
 class Differs(NamedTuple):
-    """A repeat of another content than the message that came first under its number: the CRC-32 of both (frame.content_crc)."""
+    """A repeat of another content than the message that came first under its number: the CRC-32 of both (framing.content_crc)."""
 
     exposure_index: int
     found: int
@@ -76,7 +73,7 @@ class StreamTracker:
         self._drops = 0
         self._lost_messages = 0  # since the last click block: reported with the next gap in the exposures
         self._finished = False
-        # number and CRC-32 of what was taken last, in row number % RECEIVE_WINDOW; kernels write to it too (walk.note_heard)
+        # number and CRC-32 of what was taken last, in row number % RECEIVE_WINDOW; kernels write to it too (wire_kernels.hear)
         self.heard: npt.NDArray[np.int64] = np.full((RECEIVE_WINDOW, 2), -1, np.int64)
         self.differs: Differs | None = None  # of the latest frame
 
@@ -153,7 +150,7 @@ class StreamTracker:
         return (self.next_seq - RECEIVE_WINDOW + np.arange(RECEIVE_WINDOW)) % SEQUENCE
 
     def advance(self, position: tuple[int, int], messages: int, exposures: int) -> None:
-        """Account for messages in order and without loss that were taken elsewhere (walk.py), `exposures` of them in blocks."""
+        """Account for messages in order and without loss that were taken by the kernel, `exposures` of them in blocks."""
         self.next_seq, self.next_exposure = position
         self.counters.messages += messages
         self.counters.exposures += exposures

@@ -6,7 +6,7 @@ import numpy as np
 
 from pans.firmware_sim.program import Exposures, Program
 from pans.runtime.wire.commands import SEQUENTIAL
-from pans.runtime.wire.fields import LARGEST_TICK
+from pans.runtime.wire.schema import LARGEST_TICK
 
 LONGEST_CYCLE, MOST_CYCLES = 1 << 48, (1 << 32) - 1  # docs/reference/protocol.md
 

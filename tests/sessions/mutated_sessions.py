@@ -35,9 +35,7 @@ from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.report.summary import Summary, summarise
 from pans.runtime.wire import messages
-from pans.runtime.wire.fields import ALL_MESSAGES, AUTOMATON_MESSAGES, Field, wrong_facts
-from pans.runtime.wire.frame import Frame
-from pans.runtime.wire.framing import FrameDecoder, encode_frame
+from pans.runtime.wire.framing import Frame, FrameDecoder, encode_frame
 from pans.runtime.wire.messages import (
     BLOCK_HEADER_BYTES,
     NO_OBJECT,
@@ -48,6 +46,7 @@ from pans.runtime.wire.messages import (
     Opcode,
     decode_counts,
 )
+from pans.runtime.wire.schema import ALL_MESSAGES, AUTOMATON_MESSAGES, Field, wrong_facts
 
 COMMANDS = ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE", "READ_COUNTS", "LOAD_COUNT_STATES")
 BODIES = {  # of commands: which of them holds the layout, and where in the payload it begins; of rows, the first

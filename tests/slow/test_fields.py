@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mutated_sessions import LAYOUTS, MISSING, STAMP, Mutation, Stage, by, to
 
-from pans.runtime.wire.fields import FACTS
+from pans.runtime.wire.schema import FACTS
 
 pytestmark = pytest.mark.slow
 

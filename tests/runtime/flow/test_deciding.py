@@ -15,12 +15,12 @@ from pans.runtime.core.decision import DecisionFlag, Output, joined
 from pans.runtime.decide.table import TableDecider
 from pans.runtime.flow import kernels
 from pans.runtime.flow.core import FlowCore
+from pans.runtime.instrument.channel_health import DeadChannelTest
 from pans.runtime.instrument.cusum import ChannelWatch
-from pans.runtime.instrument.dead_channels import DeadChannelTest
 from pans.runtime.kernel import state as ring
 from pans.runtime.kernel.calls import Kernel
 from pans.runtime.live.flow_run import settled_blocks
-from pans.runtime.wire.bulk import BulkDecoder
+from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import MessageType, encode_frame
 
 TAPE = {"kind": "tape", "bars_per_s": 20_000.0}
@@ -39,7 +39,7 @@ TABLES = {shots: table(shots) for shots in (1, 2)}
 
 def by_turn(core: FlowCore, data: bytes, cuts: list[int]) -> Output:
     """The kernel, and what it leaves to the core by `step`."""
-    turn, output = Kernel(core.steps(SESSION), BulkDecoder()), NOTHING
+    turn, output = Kernel(core.steps(SESSION), FrameDecoder()), NOTHING
     for first, stop in zip([0, *cuts], [*cuts, len(data)]):
         ended = turn.feed([(1, data[first:stop])])
         while True:

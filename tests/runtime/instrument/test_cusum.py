@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from naive_watch import NaiveTest
 
 from pans.runtime.instrument.cusum import (
     ALL_CHANNELS,
     SUM,
     ChannelWatch,
+    CusumDesign,
     WatchSettings,
     design_cusum,
     run_length,
@@ -83,6 +83,17 @@ def test_what_is_no_test_is_refused(rate: float, ratio: float) -> None:
         design_cusum(rate, ratio, 1e6)
 
 
+def naive_alarms(design: CusumDesign, bits: np.ndarray) -> tuple[list[int], int]:
+    """Follow one sum trial by trial; return the trials taken at each alarm, and the sum."""
+    total, alarms = 0, []
+    for trial, bit in enumerate(bits.ravel(), 1):
+        total = max(0, total + (design.click_step if bit else design.silent_step))
+        if total >= design.threshold:
+            alarms.append(trial)
+            total = 0
+    return alarms, total
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -101,18 +112,16 @@ def test_watch_is_exact_for_every_exposure(seed: int, n_channels: int, rate: flo
         for alarm in watch.update_words(np.ascontiguousarray(part))
     ]
     for row, (name, channel, design) in enumerate(watch.designs):
-        naive = NaiveTest(design.threshold, design.click_step, design.silent_step)
-        for bit in (bits if channel == ALL_CHANNELS else bits[:, channel]).ravel():
-            naive.take(int(bit))
+        expected, total = naive_alarms(design, bits if channel == ALL_CHANNELS else bits[:, channel])
         found = [alarm for alarm in alarms if (alarm.test, alarm.channel) == (name, channel)]
         trials = n_channels if channel == ALL_CHANNELS else 1
         late = name == "fall"  # passed in silence: the trial before which the threshold was reached
-        assert len(found) == len(naive.alarms)
-        for alarm, trial in zip(found, naive.alarms):
+        assert len(found) == len(expected)
+        for alarm, trial in zip(found, expected):
             assert alarm.exposure in ({trial} if trials == 1 or late else {-(-trial // trials), trial // trials + 1})
             if trials == 1:
                 assert alarm.clicks[channel] == bits[alarm.since : alarm.exposure, channel].sum()
-        assert watch._state[row, SUM] == naive.total
+        assert watch._state[row, SUM] == total
     assert watch.clicks.tolist() == bits.sum(axis=0).tolist()
     assert watch.exposures == 400
     assert watch.dropped_alarms == 0
@@ -135,6 +144,17 @@ def test_blocks_of_counts_stay_within_their_bound(seed: int, size: int) -> None:
             down = -min(design.click_step, design.silent_step)
             if design.click_step > 0:
                 assert below[row] <= down * size * (3 if channel == ALL_CHANNELS else 1)
+
+
+def test_a_block_of_counts_that_passes_a_threshold_is_an_alarm_with_its_clicks() -> None:
+    watch = ChannelWatch(3, np.full(3, 0.01), WatchSettings(arl_exposures=1e4))
+    assert watch.update(100, np.array([1, 1, 1])) == []
+    alarms = watch.update(1000, np.array([10, 90, 10]))
+    rise = next(alarm for alarm in alarms if alarm.test == "rise")
+    assert (rise.channel, rise.exposure) == (1, 1100)
+    assert rise.rate == pytest.approx(0.09, rel=0.1)
+    assert "fall" not in {alarm.test for alarm in alarms}
+    assert watch.update(100, np.array([1, 1, 1])) == []  # the sums began again
 
 
 def test_counters_beyond_32_bits() -> None:

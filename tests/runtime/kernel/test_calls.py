@@ -45,7 +45,6 @@ from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_li
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.live.loop import NO_OBSERVERS
 from pans.runtime.record import Recorder, read_recording, replay
-from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.commands import unpack_show
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, Ack, Opcode, decode_command, encode_ack, pack_body
@@ -250,7 +249,7 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
     core.begin(0, 0)
     steps = core.steps(SESSION)
     drive = HostDriver(core, WalkPlace(setup.plan, setup.plan.automaton)).arrays(SESSION)
-    turn = Kernel(steps, BulkDecoder(), drive)
+    turn = Kernel(steps, FrameDecoder(), drive)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         ours.setblocking(False)

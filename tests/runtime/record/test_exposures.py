@@ -17,8 +17,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.pages.rates import count_rates
 from pans.runtime.record import exposures
 from pans.runtime.record.exposures import iter_exposures
-from pans.runtime.wire.frame import Messages, pack_body, unpack_body
-from pans.runtime.wire.framing import FrameDecoder
+from pans.runtime.wire.framing import FrameDecoder, Messages, pack_body, unpack_body
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
     ClickBlock,
@@ -29,9 +28,9 @@ from pans.runtime.wire.messages import (
     encode_frames,
     encode_mark,
 )
-from pans.runtime.wire.schema import HEADER
+from pans.runtime.wire.schema import HEADER, MAX_GAP_EXPOSURES, RECEIVE_WINDOW
 from pans.runtime.wire.session import STREAM_TYPES
-from pans.runtime.wire.tracker import MAX_GAP_EXPOSURES, RECEIVE_WINDOW, StreamTracker
+from pans.runtime.wire.tracker import StreamTracker
 
 N = 5  # patterns, or channels
 

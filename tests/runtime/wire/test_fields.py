@@ -13,18 +13,24 @@ from inner_kernels import called
 from tree import ROOT
 
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire import walk
-from pans.runtime.wire.fields import ALL_MESSAGES, FACTS, FROM_DEVICE, LARGEST_TICK, Fact, Field, wrong_facts
+from pans.runtime.wire import wire_kernels as walk
 from pans.runtime.wire.messages import MalformedMessage, decode_counts, decode_welcome
 from pans.runtime.wire.schema import (
+    ALL_MESSAGES,
     AUTOMATON_SCHEMA,
     AUTOMATON_SCHEMA_TEXT,
     COUNT_SCHEMA,
     COUNT_SCHEMA_TEXT,
+    FACTS,
+    FROM_DEVICE,
+    LARGEST_TICK,
     LAYOUTS,
     SCHEMA,
     SCHEMA_TEXT,
     STRUCTS,
+    Fact,
+    Field,
+    wrong_facts,
 )
 
 DOCUMENT = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")

@@ -13,9 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from inner_kernels import called
 
-from pans.runtime.wire import kernels as wire_kernels
-from pans.runtime.wire.frame import DecoderCounters, Frame, unpack_body
-from pans.runtime.wire.framing import CHUNK_BYTES, FrameDecoder, cobs_encode, encode_frame
+from pans.runtime.wire import wire_kernels as wire_kernels
+from pans.runtime.wire.framing import (
+    CHUNK_BYTES,
+    DecoderCounters,
+    Frame,
+    FrameDecoder,
+    cobs_encode,
+    encode_frame,
+    unpack_body,
+)
 from pans.runtime.wire.schema import MAX_FRAME_BYTES, MAX_PAYLOAD_BYTES, SCHEMA
 
 
