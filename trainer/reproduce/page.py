@@ -192,9 +192,9 @@ class Table:
             heads += dict.fromkeys(self.across.cell(row) for row in mine)
         return [
             *([f"### {self.heading}", ""] if self.heading else []),
-            " | ".join(heads),
+            "|".join(heads),
             "|".join(["---"] * len(heads)),
-            *(" | ".join(cells) for cells in body),
+            *("|".join(cells) for cells in body),
             "",
             *(line for claim in self.claims for line in (_counted(*claim, mine), "")),
         ]

@@ -48,17 +48,17 @@ TEXT = """SIMULATED. Command: `pans reproduce name`. Trainings: one.
 
 ### Rows
 
-d_f | all | clicks
+d_f|all|clicks
 ---|---|---
-3 | 50.00 | -
-4 | 60.00 | 2.0
+3|50.00|-
+4|60.00|2.0
 
 Ours against theirs: 1 above, 1 level, 0 below, of 2.
 
-way | 5 | 9
+way|5|9
 ---|---|---
-x | 10 | 20
-y | - | 30
+x|10|20
+y|-|30
 
 ### With clicks
 
@@ -118,7 +118,7 @@ def test_the_tables_of_the_results_are_those_of_their_json(name):
     block = generated(RESULTS, page)
     assert block in text
     assert all(f"({name}{ending}.png)" in block for ending in page.captions)
-    assert " | " in block
+    assert "|" in block
 
 
 def test_the_results_have_no_file_that_no_page_shows():
