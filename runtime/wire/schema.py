@@ -1,7 +1,7 @@
 """The message dictionary of protocol 1 (docs/reference/protocol.md): fields, ranges, units, WELCOME's keys, and the tables made from them.
 
 messages.py checks with them what a device sends, wire_kernels.py does so in compiled code, and tests/runtime/wire/test_fields.py compares
-them with the document. What a field must be beside the others, the plan or the clock is not here: core/plausible.py and
+them with the document. What a field must be beside the others, the plan or the clock is not here: core/follower.py and
 timing/clock_check.py judge that.
 
 The largest numbers of the whole path:
