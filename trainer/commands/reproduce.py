@@ -63,7 +63,7 @@ def _run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say(f"interrupted; finished rows and the row in work are in {cache}\n  to resume: the same command")
         return EXIT_INTERRUPTED
-    text = "\n\n".join(page.whole(one.rows, page.drawn(one).pictures) for page, one in zip(pages, made))
+    text = "\n\n".join(page.block(one.rows, page.drawn(one).pictures) for page, one in zip(pages, made))
     emit(args, {"rows": [row for one in made for row in one.rows], "simulated": True}, text)
     return EXIT_FINE
 
@@ -75,7 +75,7 @@ def _rewrite(args: argparse.Namespace) -> int:
     rows = [row for name in names for row in read_rows(args.out, name)]
     for name in names:
         rewrite_page(args.out, page_of(name))
-    emit(args, {"rows": rows, "simulated": True}, "\n".join(f"{args.out / page_of(name).file}.md" for name in names))
+    emit(args, {"rows": rows, "simulated": True}, "\n".join(f"{args.out / page_of(name).markdown}" for name in names))
     return EXIT_FINE
 
 

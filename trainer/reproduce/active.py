@@ -8,6 +8,7 @@ objects choose between restarts: the test images are used once, at the end.
 from __future__ import annotations
 
 import json
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -160,12 +161,7 @@ def row_beside(name: str, row: ActiveRow, trained: Rows) -> Rows:
     compared = against(
         one["value"], direct["value"], one["error_objects"], spread(trained, "all", 1), direct["error_objects"]
     )
-    facts = {
-        "features": row.features,
-        "direct": direct["value"],
-        "trainings": len(trained),
-        "minutes": first["cpu_seconds"] / 60,
-    }
+    facts: Row = {"features": row.features, "direct": direct["value"], "trainings": len(trained)}
     rows.append({"table": "direct"} | one | facts | compared)
     for other in others:
         facts = {"table": "seeds", "features": row.features, "seed": other["options"]["seed"]}
@@ -188,8 +184,7 @@ def beside_paper(row: ActiveRow, shots: int, figures: Row, trained: Rows) -> Row
 def spread(trained: Rows, part: str, shots: int) -> float:
     """Return the spread of one training in points, of trainings with several seeds; 0 where it is not known."""
     values = [100 * found[part][str(shots)]["accuracy_mean"] for found in trained]
-    mean = sum(values) / len(values)
-    return float((sum((v - mean) ** 2 for v in values) / (len(values) - 1)) ** 0.5) if len(values) > 1 else 0.0
+    return statistics.stdev(values) if len(values) > 1 else 0.0
 
 
 def direct_at(name: str, photons: float, of: str = "value") -> float:

@@ -18,7 +18,7 @@ from pans.trainer.tasks.registry import load_task
 
 from .active import OTHER_SEEDS, finished_row, shot_figures
 from .dynamics import ALPHAS, training
-from .page import FIRST_OBJECTS, Asked, Made, Row, Rows, against, by_epoch, flat, interpolated, kept, sampling_error
+from .page import FIRST_OBJECTS, Asked, Made, Row, Rows, against, beside_curve, by_epoch, flat, kept, sampling_error
 from .printed import ACTIVE, DIRECT
 from .ways import measured_points
 
@@ -78,12 +78,7 @@ def fig_2e_page(asked: Asked) -> Made:
         mine: Row = {"table": "pans", "way": PANS, "features": row.features} | shot_figures(figures)
         for name, curve in (("direct", posterior), ("envelope", best)):
             for of in ("photons", "illumination"):
-                there, error = (interpolated(curve, mine[of], of, key) for key in ("value", "error_objects"))
-                if there is not None and error is not None:
-                    prefix = f"{name}_{of}_"
-                    mine |= {f"{prefix}value": there} | against(
-                        mine["value"], there, mine["error_objects"], error, prefix=prefix
-                    )
+                mine |= beside_curve(mine, curve, of, f"{name}_{of}_")
         pans.append(mine)
     return Made([*pans, *curves, *best])
 
@@ -224,19 +219,15 @@ def beside_direct(rows: Rows) -> Rows:
 
     Both errors count, as if the images were drawn for each: they are the same, so that the true error is smaller.
     """
+
+    def whole(row: Row) -> Row:
+        return row | {"error_objects": error_of(row)}
+
     found = []
     for row in rows:
-        for way, prefix in ((EXACT, ""), (STOPPING, "sure_")):
-            curve = [
-                other | {"error": error_of(other)}
-                for other in rows
-                if (other["task"], other["way"]) == (row["task"], way)
-            ]
-            there, error = (interpolated(curve, row["photons"], "photons", of) for of in ("value", "error"))
-            if row["way"] not in (EXACT, STOPPING) and there is not None and error is not None:
-                row = (
-                    row | {f"{prefix}direct": there} | against(row["value"], there, error_of(row), error, prefix=prefix)
-                )
+        for way, prefix in ((EXACT, ""), (STOPPING, "sure_")) if row["way"] not in (EXACT, STOPPING) else ():
+            curve = [whole(other) for other in rows if (other["task"], other["way"]) == (row["task"], way)]
+            row = row | beside_curve(whole(row), curve, "photons", prefix)
         found.append(row)
     return found
 

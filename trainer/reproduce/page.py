@@ -129,6 +129,16 @@ def interpolated(curve: Rows, place: float, of: str, value: str = "value") -> fl
     return float(np.interp(math.log(place), [math.log(x) for x, _ in known], [y for _, y in known]))
 
 
+def beside_curve(row: Row, curve: Rows, of: str, prefix: str = "", place: float | None = None) -> Row:
+    """Hold a row against a curve where that has as much of `of` (or `place` of it): its value as `there`, and the verdict; {} outside."""
+    there, error = (
+        interpolated(curve, row[of] if place is None else place, of, key) for key in ("value", "error_objects")
+    )
+    if there is None or error is None:
+        return {}
+    return {f"{prefix}there": there} | against(row["value"], there, row["error_objects"], error, prefix=prefix)
+
+
 # ---- tables ----
 
 _KEY = re.compile(r"\{(\w+)")
@@ -228,19 +238,19 @@ def _columns(parts: Iterable[Any]) -> tuple[Column, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """An entry of pages.toml: title, Markdown file (without .md), function that measures it, tables, captions of pictures.
+    """An entry of pages.toml: title, module:function that measures it, tables, captions of pictures, and its Markdown file if not NAME.md.
 
     `plots` names the [plots] entry of each picture that is drawn from the rows alone; the others are drawn by the module.
     """
 
     name: str
     title: str
-    file: str
     make: str
-    tables: tuple[Table, ...]
-    captions: Mapping[str, str]
     trainings: str
+    tables: tuple[Table, ...] = ()
+    pictures: Mapping[str, str] = field(default_factory=dict)
     plots: Mapping[str, str] = field(default_factory=dict)
+    file: str = ""
 
     def measure(self, asked: Asked) -> Made:
         """Measure the page, or collect what is finished."""
@@ -256,6 +266,11 @@ class Page:
         return Made(made.rows, {**pictures, **made.pictures})
 
     @property
+    def markdown(self) -> str:
+        """The name of the Markdown file, which several pages may share."""
+        return f"{self.file or self.name}.md"
+
+    @property
     def markers(self) -> tuple[str, str]:
         """The lines of the Markdown file between which the page is generated."""
         return f"<!-- {self.name}: begin -->", f"<!-- {self.name}: end -->"
@@ -266,41 +281,24 @@ class Page:
         for table in self.tables:
             lines += table.lines(rows)
         for ending in pictures:
-            lines += [f"![{self.captions.get(ending, ending)}]({self.name}{ending}.png)", ""]
+            lines += [f"![{self.pictures.get(ending, ending)}]({self.name}{ending}.png)", ""]
         begin, end = self.markers
         return "\n".join([begin, "", *lines, end])
 
-    def whole(self, rows: Rows, pictures: Iterable[str]) -> str:
-        """Return the page where nothing was written by hand."""
-        return f"# {self.title}\n\n{self.block(rows, pictures)}\n"
-
     def files(self, folder: Path) -> list[Path]:
         """Return the page's files in `folder`."""
-        ends = (f"{self.name}.json", f"{self.file}.md", *(f"{self.name}{one}.png" for one in self.captions))
+        ends = (f"{self.name}.json", self.markdown, *(f"{self.name}{one}.png" for one in self.pictures))
         return [folder / end for end in ends]
 
 
 def page_of(name: str) -> Page:
     """Return the page of that name; KeyError for a name that is not in `NAMES`."""
-    facts: Row = dict(_FILE["page"][name])
+    facts = _FILE["page"][name]
     tables = []
     for one in facts.get("tables", ()):
-        across = Column(*one["across"]) if "across" in one else None
-        claims = tuple(tuple(claim) for claim in one.get("claims", ()))
-        columns = _columns(one["columns"])
-        tables.append(
-            Table(
-                one["of"],
-                columns,
-                one.get("heading", ""),
-                claims,
-                across,
-                one.get("cell", ""),
-                one.get("needs", "table"),
-            )
-        )
-    captions, trainings, plots = facts.get("pictures", {}), facts["trainings"], facts.get("plots", {})
-    return Page(name, facts["title"], facts.get("file", name), facts["make"], tuple(tables), captions, trainings, plots)
+        parts = {"columns": _columns(one["columns"]), "claims": tuple(map(tuple, one.get("claims", ())))}
+        tables.append(Table(**one | parts | ({"across": Column(*one["across"])} if "across" in one else {})))
+    return Page(**facts | {"name": name, "tables": tuple(tables)})
 
 
 def page_json(page: Page, rows: Rows) -> str:
@@ -344,7 +342,7 @@ def write_page(folder: Path, page: Page, made: Made) -> None:
     made = page.drawn(made)
     make_folder(folder)
     replace_file(folder / f"{page.name}.json", page_json(page, made.rows).encode())
-    _put(folder, page, made.rows, made.pictures)
+    _put(folder, page, page.block(made.rows, made.pictures))
     for ending, draw in made.pictures.items():
         try:
             draw(folder / f"{page.name}{ending}.png")
@@ -355,24 +353,23 @@ def write_page(folder: Path, page: Page, made: Made) -> None:
 
 def generated(folder: Path, page: Page) -> str:
     """Return the generated part of a page as NAME.json and the pictures in `folder` give it."""
-    there = [ending for ending in page.captions if (folder / f"{page.name}{ending}.png").is_file()]
+    there = [ending for ending in page.pictures if (folder / f"{page.name}{ending}.png").is_file()]
     return page.block(read_rows(folder, page.name), there)
 
 
 def rewrite_page(folder: Path, page: Page) -> None:
     """Write the generated part of a page again, from NAME.json."""
-    there = [ending for ending in page.captions if (folder / f"{page.name}{ending}.png").is_file()]
-    _put(folder, page, read_rows(folder, page.name), there)
+    _put(folder, page, generated(folder, page))
 
 
-def _put(folder: Path, page: Page, rows: Rows, pictures: Iterable[str]) -> None:
-    path, pictures = folder / f"{page.file}.md", list(pictures)
+def _put(folder: Path, page: Page, block: str) -> None:
+    path = folder / page.markdown
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     begin, end = page.markers
     if begin in text and end in text:
-        whole = text[: text.index(begin)] + page.block(rows, pictures) + text[text.index(end) + len(end) :]
+        whole = text[: text.index(begin)] + block + text[text.index(end) + len(end) :]
     else:
-        whole = f"{text}\n" * bool(text) + page.whole(rows, pictures)
+        whole = f"{text}\n" * bool(text) + f"# {page.title}\n\n{block}\n"
     replace_file(path, whole.encode())
 
 

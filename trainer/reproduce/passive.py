@@ -52,10 +52,10 @@ from .page import (
     Row,
     Rows,
     against,
+    beside_curve,
     check_cached_bundle,
     finished,
     flat,
-    interpolated,
     kept,
     sampling_error,
 )
@@ -288,18 +288,15 @@ def beside_direct(name: str, figures: Row, dark: float, direct: Rows) -> Row:
     """Return direct imaging with the photons of a cell, and of barcodes with its clicks; nothing where none was measured there."""
     if name == "barcode":
         there = strings.at_photons(figures["photons"], dark)
-        found = {"direct": there["value"], "direct_illumination": there["illumination"]}
+        found = {"direct_there": there["value"], "direct_illumination": there["illumination"]}
         found |= against(figures["value"], there["value"], PRINTED, prefix="direct_")
         as_many = strings.at_clicks(figures["clicks"], dark)
         if as_many:
-            found |= {"at_clicks": as_many["value"]} | against(
+            found |= {"clicks_there": as_many["value"]} | against(
                 figures["value"], as_many["value"], PRINTED, prefix="clicks_"
             )
         return found
-    value, error = (interpolated(direct, figures["photons"], "photons", of) for of in ("value", "error_objects"))
-    if value is None or error is None:
-        return {}
-    return {"direct": value} | against(figures["value"], value, figures["error_objects"], error, prefix="direct_")
+    return beside_curve(figures, direct, "photons", "direct_")
 
 
 # ---- digits behind a fibre as a field ----
@@ -326,11 +323,9 @@ def field_page(asked: Asked) -> Made:
 def field_row(row: PassiveRow, found: Row, direct: Rows) -> Row:
     """Return the figures of one number of detectors beside direct imaging."""
     line: Row = {"table": "field", "features": row.features, "paper": row.values[0], "paper_clicks": row.clicks} | found
-    for prefix, photons in (("direct", found["photons"]), ("optics", found["reaching"])):
-        light = min(photons, SPECKLE_LEVELS[-1])  # more photons tell nothing more
-        value, error = (interpolated(direct, light, "photons", of) for of in ("value", "error_objects"))
-        if value is not None and error is not None:
-            line |= {prefix: value} | against(found["value"], value, found["error_objects"], error, prefix=f"{prefix}_")
+    for prefix, photons in (("direct_", found["photons"]), ("optics_", found["reaching"])):
+        place = min(photons, SPECKLE_LEVELS[-1])  # more photons tell nothing more
+        line |= beside_curve(found, direct, "photons", prefix, place)
     return line
 
 

@@ -38,7 +38,7 @@ from .active import (
     shot_figures,
     trained_rows,
 )
-from .page import FIRST_OBJECTS, VERDICTS, Asked, Draw, Made, Row, Rows, against, flat, interpolated, sampling_error
+from .page import FIRST_OBJECTS, Asked, Draw, Made, Row, Rows, beside_curve, flat, sampling_error
 from .printed import ACTIVE, SHOTS
 
 SWEPT = "fashion-mnist"  # of eta, dark counts and single shots
@@ -55,6 +55,14 @@ SAMPLED_TRIALS = 10_000  # where the words are too many to enumerate
 MAPPED = 1000  # shots on a map
 NEIGHBOURS = 10
 UNCERTAIN = (0.1, 0.9)  # click probabilities between which an exposure tells trials apart
+DUELS = (  # whose, what is equal, key of it, of the accuracy, and of its error
+    ("paper, simulation", "detections", "detections", "simulation", "paper_error"),
+    ("paper, simulation", "clicks", "paper_clicks", "simulation", "paper_error"),
+    (f"ours, first {FIRST_OBJECTS}", "detections", "detections", "first_200", "first_error"),
+    ("ours, all", "detections", "detections", "value", "error_objects"),
+    ("ours, all", "clicks", "clicks", "value", "error_objects"),
+    ("ours, all", "photons", "photons", "value", "error_objects"),
+)
 PIPELINE = ("Shirt", 16)  # the paper's example: class and number of patterns
 
 F64 = NDArray[np.float64]
@@ -66,23 +74,18 @@ I64 = NDArray[np.int64]
 
 def fig_3_page(asked: Asked) -> Made:
     """Return one row per data set and number of patterns at one shot, beside the paper's simulation and experiment."""
-    rows = [
-        {"set": name} | beside_paper(row.paper, 1, row.figures, [row.figures])
-        for name in ACTIVE
-        for row in trained_rows(asked, name)
-    ]
-    return Made(rows)
+    return Made(_points(asked, (1,)))
 
 
 def multi_shot_page(asked: Asked) -> Made:
-    """Return, per data set and measure of the expense, the duels of more patterns against more shots."""
-    points = [
-        {"set": name} | beside_paper(row.paper, shots, row.figures, [row.figures])
-        for name in ACTIVE
-        for row in trained_rows(asked, name)
-        for shots in SHOTS
-    ]
+    """Return, per data set and measure of the expense, the duels of more patterns against more shots; then the points."""
+    points = _points(asked, SHOTS)
     return Made(duels(points) + points)
+
+
+def _points(asked: Asked, shots: tuple[int, ...]) -> Rows:
+    rows = [(name, row) for name in ACTIVE for row in trained_rows(asked, name)]
+    return [{"set": name} | beside_paper(row.paper, k, row.figures, [row.figures]) for name, row in rows for k in shots]
 
 
 def duels(points: Rows) -> Rows:
@@ -97,39 +100,18 @@ def duels(points: Rows) -> Rows:
             for row in points
             if row["set"] == name
         ]
-        for whose, value, error, expenses in (
-            ("paper, simulation", "simulation", "paper_error", {"detections": "detections", "clicks": "paper_clicks"}),
-            (f"ours, first {FIRST_OBJECTS}", "first_200", "first_error", {"detections": "detections"}),
-            (
-                "ours, all",
-                "value",
-                "error_objects",
-                {"detections": "detections", "clicks": "clicks", "photons": "photons"},
-            ),
-        ):
-            for words, key in expenses.items():
-                found = [
-                    duel
-                    for pair in combinations(sorted({r["features"] for r in mine}), 2)
-                    for duel in _duels(mine, pair, key, value, error)
-                ]
-                counts = {verdict: [duel["verdict"] for duel in found].count(verdict) for verdict in VERDICTS}
-                least = min((duel["ahead"] for duel in found), default=None)
-                rows.append(
-                    {"table": "duels", "set": name, "whose": whose, "equal": words, "duels": len(found), "least": least}
-                    | counts
-                )
+        for whose, equal, spent, value, error in DUELS:
+            curves: dict[int, Rows] = {}
+            for row in mine:
+                point = {"spent": row[spent], "value": row[value], "error_objects": row[error]}
+                curves.setdefault(row["features"], []).append(point)
+            pairs = [(row, curves[many]) for few, many in combinations(sorted(curves), 2) for row in curves[few]]
+            found = [compared for row, curve in pairs if (compared := beside_curve(row, curve, "spent"))]
+            fewer = [compared["verdict"] for compared in found]  # of fewer patterns
+            counts = {"above": fewer.count("below"), "level": fewer.count("level"), "below": fewer.count("above")}
+            facts = {"table": "duels", "set": name, "whose": whose, "equal": equal, "duels": len(found)}
+            rows.append(facts | counts | {"least": min((-compared["ahead"] for compared in found), default=None)})
     return rows
-
-
-def _duels(rows: Rows, pair: tuple[int, int], spent: str, value: str, error: str) -> Rows:
-    few, many = ([row for row in rows if row["features"] == features] for features in pair)
-    found = []
-    for row in few:
-        there, their_error = (interpolated(many, row[spent], spent, of) for of in (value, error))
-        if there is not None and their_error is not None:
-            found.append(against(there, row[value], their_error, row[error]))
-    return found
 
 
 # ---- light and dark counts ----
@@ -269,7 +251,9 @@ def single_shot_page(asked: Asked) -> Made:
             rows.append(
                 {"table": "varying"} | of_row | shot_figures(row.figures) | made["differing"] | near | uncertain
             )
-            images += [{"table": "images"} | of_row | one | _decided(one, made["classes"]) for one in made["objects"]]
+            for one in made["objects"]:
+                named = row.features == PIPELINE[1]  # the table names the images of the paper's example
+                images.append({"table": "images", "shown": named} | of_row | one | _decided(one, made["classes"]))
             shown.append(of_row | made | {"patterns": row.bundle.patterns()})
     pictures: dict[str, Draw] = {}
     if shown:

@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.trainer.options import Options, plain_options
+from pans.trainer.options import Options
 from pans.trainer.reproduce import active
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
 from pans.trainer.reproduce.printed import ACTIVE, ActiveRow
@@ -41,15 +41,6 @@ def figures_of(accuracy, clicks, photons=20.0):
     one |= {"photons_mean": photons, "illumination": 80.0, "objects": 200, "trials": 0}
     of_part = {str(shots): one for shots in (1, 2, 3, 5)}
     return {"first_200": of_part, "all": of_part, "cpu_seconds": 60.0, "options": {"seed": 1000}}
-
-
-def test_a_row_is_told_from_one_of_another_recipe(tmp_path):
-    row, path = ACTIVE["mnist"][0], active.row_path(tmp_path, "mnist", 4)
-    assert active.finished_row(tmp_path, "mnist", row) is None
-    path.write_text(json.dumps({"options": plain_options(active.options_of("mnist", row))}))
-    assert active.finished_row(tmp_path, "mnist", row) is not None
-    path.write_text(json.dumps({"options": plain_options(active.options_of("mnist", row, seed=1))}))
-    assert active.finished_row(tmp_path, "mnist", row) is None
 
 
 def test_a_row_stands_beside_the_papers_direct_imaging_and_another_seed():

@@ -19,7 +19,6 @@ from pans.trainer.reproduce.page import (
     cached_row,
     check_cached_bundle,
     generated,
-    interpolated,
     is_page_file,
     kept,
     page_of,
@@ -27,7 +26,6 @@ from pans.trainer.reproduce.page import (
     rewrite_page,
     write_page,
 )
-from pans.trainer.reproduce.printed import ACTIVE, PASSIVE
 
 RESULTS = ROOT / "docs" / "results"
 COLUMNS = (Column("d_f", "{features}"), Column("all", "{value:.2f}"), Column("clicks", "{clicks:.1f}"))
@@ -43,7 +41,7 @@ TABLES = (
     Table("b", (Column("way", "{way}"),), "", (), Column("photons", "{photons}"), "{value:.0f}"),
     Table("a", COLUMNS[:1], "With clicks", needs="clicks"),
 )
-PAGE = Page("name", "A page", "file", "", TABLES, {"-x": "a picture"}, "one")
+PAGE = Page("name", "A page", "", "one", TABLES, {"-x": "a picture"}, file="file")
 TEXT = """SIMULATED. Command: `pans reproduce name`. Trainings: one.
 
 ### Rows
@@ -105,7 +103,7 @@ def test_what_is_written_by_hand_and_other_pages_of_the_file_stay(tmp_path):
     path.write_text(whole.replace("60.00", "99.99"))
     rewrite_page(tmp_path, PAGE)
     assert path.read_text() == whole
-    other = Page("other", "Another page", "file", "", TABLES[:1], {}, "one")
+    other = Page("other", "Another page", "", "one", TABLES[:1], file="file")
     write_page(tmp_path, other, Made(ROWS))
     assert path.read_text().startswith(whole)
     assert "# Another page" in path.read_text()
@@ -114,10 +112,10 @@ def test_what_is_written_by_hand_and_other_pages_of_the_file_stay(tmp_path):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_tables_of_the_results_are_those_of_their_json(name):
     page = page_of(name)
-    text = (RESULTS / f"{page.file}.md").read_text(encoding="utf-8")
+    text = (RESULTS / page.markdown).read_text(encoding="utf-8")
     block = generated(RESULTS, page)
     assert block in text
-    assert all(f"({name}{ending}.png)" in block for ending in page.captions)
+    assert all(f"({name}{ending}.png)" in block for ending in page.pictures)
     assert "|" in block
 
 
@@ -127,26 +125,15 @@ def test_the_results_have_no_file_that_no_page_shows():
         shown = path.suffix == ".md" or path.stem in NAMES or f"({path.name})" in text
         assert shown, path
     index = (RESULTS / "README.md").read_text(encoding="utf-8")
-    assert {page_of(name).file for name in NAMES} == set(re.findall(r"\]\(([\w-]+)\.md\)", index))
-
-
-def test_every_table_of_the_paper_has_a_page():
-    assert set(NAMES) > {*ACTIVE, *PASSIVE}
+    assert {page_of(name).markdown.removesuffix(".md") for name in NAMES} == set(
+        re.findall(r"\]\(([\w-]+)\.md\)", index)
+    )
 
 
 def test_a_verdict_needs_two_combined_errors():
     assert against(52.0, 50.0, 0.6, 0.8) == {"ahead": 2.0, "error": 1.0, "verdict": "level"}
     assert against(52.1, 50.0, 0.6, 0.8)["verdict"] == "above"
     assert against(47.9, 50.0, 0.6, 0.8, prefix="x_")["x_verdict"] == "below"
-
-
-def test_curves_are_read_between_their_ends_only():
-    curve = [{"photons": 1000.0, "value": 80.0}, {"photons": 10.0, "value": 40.0}]
-    assert interpolated(curve, 100.0, "photons") == pytest.approx(60)
-    assert interpolated(curve, 10.0, "photons") == pytest.approx(40)
-    assert interpolated(curve, 9.0, "photons") is None
-    assert interpolated(curve, 1001.0, "photons") is None
-    assert interpolated([], 5.0, "photons") is None
 
 
 def test_a_part_is_made_once_and_again_when_asked_for_otherwise(tmp_path):

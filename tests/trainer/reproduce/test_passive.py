@@ -109,15 +109,10 @@ def test_the_command_trains_on_another_draw_and_keeps_it_apart(few_cells, tmp_pa
     assert "draw 0" in capsys.readouterr().err
 
 
-def test_a_task_without_printed_figures_has_none_beside_ours():
-    row = passive.beside_paper("nebula", PASSIVE["nebula"].rows[0], 0.01, {"value": 81.0, "cpu_seconds": 30.0})
-    assert row == {"table": "nebula", "features": 2, "dark": 0.01, "minutes": 0.5, "value": 81.0, "cpu_seconds": 30.0}
-
-
 def test_direct_imaging_stands_beside_a_cell_at_its_photons():
     cell = {"value": 66.0, "photons": 100.0, "error_objects": 0.4}
     found = passive.beside_direct("mmf-mnist", cell, 0.01, CURVE)
-    assert (found["direct"], found["direct_ahead"]) == pytest.approx((65.0, 1.0))  # half way in the logarithm
+    assert (found["direct_there"], found["direct_ahead"]) == pytest.approx((65.0, 1.0))  # half way in the logarithm
     assert found["direct_error"] == pytest.approx(0.5)
     assert passive.beside_direct("mmf-mnist", cell | {"photons": 5.0}, 0.01, CURVE) == {}  # outside of the curve
 
@@ -125,9 +120,12 @@ def test_direct_imaging_stands_beside_a_cell_at_its_photons():
 def test_a_row_of_the_field_is_compared_at_what_it_detects_and_at_what_must_reach_it():
     found = {"value": 70.0, "error_objects": 0.4, "photons": 100.0, "reaching": 5000.0}
     row = passive.field_row(PASSIVE["mmf-mnist"].rows[0], found, CURVE)
-    assert (row["direct"], row["direct_verdict"]) == (pytest.approx(65), "above")
-    assert (row["optics"], row["optics_verdict"]) == (pytest.approx(90), "below")  # no more than the curve's last level
-    assert "direct" not in passive.field_row(PASSIVE["mmf-mnist"].rows[0], found | {"photons": 5.0}, CURVE)
+    assert (row["direct_there"], row["direct_verdict"]) == (pytest.approx(65), "above")
+    assert (row["optics_there"], row["optics_verdict"]) == (
+        pytest.approx(90),
+        "below",
+    )  # no more than the curve's last level
+    assert "direct_there" not in passive.field_row(PASSIVE["mmf-mnist"].rows[0], found | {"photons": 5.0}, CURVE)
 
 
 def test_digits_behind_a_fibre_are_measured_as_a_field_and_by_a_camera(tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """Pages of the trained rows: patterns or shots, light, dark counts, confusion, single shots; measured once and collected again."""
 
-import dataclasses
 import itertools
 import json
 
@@ -69,7 +68,7 @@ def asked(cache, monkeypatch):
 def write(folder, name, made):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
     write_page(folder, page_of(name), made)
-    assert set(page_of(name).drawn(made).pictures) == {*page_of(name).captions}
+    assert set(page_of(name).drawn(made).pictures) == {*page_of(name).pictures}
     assert all((folder / f"{name}{ending}.png").stat().st_size > 5000 for ending in page_of(name).drawn(made).pictures)
 
 
@@ -103,14 +102,6 @@ def test_shots_and_fig_3_stand_on_the_figures_of_the_table(asked, cache, tmp_pat
     shots = trained.multi_shot_page(question("multi-shot"))
     assert {row["duels"] for row in of_table(shots.rows, "duels")} == {0}  # one number of patterns alone
     write(tmp_path, "multi-shot", shots)
-
-
-def test_rows_of_an_earlier_recipe_are_reported(asked, monkeypatch):
-    question, said = asked
-    other = dataclasses.replace(active.options_of("mnist", ACTIVE["mnist"][0]), epochs=7)
-    monkeypatch.setattr(active, "recipe", lambda *_: other)
-    assert [row.features for row in active.trained_rows(question("x"), "mnist")] == [4]
-    assert "mnist d_f=4 was trained by an earlier recipe than today's" in said
 
 
 @pytest.mark.parametrize("name", ["eta", "dark-counts"])
