@@ -278,11 +278,6 @@ class DarkGuard:
         self._made: Decider | None = None
         self._made_for: tuple[Any, ...] = ()
 
-    @property
-    def dark_slot(self) -> NDArray[np.bool_]:
-        """Which slots of a cycle are dark."""
-        return self._dark_slot
-
     def warm_up(self) -> None:
         """Compile or load the kernels, before arming."""
         self.watch.warm_up()
@@ -301,11 +296,7 @@ class DarkGuard:
         if self.lit is not None:
             words = block.words if isinstance(block, FrameBlock) else self._words(block)
             self.lit.take_exposures(words)
-            self.look_for_dead()
-        return self.take_rest(block)
-
-    def take_rest(self, block: ClickBlock | FrameBlock) -> list[Finding]:
-        """As `take`, of a block whose lit exposures have been looked at."""
+            self._look_for_dead()
         events = self._take_dark(block)
         return self.news() + events
 
@@ -319,21 +310,21 @@ class DarkGuard:
         elif self.lit is not None:
             of_channels = counts if self._parallel else counts.reshape(-1, self._at_once).sum(axis=0)
             self.lit.take_object(of_channels, -1 if number == NO_OBJECT else number)
-            self.look_for_dead()
+            self._look_for_dead()
 
     def take_clicks(self, clicks: int, number: int) -> None:
         """As `take_object` with one detector, of which only the sum of its clicks counts."""
         if self.lit is not None:
             self._any_click[0] = clicks
             self.lit.take_object(self._any_click, -1 if number == NO_OBJECT else number)
-            self.look_for_dead()
+            self._look_for_dead()
 
     def news(self) -> list[Finding]:
         """Return what was found with objects, once."""
         news, self._news = self._news, []
         return news
 
-    def look_for_dead(self) -> None:
+    def _look_for_dead(self) -> None:
         """Ask the test of lit exposures what it has found, if it has."""
         assert self.lit is not None
         if not self.lit.has_news:
@@ -377,7 +368,7 @@ class DarkGuard:
 
     def take_dark_words(self, words: NDArray[np.uint8]) -> list[Finding]:
         """Take dark exposures, words uint8 (n, bytes), in the order of time; return the findings."""
-        return self.found(self.watch.update_words(words)) if len(words) else []
+        return self._found(self.watch.update_words(words)) if len(words) else []
 
     def take_empty(self, frames: int, clicks: NDArray[np.int64]) -> list[Finding]:
         """Take `frames` frames of an empty field of which only the clicks of each channel are known, int64 (n,); return the findings."""
@@ -385,10 +376,10 @@ class DarkGuard:
             return []
         if self.lit is not None:
             self.lit.take_counts(frames, clicks)
-            self.look_for_dead()
-        return self.news() + self.found(self.watch.update(frames, clicks))
+            self._look_for_dead()
+        return self.news() + self._found(self.watch.update(frames, clicks))
 
-    def found(self, alarms: list[Alarm]) -> list[Finding]:
+    def _found(self, alarms: list[Alarm]) -> list[Finding]:
         """Take alarms that came at once; return the findings."""
         return self._keep(self.health.take(alarms))
 

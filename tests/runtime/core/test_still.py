@@ -205,6 +205,26 @@ def test_marks_are_bounded() -> None:
     assert 0 not in core.marks
 
 
+def test_a_mark_that_comes_again_is_as_young_as_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more marks than are remembered the one goes that was set longest ago."""
+    monkeypatch.setattr("pans.runtime.core.follower.MAX_MARKS", 2)
+    core, _ = make()
+    for number in (0, 1, 0, 2):
+        core.remember(Mark(0, number, 0, 0, 0, 0.0))
+    assert list(core.marks) == [0, 2]
+
+
+@pytest.mark.parametrize("off", [-3, 0, 3])
+def test_a_block_that_ends_early_differs_from_the_plan_as_one_that_ends_late(off: int) -> None:
+    core, _ = make()
+    block = cycle(0, 0, [0, 1, 0, 0])
+    first = int.from_bytes(block.payload[8:16], "little")
+    core.begin(first, 0)
+    tick = first + off
+    core.step(block._replace(payload=block.payload[:8] + tick.to_bytes(8, "little") + block.payload[16:]))
+    assert core.jitter_ticks == abs(off)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_random_losses_never_reach_the_decider(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -57,7 +57,7 @@ def test_the_core_alone_leaves_the_same(
         numbers = random.Random(7)
         monkeypatch.setattr(connection, "secrets", SimpleNamespace(randbelow=numbers.randrange))
         if alone:
-            monkeypatch.setattr(FlowCore, "excluded", "asked for")
+            monkeypatch.setattr(FlowCore, "takes", False)
         else:
             monkeypatch.undo()
             monkeypatch.setattr(connection, "secrets", SimpleNamespace(randbelow=random.Random(7).randrange))

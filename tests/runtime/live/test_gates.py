@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -69,6 +70,19 @@ def test_a_pulse_is_sent_at_once_and_counts_when_it_was_accepted() -> None:
     bench.answer(1)
     bench.turn(10_100)
     assert bench.queue.summary() == {"asked": 1, "done": 1, "refused": 0, "expired": 0}
+
+
+def test_decisions_are_on_record_before_the_first_pulse_leaves() -> None:
+    bench, told = Bench(), list[str]()
+    submit = bench.session.submit
+    recorder: Any = SimpleNamespace(flush_decisions=lambda: told.append("flushed"))
+    bench.queue = GateQueue(recorder, bench.journal)
+    bench.session.submit = lambda *words, **more: told.append("sent") or submit(*words, **more)  # type: ignore[method-assign,func-returns-value]
+    bench.queue.take([pulse(0, 50_000), pulse(1, 51_000)])
+    assert len(bench.turn(10_000)) == 2
+    assert told == ["flushed", "sent", "sent"]
+    assert bench.turn(11_000) == []
+    assert told == ["flushed", "sent", "sent"]
 
 
 def test_what_is_known_to_be_late_is_never_sent() -> None:

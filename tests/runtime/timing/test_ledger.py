@@ -48,11 +48,15 @@ def test_extreme_durations() -> None:
     assert len(histogram.counts) == N_BUCKETS
 
 
+def judge(ledger: TimingLedger, marks: tuple[int, int, int, int, int], uncertainty_ns: int = 0, count: int = 1) -> bool:
+    return bool(ledger.judge(np.array([marks]), np.array([uncertainty_ns]), np.array([count]))[0])
+
+
 def test_a_decision_is_late_only_beyond_the_clocks_uncertainty() -> None:
     ledger = TimingLedger(deadline_ns=1000)
-    assert not ledger.judge((0, 100, 200, 1000, 1100), 0)
-    assert not ledger.judge((0, 100, 200, 1050, 1100), 50)
-    assert ledger.judge((0, 100, 200, 1051, 1100), 50)
+    assert not judge(ledger, (0, 100, 200, 1000, 1100), 0)
+    assert not judge(ledger, (0, 100, 200, 1050, 1100), 50)
+    assert judge(ledger, (0, 100, 200, 1051, 1100), 50)
     assert ledger.late == 1
 
 
@@ -62,14 +66,27 @@ def test_a_decision_is_late_only_beyond_the_clocks_uncertainty() -> None:
 )
 def test_blame_goes_to_the_slowest_stage(marks: tuple[int, int, int, int, int], stage: str) -> None:
     ledger = TimingLedger(deadline_ns=1000)
-    assert ledger.judge(marks, 0)
+    assert judge(ledger, marks)
     assert ledger.blame == {stage: 1}
 
 
 def test_recording_is_not_part_of_the_deadline() -> None:
     ledger = TimingLedger(deadline_ns=1000)
-    assert not ledger.judge((0, 1, 2, 3, 10_000), 0)
+    assert not judge(ledger, (0, 1, 2, 3, 10_000), 0)
     assert ledger.stages["record"].max_ns == 9997
+
+
+def test_many_blocks_are_judged_as_one_by_one() -> None:
+    rng = np.random.default_rng(1)
+    marks = np.cumsum(10 ** rng.uniform(-1, 6, (300, 5)), axis=1).astype(np.int64) - 50
+    unsure, counts = rng.integers(0, 1000, 300), rng.integers(1, 9, 300)
+    one, many = TimingLedger(100_000), TimingLedger(100_000)
+    late = [judge(one, tuple(row), int(off), int(n)) for row, off, n in zip(marks.tolist(), unsure, counts)]
+    assert many.judge(marks, unsure, counts).tolist() == late
+    assert (many.late, many.blame, many.worst_uncertainty_ns) == (one.late, one.blame, one.worst_uncertainty_ns)
+    assert many.late == int(counts[late].sum())
+    assert many.total.counts == one.total.counts
+    assert many.total.total == int(counts.sum())
 
 
 def test_a_heap_that_the_caller_has_frozen_stays_frozen() -> None:
