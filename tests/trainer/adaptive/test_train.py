@@ -273,7 +273,7 @@ def test_what_cannot_be_started_from_is_refused(task, first):
     ):
         with pytest.raises(UsageError, match=words):
             started_from(replace(FREE, **changes), bundle, digest, task, IDEAL)
-    with pytest.raises(PlanError, match="12 are allowed"):
+    with pytest.raises(PlanError, match="12 patterns are allowed"):
         started_from(replace(FREE, patterns=12), bundle, digest, task, IDEAL)
     with pytest.raises(UsageError, match="same task"):
         started_from(FREE, bundle, digest, replace(task, classes=("one", "other")), IDEAL)
