@@ -103,7 +103,7 @@ def tune_epochs_of(options: AutomatonOptions) -> int:
 def started_from(
     options: AutomatonOptions, start: Bundle, sha256: str, task: Task, profile: Profile
 ) -> AutomatonOptions:
-    """Return `options` for going on from the automaton of `start`, a file of that hash: its exposures and states.
+    """Return `options` for starting from the automaton of `start`, a file of that hash: its exposures and states.
 
     UsageError or PlanError where the options ask for others, the automaton is of other classes, images or outcomes, or `profile`
     holds fewer patterns than it has states.

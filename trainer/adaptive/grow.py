@@ -61,7 +61,7 @@ class Growth:
         self._branch(light)
 
     def follow(self, levels: list[Level]) -> None:
-        """Go on from levels that grew before over the same blocks."""
+        """Continue from levels that grew before over the same blocks."""
         for level in levels:
             assert isinstance(level.light, Grey)
             self._carry(level.light, level.successors, int(level.successors.max()) + 1)

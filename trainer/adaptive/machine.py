@@ -359,7 +359,7 @@ def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
         light = brought(level.light, sight, grey)
         chances, falls = readings(light, sight.law)
         if memory is not None:
-            chances, falls = memory.go_on(alpha, chances, falls, level.successors, machine.n_nodes(number))
+            chances, falls = memory.step(alpha, chances, falls, level.successors, machine.n_nodes(number))
         result.steps.append(Step(alpha, light, by_state(light, channels), chances, falls, numbers))
         nodes = children(alpha, chances, level.successors, machine.n_nodes(number))
     result.leaves.append(nodes)

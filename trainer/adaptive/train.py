@@ -110,7 +110,7 @@ def train_automaton(
 ) -> TrainedAutomaton:
     """Train `task` through `profile`; the same options, machine and number of threads give the same result.
 
-    After every level and epoch the state goes to `checkpoint`; with `resume` a training goes on from there. `held_back` objects (0: one
+    After every level and epoch the state goes to `checkpoint`; with `resume` a training continues from there. `held_back` objects (0: one
     in twelve) set the price and calibrate; no pattern is trained on them. Soft targets are read from the file
     `teacher` where there is one, else made and kept there. With `start`, an automaton that `started_from` gave
     the options for, nothing is grown: its patterns and edges are trained on. KeyboardInterrupt passes through.
@@ -121,7 +121,7 @@ def train_automaton(
     if saved:
         run.restore(saved["run"])
     elif start is not None:
-        run.go_on_from(start)
+        run.start_from(start)
 
     def keep() -> None:
         if checkpoint:
@@ -180,7 +180,7 @@ class _Run:
 
     # ---- the stages ----
 
-    def go_on_from(self, start: Bundle) -> None:
+    def start_from(self, start: Bundle) -> None:
         """Take the states and patterns of `start` in place of growing, and count its leaves on some of the objects."""
         self.machine, self.stage = machine_of(start), "shown"
         lights = [level.light for level in self.machine.levels if isinstance(level.light, Bits)]
@@ -398,7 +398,7 @@ class _Run:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         self.stage, self.epoch, self.price.value = state["stage"], state["epoch"], state["price"]
         self.machine = machine_from(state["machine"])
         self.saved_tuning = state["tuning"]

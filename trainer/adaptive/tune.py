@@ -145,11 +145,11 @@ class Tuning:
         return TuneReport(self.epochs, loss, accuracy, clicks, photons, self.price.value)
 
     def state(self) -> dict[str, Any]:
-        """Return what `restore` needs to go on."""
+        """Return what `restore` needs to continue."""
         return {"optimiser": self.optimiser.state_dict(), "done": self.done, "epochs": self.epochs}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from `state`, of a tuning of the same machine."""
+        """Continue from `state`, of a tuning of the same machine."""
         self.optimiser.load_state_dict(state["optimiser"])
         self.done, self.epochs = state["done"], state["epochs"]
 

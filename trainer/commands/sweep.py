@@ -78,7 +78,7 @@ def _run(args: argparse.Namespace) -> int:
         if sum(trial.state == finished for trial in study.trials) < args.trials:
             study.optimize(objective, callbacks=[optuna.study.MaxTrialsCallback(args.trials, states=(finished,))])
     except KeyboardInterrupt:
-        say(f"interrupted; finished trials are in {shown_storage(args.storage)}\n  go on: the same command")
+        say(f"interrupted; finished trials are in {shown_storage(args.storage)}\n  continue with the same command")
         return EXIT_INTERRUPTED
     done = [trial for trial in study.trials if trial.state == finished]
     payload = {

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 AUTOMATON = "automaton"
 AUTOMATON_PROFILE = "ideal"
-SIZES = ("exposures", "states")  # which a training that goes on from an automaton has from it
+SIZES = ("exposures", "states")  # which a training that starts from an automaton has from it
 CHANGES = ("copies", "shift_px", "offset_px")  # a user who asks for one of these has chosen how images are varied
 BASELINE_TRIALS = 10
 BUDGET_OFF = 0.05  # relative: more is said at the end

@@ -23,7 +23,7 @@ CURVES: Mapping[str, tuple[float, ...]] = {
     "psf_px": (0.0, 0.3, 0.5, 0.7, 0.9, 1.2),
     "black": (0.0, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02),
 }
-DRAW_STREAM = 0xD7A  # beside the seed
+DRAW_STREAM = 0xD7A  # with the seed
 Figures = Measured | MeasuredWalks
 Report = Callable[[int, int], None]
 

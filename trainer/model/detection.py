@@ -182,7 +182,7 @@ class MeanMemory:
     def __init__(self, afterpulses: Afterpulses, root: Tensor) -> None:
         self.afterpulses, self._sums = afterpulses, torch.zeros(2, *root.shape, dtype=root.dtype)
 
-    def go_on(
+    def step(
         self, alpha: Tensor, chances: tuple[Tensor, ...], falls: tuple[Tensor, ...], successors: Tensor, n_nodes: int
     ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         """Leave a level's states of chance `alpha`: silence and how fast it falls with light, with memory from those without."""

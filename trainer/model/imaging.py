@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pans.runtime.imaging import Bleaching, Imaging, Tolerance, operator
 
-OPTICS_STREAM = 0x0971C5  # beside the seed, so that no other draw is repeated
+OPTICS_STREAM = 0x0971C5  # with the seed, so that no other draw is repeated
 GROUP = 500  # objects seen through the same optics
 SMALL_DOSE = 1e-3  # over D0, below which the third term of the series is the last that float32 holds
 GROUPS_MIN = 40  # of few objects, so that they meet more than a handful of draws

@@ -18,7 +18,7 @@ from torch.nn.functional import affine_grid, grid_sample, interpolate
 
 from .registry import IMAGES_MAX_BYTES, Objects, Task
 
-DISTORT_STREAM = 0xD157  # beside the seed, so that no other draw is repeated
+DISTORT_STREAM = 0xD157  # with the seed, so that no other draw is repeated
 SIDE_MIN_PX = 8
 TURN_RAD = math.radians(8.0)  # each uniform between minus and plus that much:
 STRETCH = 0.08
@@ -29,7 +29,7 @@ KNOTS = 5  # per side, of the random displacement
 CHUNK = 2000
 
 Imaged = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
-SHIFT_STREAM = 0x5417  # beside the seed, so that no other draw is repeated
+SHIFT_STREAM = 0x5417  # with the seed, so that no other draw is repeated
 VARIED_AT_ONCE = 2000  # images changed together
 
 

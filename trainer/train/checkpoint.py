@@ -1,4 +1,4 @@
-"""Checkpoints: the state of a training on disk, so that an interrupted one goes on to the same result.
+"""Checkpoints: the state of a training on disk, so that an interrupted one continues to the same result.
 
 The file is torch's own and is read with `weights_only`: tensors and plain values, nothing that could run code.
 """
@@ -41,7 +41,7 @@ _WATCH: ContextVar[Stopwatch | None] = ContextVar("stopwatch of the training tha
 
 @contextmanager
 def timed(path: Path, *, resume: bool) -> Iterator[Stopwatch]:
-    """Yield the time of a training; the checkpoints written meanwhile hold it, and with `resume` it goes on from that in `path`."""
+    """Yield the time of a training; the checkpoints written meanwhile hold it, and with `resume` it continues from that in `path`."""
     watch = Stopwatch(_seconds_in(path) if resume else 0.0, time.perf_counter())
     token = _WATCH.set(watch)
     try:

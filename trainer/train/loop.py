@@ -160,7 +160,7 @@ def train(
     is exported is still judged by the profile's. A checkpoint does not know of it, nor of `basis` (inputs, size): a coherent encoder
     is then trained as coefficients of these fields (field_basis.py), and the one returned is W = coefficients @ basis.T.
 
-    After every epoch the state goes to `checkpoint`; with `resume` a run goes on from there. KeyboardInterrupt passes
+    After every epoch the state goes to `checkpoint`; with `resume` a run continues from there. KeyboardInterrupt passes
     through, with the state of the last whole epoch on disk.
     """
     check_options(options, profile)
@@ -171,7 +171,7 @@ def train(
     for restart in range(len(losses), options.restarts):
         started: list[float] = saved.pop("started", [])  # losses of the starts of this restart
         chosen: dict[str, Any] | None = saved.pop("chosen", None)  # and the best of them
-        for start in range(len(started), options.starts + 1):  # the last round goes on with the best start
+        for start in range(len(started), options.starts + 1):  # the last round continues with the best start
             seed = restart * options.starts + min(start, options.starts - 1)
             run = Run(data, profile, options, seed, law)
             if "run" in saved:
@@ -403,7 +403,7 @@ class Run:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         for name, module in self._modules():
             module.load_state_dict(state[name])
         self.optimiser.load_state_dict(state["optimiser"])
