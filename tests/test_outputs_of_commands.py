@@ -36,7 +36,7 @@ COMMANDS = {  # words, what is there already, what else is read
     "evaluate": ("evaluate b.pans --pictures DIR", "DIR/confusion.png", None),
     "data": ("data scene cells -o OUT.npz --objects 2", "OUT.npz", None),
     "reproduce json": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.json", None),
-    "reproduce md": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.md", None),
+    "reproduce md": ("reproduce alpha --collect --cache C -o DIR", "DIR/figures.md", None),
     "refit": ("refit b.pans r.pansrec -o OUT", "OUT", "b.pans"),
     "order": ("order b.pans -o OUT", "OUT", "b.pans"),
     "tune": (f"tune b.pans --device {DEVICE} -o OUT", "OUT", "b.pans"),
