@@ -12,7 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .evidence import F64, I64, Correction, Evidence, Prior, best_kappa, fit, log_softmax, n_parameters, shrunk
+from .evidence import (
+    F64,
+    I64,
+    Correction,
+    Evidence,
+    Prior,
+    best_kappa,
+    eigentasks,
+    fit,
+    log_softmax,
+    n_parameters,
+    shrunk,
+)
 
 FOLDS = 5
 CLEARLY = 3.0  # standard errors by which the best kind must beat the old one: at two, 6 of 100 draws without any change took one
@@ -26,14 +38,21 @@ Chosen = NDArray[np.bool_]
 
 
 class Kind(NamedTuple):
-    """A kind of correction: blocks of the log-linear one, then perhaps row by row towards what was seen."""
+    """A kind of correction: blocks of the log-linear one, then perhaps row by row towards what was seen.
+
+    With `tasks` the clicks are taken as their first so many eigentasks; `alone`, in place of the old scores.
+    """
 
     blocks: tuple[str, ...]
     rows: bool = False
+    tasks: int = 0
+    alone: bool = False
 
     @property
     def name(self) -> str:
         """As reports call it."""
+        if self.tasks:
+            return f"{self.tasks} eigentasks" + (" alone" if self.alone else "")
         return "+".join((*self.blocks, *(("rows",) if self.rows else ())))
 
 
@@ -87,18 +106,22 @@ class Judged(NamedTuple):
     log_loss_gain: Estimate
     sizes: tuple[int, ...]
     curve: tuple[Estimate, ...]
+    more_gain: Estimate  # in accuracy, from twice as many objects, by the upper half of the curve
     chosen: tuple[str, ...]  # in each outer fold
 
 
 def kinds_for(evidence: Evidence, *, rows: bool) -> tuple[Kind, ...]:
     """Return the kinds that this evidence can be fitted with; `rows` says whether each row may have a posterior of its own."""
     n_clicks = evidence.clicks.shape[1]
+    known = eigentasks(evidence) is not None
+    numbers = {min(1 << power, n_clicks) for power in range(1, n_clicks.bit_length() + 1)} if known else set()
+    of_tasks = (Kind(("bias", "clicks"), False, n, alone) for alone in (False, True) for n in sorted(numbers))
     return tuple(
         kind
-        for kind in KINDS
+        for kind in (*KINDS, *of_tasks)
         if (rows or not kind.rows)
         and (n_clicks or "clicks" not in kind.blocks)
-        and n_parameters(kind.blocks, evidence.n_classes, n_clicks) <= PARAMETERS_MAX
+        and n_parameters(kind.blocks, evidence.n_classes, kind.tasks or n_clicks) <= PARAMETERS_MAX
     )
 
 
@@ -107,7 +130,9 @@ def choose(evidence: Evidence, kinds: tuple[Kind, ...], objects: Chosen | None =
     chosen = np.ones(evidence.n_objects, bool) if objects is None else objects
     old, _ = evidence.losses(evidence.scores)
     fold = evidence.folds(FOLDS, chosen, np.random.default_rng(_SEED))
-    gains = {kind: Estimate.of((old - _held_out_loss(evidence, kind, fold))[chosen]) for kind in kinds}
+    tasks = eigentasks(evidence, chosen) if any(kind.tasks for kind in kinds) else None
+    tried = [kind for kind in kinds if not kind.tasks or tasks is not None]
+    gains = {kind: Estimate.of((old - _held_out_loss(evidence, kind, fold, tasks))[chosen]) for kind in tried}
     trials = {kind.name: (gain.value, gain.error) for kind, gain in gains.items()}
     best = max(gains, key=lambda kind: gains[kind].value, default=None)
     if best is None or not gains[best].value > CLEARLY * gains[best].error:
@@ -118,9 +143,26 @@ def choose(evidence: Evidence, kinds: tuple[Kind, ...], objects: Chosen | None =
 def fitted(evidence: Evidence, kind: Kind, chosen: Chosen) -> Refitted:
     """Return the correction of this kind, fitted to the objects `chosen` (objects,)."""
     counts = evidence.counts(chosen)
-    correction, _ = fit(kind.blocks, evidence.scores, evidence.clicks, counts)
+    correction, _ = _fit(evidence, kind, counts, eigentasks(evidence, chosen) if kind.tasks else None)
     scores, kappa = _with_rows(evidence, kind, correction, counts)
     return Refitted(kind.name, scores, correction, kappa, {})
+
+
+def _fit(
+    evidence: Evidence, kind: Kind, counts: F64, tasks: F64 | None, prior: Prior | None = None
+) -> tuple[Correction, Prior]:
+    """Fit to `counts`; a head on eigentasks is given back as one on clicks, `alone` as one that takes the old scores away."""
+    scores, clicks = evidence.scores, evidence.clicks
+    if not kind.tasks:
+        return fit(kind.blocks, scores, clicks, counts, prior)
+    assert tasks is not None  # kinds of tasks are tried where there are some
+    readout = tasks[:, : kind.tasks]
+    found, prior = fit(kind.blocks, np.zeros_like(scores) if kind.alone else scores, clicks @ readout, counts, prior)
+    gain = readout @ found.gain
+    if not kind.alone:
+        return replace(found, gain=gain), prior
+    gain = np.concatenate([-np.eye(evidence.n_classes), gain])
+    return replace(found, blocks=("bias", "scores", "clicks"), gain=gain), prior
 
 
 def _with_rows(evidence: Evidence, kind: Kind, correction: Correction, counts: F64) -> tuple[F64, float]:
@@ -132,14 +174,16 @@ def _with_rows(evidence: Evidence, kind: Kind, correction: Correction, counts: F
     return np.log(shrunk(believed, counts, kappa)), kappa
 
 
-def _held_out_loss(evidence: Evidence, kind: Kind, fold: I64) -> F64:
-    """Return the log loss of each object, fitted without its fold; nan outside the folds. The prior's width is that of all folds."""
-    scores, clicks = evidence.scores, evidence.clicks
-    prior: Prior | None = fit(kind.blocks, scores, clicks, evidence.counts(fold >= 0))[1]
+def _held_out_loss(evidence: Evidence, kind: Kind, fold: I64, tasks: F64 | None) -> F64:
+    """Return the log loss of each object, fitted without its fold; nan outside the folds.
+
+    The prior's width is that of all folds, and so are the eigentasks, which know no labels.
+    """
+    prior: Prior | None = _fit(evidence, kind, evidence.counts(fold >= 0), tasks)[1]
     found = np.full(evidence.n_objects, np.nan)
     for held in range(FOLDS):
         others = evidence.counts((fold >= 0) & (fold != held))
-        correction, _ = fit(kind.blocks, scores, clicks, others, prior)
+        correction, _ = _fit(evidence, kind, others, tasks, prior)
         found[fold == held] = evidence.losses(_with_rows(evidence, kind, correction, others)[0])[0][fold == held]
     return found
 
@@ -165,6 +209,10 @@ def judge(evidence: Evidence, kinds: tuple[Kind, ...]) -> Judged:
                 loss[here] = after[here]
                 chosen.append(found.name)
     sizes = tuple(round(share * n * (FOLDS - 1) / FOLDS) for share in CURVE)
+    # the loss of a fitted model falls as its parameters over the objects: a straight line in 1 / objects
+    inverse = 1 / np.array(sizes[1:], np.float64)
+    centred = inverse - inverse.mean()
+    slope = centred @ right[1:] / (centred**2).sum()
     return Judged(
         Estimate.of(old_right),
         Estimate.of(right[-1]),
@@ -174,6 +222,7 @@ def judge(evidence: Evidence, kinds: tuple[Kind, ...]) -> Judged:
         Estimate.of(old_loss - loss),
         sizes,
         tuple(Estimate.of(values) for values in right),
+        Estimate.of(-slope / (2 * n)),
         tuple(chosen),
     )
 

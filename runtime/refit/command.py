@@ -119,6 +119,7 @@ def _report(bundle: Bundle, clicks: Labelled, evidence: Evidence, found: Refitte
         "held_out": {"folds": FOLDS, **figures, "chosen": list(judged.chosen)},
         "kinds": {name: {"log_loss_gain": gain, "error": error} for name, (gain, error) in found.trials.items()},
         "learning_curve": [{"objects": size, **estimate_json(accuracy)} for size, accuracy in curve],
+        "more_objects": {"objects": 2 * evidence.n_objects, "accuracy_gain": estimate_json(judged.more_gain)},
         "clicks_mean": float(clicks.counts.sum(axis=1).mean()),
         "photons_mean": _known(clicks.photons),
         "illumination": _known(clicks.illumination),
@@ -142,7 +143,7 @@ def _provenance(
 def words_of(report: Mapping[str, Any]) -> str:
     """Return the report in words."""
     held = report["held_out"]
-    kind = "SIMULATED: " if report["simulated"] else ""
+    kind, more = "SIMULATED: " if report["simulated"] else "", report["more_objects"]
     left = ", ".join(f"{count} {why}" for why, count in report["left_out"].items() if count)
     lines = [
         f"{kind}{report['objects']} labelled objects, {report['decisions']} decisions"
@@ -155,6 +156,7 @@ def words_of(report: Mapping[str, Any]) -> str:
         f"  {light_words(report)} per decision",
         "accuracy by the number of labelled objects: "
         + ", ".join(f"{row['objects']}: {100 * row['value']:.1f} %" for row in report["learning_curve"]),
+        f"with {more['objects']} objects in all, about {percent_words(more['accuracy_gain'], '+')} more",
         *report.get("notes", ()),
         f"{report['bundle']}  SHA-256 {report['sha256'][:16]}",
     ]

@@ -34,6 +34,8 @@ _SETTLED = 0.05  # change of the logarithm of a precision that ends the search
 _ROWS_AT_ONCE = 4096  # of the Hessian: 50 MB at most
 _FLAT = 1e-9  # variance of a feature that says nothing
 _LEAST = 1e-12  # of a belief
+_RIDGE = 1e-6  # of the mean variance of the clicks: channels that never or always click have none of their own
+REPEATED_MIN = 20  # objects shown again, below which their scatter is no measure
 _log_gamma = np.vectorize(math.lgamma, otypes=[np.float64])
 
 
@@ -46,6 +48,7 @@ class Evidence:
     row: I64  # (n,)
     truth: I64  # (n,)
     object_id: I64  # (n,): the object, 0..objects-1; an object has one truth
+    shots: int = 1  # of a decision, whose mean `clicks` are
 
     @property
     def n_classes(self) -> int:
@@ -96,13 +99,19 @@ class Evidence:
 
 
 def evidence_of(
-    scores: NDArray[Any], clicks: NDArray[Any], row: NDArray[Any], truth: NDArray[Any], object_id: NDArray[Any]
+    scores: NDArray[Any],
+    clicks: NDArray[Any],
+    row: NDArray[Any],
+    truth: NDArray[Any],
+    object_id: NDArray[Any],
+    shots: int = 1,
 ) -> Evidence:
     """Return the evidence with scores centred on each row's mean, in float64, and objects numbered without gaps."""
     wide = np.asarray(scores, np.float64)
     centred = wide - wide.mean(axis=1, keepdims=True)
     numbers = np.unique(object_id, return_inverse=True)[1]
-    return Evidence(centred, np.asarray(clicks, np.float64), row.astype(np.int64), truth.astype(np.int64), numbers)
+    wide_clicks = np.asarray(clicks, np.float64)
+    return Evidence(centred, wide_clicks, row.astype(np.int64), truth.astype(np.int64), numbers, shots)
 
 
 def log_softmax(scores: F64) -> F64:
@@ -110,6 +119,38 @@ def log_softmax(scores: F64) -> F64:
     moved = scores - scores.max(axis=1, keepdims=True)
     moved -= np.log(np.exp(moved).sum(axis=1, keepdims=True))
     return moved
+
+
+# ---- eigentasks ----
+
+
+def eigentasks(evidence: Evidence, chosen: NDArray[np.bool_] | None = None) -> F64 | None:
+    """Return the eigentasks of the clicks of the objects `chosen`, a readout (d_f, d_f): column k times the clicks is eigentask k.
+
+    They solve N r = share T r, the smallest share of noise first: T is the covariance of the click means over decisions, N (diagonal)
+    that part which the photons' randomness makes (F. Hu et al., Phys. Rev. X 13, 041020, 2023). N is measured by objects that were shown
+    several times, or by decisions of several shots; without either the answer is None, and of an automaton too.
+    """
+    taken = np.ones(len(evidence.row), bool) if chosen is None else chosen[evidence.object_id]
+    clicks, object_id = evidence.clicks[evidence.row[taken]], evidence.object_id[taken]
+    times = np.bincount(object_id)
+    again = times > 1
+    if not clicks.shape[1] or len(clicks) < 2:
+        return None
+    if again.sum() >= REPEATED_MIN:
+        sums = np.zeros((len(times), clicks.shape[1]))
+        np.add.at(sums, object_id, clicks)
+        means = sums / np.maximum(times, 1)[:, None]
+        noise = ((clicks - means[object_id]) ** 2).sum(axis=0) / (times[again] - 1).sum()
+    elif evidence.shots > 1:
+        noise = (clicks * (1 - clicks)).mean(axis=0) / (evidence.shots - 1)
+    else:
+        return None
+    total = np.cov(clicks.T).reshape(len(noise), len(noise))
+    total += np.eye(len(noise)) * _RIDGE * max(float(np.trace(total)) / len(noise), _RIDGE)
+    # with T = L L^T the problem is an ordinary one: (L^-1 N L^-T) q = share q, r = L^-T q
+    inverse = np.linalg.inv(np.linalg.cholesky(total))
+    return np.asarray(inverse.T @ np.linalg.eigh(inverse * noise @ inverse.T)[1])
 
 
 # ---- single rows ----

@@ -66,7 +66,8 @@ def rows_of(bundle: Bundle, clicks: Labelled) -> Rows:
     vectors, row = np.unique(clicks.counts, axis=0, return_inverse=True)
     means = vectors / (clicks.shots * bundle.largest)
     scores = reference_scores(layers, means)
-    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.object_id)
+    shots = clicks.shots if bundle.largest == 1 else 1  # the noise of shots is known of clicks, not of photon numbers
+    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.object_id, shots)
     return Rows(evidence, np.arange(len(vectors)), own_posteriors=False)
 
 

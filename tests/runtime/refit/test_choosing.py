@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pans.runtime.refit.choosing import OLD, choose, judge, kinds_for
-from pans.runtime.refit.evidence import evidence_of, log_softmax
+from pans.runtime.refit.choosing import OLD, Kind, choose, fitted, judge, kinds_for
+from pans.runtime.refit.evidence import eigentasks, evidence_of, log_softmax
 
 ROWS, CLASSES = 30, 3
 
@@ -83,3 +83,43 @@ def test_an_object_counts_once_however_often_it_was_shown_and_is_never_in_two_fo
     logs = log_softmax(evidence.scores)[evidence.row[mine]]
     assert loss[7] == pytest.approx(-logs[np.arange(5), evidence.truth[mine]].mean())
     assert right[7] == pytest.approx(np.mean(logs.argmax(axis=1) == evidence.truth[mine]))
+
+
+def shown(count: int, times: int, shots: int = 1, seed: int = 0):
+    """Evidence without a head, of objects shown `times`: of six channels the first three tell the class. Also the chances and labels."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, CLASSES, count)
+    chances = np.concatenate([0.15 + 0.7 * np.eye(CLASSES)[labels], np.full((count, 3), 0.5)], axis=1)
+    object_id = np.repeat(np.arange(count), times)
+    clicks = rng.binomial(shots, chances[object_id]) / shots
+    rows = np.arange(len(object_id))
+    return evidence_of(np.zeros((len(rows), CLASSES)), clicks, rows, labels[object_id], object_id, shots), chances
+
+
+@pytest.mark.parametrize(("times", "shots"), [(3, 1), (3, 4), (1, 4)])
+def test_eigentasks_put_signal_before_noise(times: int, shots: int) -> None:
+    evidence, chances = shown(2000, times, shots)
+    tasks = eigentasks(evidence)
+    assert tasks is not None
+    noise = np.diag((chances * (1 - chances)).mean(axis=0)) / shots
+    total = noise + np.cov(chances.T)
+    share = np.diag(tasks.T @ noise @ tasks) / np.diag(tasks.T @ total @ tasks)
+    assert share == pytest.approx(np.sort(np.linalg.eigvals(np.linalg.solve(total, noise)).real), abs=0.05)
+
+
+def test_objects_shown_once_by_one_shot_have_no_eigentasks() -> None:
+    once, again = shown(300, 1)[0], shown(300, 2)[0]
+    assert eigentasks(once) is None
+    assert not any(kind.tasks for kind in kinds_for(once, rows=False))
+    assert {kind.tasks for kind in kinds_for(again, rows=False)} == {0, 2, 4, 6}
+
+
+def test_eigentasks_are_taken_where_there_is_no_head_and_alone_forget_the_old_scores() -> None:
+    evidence, _ = shown(150, 4)
+    assert choose(evidence, kinds_for(evidence, rows=False)).name.startswith("2 eigentasks")
+    found = fitted(evidence, Kind(("bias", "clicks"), tasks=2, alone=True), np.ones(150, bool)).correction
+    assert found is not None
+    old, clicks = np.random.default_rng(3).normal(size=(50, CLASSES)), np.random.default_rng(4).random((50, 6))
+    new = found.apply(old - old.mean(axis=1, keepdims=True), clicks)
+    assert new == pytest.approx(found.apply(np.zeros_like(old), clicks))
+    assert np.linalg.matrix_rank(new - new.mean(axis=0), tol=1e-6) == 2

@@ -83,6 +83,7 @@ def test_several_shots_are_refitted_through_the_head_and_claim_no_noise() -> Non
     clicks = drawn(shots=3)
     rows = rows_of(wrong_bundle("head"), clicks)
     assert np.allclose(rows.evidence.clicks[rows.evidence.row], clicks.counts / 9)
+    assert rows.evidence.shots == 1  # the binomial variance would be wrong of photon numbers
 
 
 def test_an_automaton_over_numbers_comes_near_the_exact_posteriors() -> None:

@@ -58,6 +58,7 @@ def test_a_refit_is_better_on_objects_held_out(folder: Path, capsys: pytest.Capt
     )
     assert found["clicks_mean"] > 1 < found["photons_mean"] < found["illumination"]
     assert [row["objects"] for row in found["learning_curve"]] == [20, 40, 80, 160]
+    assert found["more_objects"]["objects"] == 2 * found["objects"]
     bundle, sha256 = load_bundle(new)
     assert sha256 == found["sha256"]
     told = bundle.provenance["refit"]
