@@ -192,7 +192,7 @@ def test_laws_of_one_exposure_are_exact(number: int) -> None:
 
 @pytest.mark.slow
 def test_the_worst_of_all_settings() -> None:
-    """The table of docs/explanation/detector.md."""
+    """The ranges of docs/explanation/detector.md."""
     rows = [(one.effect, *off(one, 2_000_000, at), one) for at, one in enumerate([*with_traps(), *blinded(), *both()])]
     rows += [(*off_without_memory(number, 2_000_000), number) for number in range(18)]
     assert len(rows) >= 100
