@@ -28,7 +28,7 @@ class Link(Protocol):
 
     `read` is called by two threads, never at once, and `write` by one of them, maybe while the other reads.
     A link may also have `reopen() -> Link` (come back after an outage) and `pause(seconds)`; without them its URL is opened again. With
-    `fileno() -> int | None`, a non-blocking POSIX descriptor that carries the bytes as they are, the compiled turn reads and writes it.
+    `fileno() -> int | None`, a non-blocking POSIX descriptor that carries the bytes as they are, the kernel reads and writes it.
     A virtual one may have `read_ahead(timeout_s, frames, size, until_ns)`: many reads in one call, see reader.LinkReader.ahead.
     """
 

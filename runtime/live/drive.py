@@ -35,7 +35,7 @@ class WalkPlace:
         self._slots, self._walks = plan.slots_per_cycle, plan.cycles_per_object
 
     def arrays(self, tails: list[bytes], session: int) -> Drive:
-        """Return what the compiled turn drives by, with the `tails` of SHOW by state, in `session`."""
+        """Return what the kernel drives by, with the `tails` of SHOW by state, in `session`."""
         size = HEADER.size + STRUCTS["COMMAND"].size
         plain: npt.NDArray[np.uint8] = np.zeros(size + _EXPOSURE_BYTES + len(tails[0]) + CRC_BYTES, np.uint8)
         head = HEADER.pack(MessageType.COMMAND, 0, 0, session) + STRUCTS["COMMAND"].pack(0, Opcode.SHOW, 0, 0)
@@ -87,7 +87,7 @@ class HostDriver:
             self.turns.add(now_ns() - arrival_ns)
 
     def arrays(self, session: int) -> Drive:
-        """Return what the compiled turn drives by in `session`."""
+        """Return what the kernel drives by in `session`."""
         return self._place.arrays(self._tails, session)
 
     def body(self, exposure: int, state: int) -> bytes:
@@ -100,7 +100,7 @@ class HostDriver:
         return self._sent
 
     def account(self, sent: tuple[int, int], turns_ns: npt.NDArray[np.int64]) -> None:
-        """Take over what a compiled turn has named, and how long each turn took from the arrival of its block, int64 (n,)."""
+        """Account for what the kernel has named, and how long each answer took from the arrival of its block, int64 (n,)."""
         self._sent = sent
         self.turns.add_many(turns_ns)
 

@@ -53,7 +53,7 @@ class Observers:
 
     `uploaded` is called when the device has the plan, before the first kernel is needed: what compiles them elsewhere can be waited for.
 
-    A watcher that only looks (`acts` is False) gets what a compiled turn brought all at once.
+    A watcher that only looks (`acts` is False) gets what a call of the kernel brought all at once.
     """
 
     watch: Watcher | None = None

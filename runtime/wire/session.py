@@ -126,7 +126,7 @@ class HostSession:
     def stop_frames(self, next_id: int = 0) -> bytes:
         """Return bytes that stop the device, whatever it has of the commands so far: those that it may lack, in order, then STOP.
 
-        Nothing changes here: it is for a thread that speaks in the place of a loop that is stuck. `next_id` above 0 where a compiled turn
+        Nothing changes here: it is for a thread that speaks in the place of a loop that is stuck. `next_id` above 0 where a kernel
         has sent commands of which the session has not been told.
         """
         before = [frame for _, frame in (*self._unacknowledged, *self._waiting)]
@@ -165,7 +165,7 @@ class HostSession:
         self._output.clear()
         return data
 
-    # -- commands that a compiled turn sends ---------------------------------------------------------------------------
+    # -- commands that the kernel sends --------------------------------------------------------------------------------
 
     @property
     def window(self) -> tuple[int, int, int, bool]:
