@@ -145,10 +145,15 @@ def words_of(report: Mapping[str, Any]) -> str:
     held = report["held_out"]
     kind, more = "SIMULATED: " if report["simulated"] else "", report["more_objects"]
     left = ", ".join(f"{count} {why}" for why, count in report["left_out"].items() if count)
+    outcome = "the old back end stays: no correction is clearly better on objects held out"
+    if report["changed"]:
+        slots = report.get("slots_corrected", 0)
+        also = f", and of the states after {slots} of the exposures" if slots else ""
+        outcome = f"corrected: {report['chosen']}{also}"
     lines = [
         f"{kind}{report['objects']} labelled objects, {report['decisions']} decisions"
         + (f" ({left}: left out)" if left else ""),
-        _outcome(report),
+        outcome,
         f"on objects held out ({held['folds']} folds; 95 % intervals):",
         f"  accuracy  old {percent_words(held['accuracy_old'])}, new {percent_words(held['accuracy_new'])}, "
         f"gain {percent_words(held['accuracy_gain'], '+')}",
@@ -163,23 +168,11 @@ def words_of(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _outcome(report: Mapping[str, Any]) -> str:
-    if not report["changed"]:
-        return "the old back end stays: no correction is clearly better on objects held out"
-    slots = report.get("slots_corrected", 0)
-    also = f", and of the states after {slots} of the exposures" if slots else ""
-    return f"corrected: {report['chosen']}{also}"
-
-
 def estimate_json(found: Estimate) -> dict[str, float | None]:
     """Return an estimate with its 95 % interval; None for what is not known."""
-    half = Z_95 * found.error
-    return {
-        "value": _known(found.value),
-        "low": _known(found.value - half),
-        "high": _known(found.value + half),
-        "error": _known(found.error),
-    }
+    value, half = found.value, Z_95 * found.error
+    figures = {"value": value, "low": value - half, "high": value + half, "error": found.error}
+    return {name: _known(figure) for name, figure in figures.items()}
 
 
 def _known(value: float) -> float | None:

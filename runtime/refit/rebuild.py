@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -106,9 +105,7 @@ def rebuilt(bundle: Bundle, rows: Rows, found: Refitted, clicks: Labelled, prove
 
 def _with_head(bundle: Bundle, facts: dict[str, Any], layers: tuple[Layer, ...], found: Refitted) -> Rebuilt:
     assert found.correction is not None
-    new = corrected_layers(layers, found.correction)
-    assert new is not None  # _layers has looked
-    notes, int8 = [], None
+    new, notes, int8 = corrected_layers(layers, found.correction), [], None
     if bundle.int8_head is not None:
         try:
             int8 = quantise_head(new)
@@ -194,15 +191,13 @@ def _of_slot(
 # ---- a chain of layers as ONNX ----
 
 
-def corrected_layers(layers: tuple[Layer, ...], correction: Correction) -> tuple[Layer, ...] | None:
-    """Return the layers whose scores are the corrected ones; None where the last one is rectified.
+def corrected_layers(layers: tuple[Layer, ...], correction: Correction) -> tuple[Layer, ...]:
+    """Return the layers whose scores are the corrected ones; the last one must not be rectified.
 
     Where the correction reads the clicks, each hidden layer passes them on beside its own values: they are 0 or more, which a rectifier
     leaves as it is.
     """
     last = layers[-1]
-    if last.relu:
-        return None
     n_classes, n_clicks = last.weights.shape[1], layers[0].weights.shape[0]
     of_scores, of_clicks = _parts(correction, n_classes, n_clicks)
     centred = np.eye(n_classes) - 1.0 / n_classes
@@ -237,13 +232,9 @@ def chain_onnx(layers: tuple[Layer, ...]) -> bytes:
 
 def _parts(correction: Correction, n_classes: int, n_clicks: int) -> tuple[F64, F64]:
     """The gains of scores (classes, classes) and clicks (d_f, classes), zeros where there is no such block."""
-    sizes = {"bias": 0, "scores": n_classes, "clicks": n_clicks}
-    found = {"scores": np.zeros((n_classes, n_classes)), "clicks": np.zeros((n_clicks, n_classes))}
-    ends = np.cumsum([0, *(sizes[block] for block in correction.blocks)])
-    for block, (start, end) in zip(correction.blocks, pairwise(ends)):
-        if sizes[block]:
-            found[block] = correction.gain[start:end]
-    return found["scores"], found["clicks"]
+    blocks, gain = correction.blocks, correction.gain
+    of_scores = gain[:n_classes] if "scores" in blocks else np.zeros((n_classes, n_classes))
+    return of_scores, gain[-n_clicks:] if "clicks" in blocks else np.zeros((n_clicks, n_classes))
 
 
 def _layer(weights: F64, bias: F64, *, relu: bool) -> Layer:

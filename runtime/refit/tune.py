@@ -60,9 +60,8 @@ _SEED = re.compile(r"([?&]seed=)(\d+)")
 class Move:
     """How all patterns differ from the trained ones; nothing by default. `brightness` is of the light, by a longer exposure.
 
-    Where the numbers are those of the table (runtime.imaging), the changed patterns meet the object as the trained ones would on a perfect
-    table. The last four bend the grid smoothly, each by so many pixels at the edge of the patterns: with x and y from -1 to 1, stretch
-    moves by (x, -y), shear by (y, x), the keystones by (x y, 0) and (0, x y).
+    The last four bend the grid smoothly, each by so many pixels at the edge of the patterns: with x and y from -1 to 1, stretch moves by
+    (x, -y), shear by (y, x), the keystones by (x y, 0) and (0, x y).
     """
 
     right_px: float = 0.0
@@ -318,11 +317,11 @@ def held_out_of(n_objects: int) -> NDArray[np.bool_]:
 
 def paired(old: F64, new: F64, chosen: NDArray[np.bool_]) -> tuple[float, float]:
     """Return the mean of `old` - `new` over the chosen objects that both know, and its standard error; (0, inf) below two of them."""
-    both = chosen & np.isfinite(old) & np.isfinite(new)
-    difference = (old - new)[both]
+    difference = (old - new)[chosen & np.isfinite(old) & np.isfinite(new)]
     if len(difference) < 2:
         return 0.0, math.inf
-    return float(difference.mean()), float(difference.std(ddof=1) / math.sqrt(len(difference)))
+    found = Estimate.of(difference)
+    return found.value, found.error
 
 
 def _in_errors(gain: float, error: float) -> float:
@@ -384,12 +383,8 @@ class Bench:
                 log.note(output.decisions)
 
             timing = self.profile.timing
-            config = RunOptions(
-                n_cycles=n_cycles,
-                deadline_us=timing.decision_deadline_us,
-                lease_ms=timing.lease_ms,
-                realtime=False,
-            )
+            deadline, lease = timing.decision_deadline_us, timing.lease_ms
+            config = RunOptions(n_cycles=n_cycles, deadline_us=deadline, lease_ms=lease, realtime=False)
             watching = Observers(look, stop=self.stop, acts=False)
             result = run_live(link, self.profile, bundle, plan, core, config, None, None, watching)
         finally:
@@ -466,9 +461,6 @@ def demand_labelled(trial: Trial, held_out: NDArray[np.bool_]) -> None:
             f"{tuned} labelled objects to tune on and {kept} held out, allowed: {TUNED_MIN} and {HELD_MIN} or more",
             remedy="label more objects with --labels, or let more pass with --objects",
         )
-
-
-TUNED_MIN, HELD_MIN = 80, 20
 
 
 # ---- a whole tuning ----

@@ -255,14 +255,9 @@ def pattern_residuals(bench: Bench, observed: Observed, vector: F64) -> tuple[F6
     Exposures behind a click and behind none are taken together.
     """
     lit, n = observed.lit, len(observed.patterns)
-    log_miss = (
-        bench.model.log_miss(bench.means(vector, observed.patterns))[observed.pattern[lit]] + observed.log_other[lit]
-    )
-    chance, exposures = -np.expm1(log_miss), observed.exposures[lit]
-    sums = np.zeros((4, n))
-    for row, values in zip(
-        sums, (exposures, observed.clicks[lit], exposures * chance, exposures * chance * (1 - chance))
-    ):
-        np.add.at(row, observed.pattern[lit], values)
-    shown = np.maximum(sums[0], 1.0)
-    return sums[2] / shown, sums[1] / shown, (sums[1] - sums[2]) / np.sqrt(np.maximum(sums[3], 1e-12))
+    row, exposures = observed.pattern[lit], observed.exposures[lit]
+    chance = -np.expm1(bench.model.log_miss(bench.means(vector, observed.patterns))[row] + observed.log_other[lit])
+    of_groups = (exposures, observed.clicks[lit], exposures * chance, exposures * chance * (1 - chance))
+    shown, clicks, expected, variance = (np.bincount(row, values, n) for values in of_groups)
+    shown = np.maximum(shown, 1.0)
+    return expected / shown, clicks / shown, (clicks - expected) / np.sqrt(np.maximum(variance, 1e-12))

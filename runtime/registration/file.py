@@ -7,7 +7,6 @@ not use, and corrects the bundle's patterns. The bundle's file is recorded as it
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
@@ -66,17 +65,13 @@ def registration_values(found: Estimate, shape: Shape) -> dict[str, Any]:
     """Return what a file says of an estimate: values, standard errors, 95 % intervals, and how well it explains the counts."""
     ends = found.intervals()
     rows = zip(PARAMETERS, found.values.tolist(), found.errors.tolist(), ends.tolist())
+    parameters = {
+        one.name: {"value": max(value, 0.0) if one.name == "black" else value, "error": error, "low": low, "high": high}
+        for one, value, error, (low, high) in rows
+    }
     return {
         "grid": list(shape),
-        "parameters": {
-            one.name: {
-                "value": max(value, 0.0) if one.name == "black" else value,
-                "error": error,
-                "low": low,
-                "high": high,
-            }
-            for one, value, error, (low, high) in rows
-        },
+        "parameters": parameters,
         "dark_per_exposure": float(found.values[DARK]),
         "clicks": found.clicks,
         "exposures": found.exposures,
@@ -167,7 +162,12 @@ def _check(values: Mapping[str, Any]) -> None:
     for size in grid:
         SIDE.checked(size, "grid")
     for one in PARAMETERS:
-        _check_parameter(values["parameters"][one.name], one.name, one.low, one.high)
+        row = values["parameters"][one.name]
+        Range(one.low, one.high).checked(row["value"], f"{one.name}.value")
+        for key in ("low", "high", "error"):
+            Range(-1e6, 1e6).checked(row[key], f"{one.name}.{key}")
+        fits = row["low"] <= row["value"] <= row["high"]
+        demand(fits, f"{one.name} {row['value']} is not within {row['low']} to {row['high']}")
     made = values["made_utc"]
     demand(isinstance(made, str), f"made_utc is {number_text(made)}, allowed: a date and time")
     demand(datetime.fromisoformat(made).utcoffset() is not None, f"made_utc {made[:40]!a} has no time zone")
@@ -179,15 +179,6 @@ def _check(values: Mapping[str, Any]) -> None:
     CLICKS.checked(values["clicks"], "clicks")
     Range(0, 1).checked(values["p_value"], "p_value")
     Registered("", "", dict(values)).imaging()  # refuses a flat field that is negative somewhere
-
-
-def _check_parameter(row: Mapping[str, Any], name: str, low: float, high: float) -> None:
-    allowed = Range(low, high)
-    allowed.checked(row["value"], f"{name}.value")
-    for key in ("low", "high", "error"):
-        Range(-1e6, 1e6).checked(row[key], f"{name}.{key}")
-    fits = row["low"] <= row["value"] <= row["high"] and math.isfinite(row["error"])
-    demand(fits, f"{name} {row['value']} is not within {row['low']} to {row['high']}")
 
 
 # ---- in use ----

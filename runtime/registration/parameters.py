@@ -41,9 +41,7 @@ GEOMETRY = (
 FLAT = tuple(Parameter(f"flat_{term}", "", -0.5, 0.5, 0.1) for term in ("x", "y", "xx", "xy", "yy"))
 LIGHT = (Parameter("gain", "", 0.02, 50.0, 0.05), Parameter("black", "", -0.002, 0.1, 0.001))
 PARAMETERS = (*GEOMETRY, *LIGHT, *FLAT)
-DARK = len(
-    PARAMETERS
-)  # where the vector holds the dark photoelectrons of an exposure, a nuisance: calibrations measure it
+DARK = len(PARAMETERS)  # place in the vector of the dark photoelectrons of an exposure, a nuisance
 N_GEOMETRY = len(GEOMETRY)
 PSF_SEEN_FROM = 0.15  # px: the light changes with the square of less, and an interval in px begins at 0
 

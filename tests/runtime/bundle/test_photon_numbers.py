@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from automata import random_automaton
-from bundles import automaton_bundle, made_bundle, resealed
+from bundles import made_bundle, resealed
 from heads import affine_head
 
 from pans.runtime.bundle.model import bundle_bytes, parse_bundle, word_means
@@ -41,11 +40,6 @@ def test_they_are_read_back_whole() -> None:
     assert np.array_equal(read.table, made.table)
     assert bundle_bytes(read) == bundle_bytes(made)
     assert made_bundle(D_F, 2, table=np.zeros((8, 2))).largest == 1
-
-
-def test_largest_of_an_automaton_is_that_of_its_exposures() -> None:
-    assert automaton_bundle(random_automaton(0, outcomes=3)).largest == 2
-    assert automaton_bundle(random_automaton(0)).largest == 1
 
 
 FILE = bundle_bytes(counted(table=np.arange(128.0).reshape(64, 2)))
