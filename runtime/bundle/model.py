@@ -30,33 +30,20 @@ from .facts import (
     GOLDEN_WORK_MAX,
     LEVELS_MAX,
     RANGES,
-    Bundle,
     check_bundle,
     check_expected,
     check_table_shape,
     frozen,
-    golden_violation,
     words_among,
 )
-from .format import bundle_bytes, parse_bundle, read_bundle
+from .facts import Bundle as Bundle
+from .facts import golden_violation as golden_violation
+from .format import bundle_bytes as bundle_bytes
+from .format import parse_bundle as parse_bundle
+from .format import read_bundle as read_bundle
 from .head import open_head
 from .layers import Int8Head
 from .optics import Analyser
-
-__all__ = [
-    "BackEnd",
-    "Bundle",
-    "Shown",
-    "bundle_bytes",
-    "golden_violation",
-    "load_bundle",
-    "make_bundle",
-    "parse_bundle",
-    "read_bundle",
-    "with_expected",
-    "word_means",
-    "write_bundle",
-]
 
 TABLE_BUILD_ROWS_MAX = 1 << 12
 

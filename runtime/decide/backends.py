@@ -134,9 +134,8 @@ def _choose(bundle: Bundle, shots: int) -> Decider:
 def median_us(decider: Decider, shots: int, calls: int = MEASURED_CALLS) -> float:
     """Return the median time of one decision in microseconds, over varied clicks with a fixed seed."""
     rng = np.random.default_rng(CLICKS_SEED)
-    counts: NDArray[np.int64] = rng.integers(
-        0, shots * getattr(decider, "largest", 1) + 1, size=(calls, decider.n_features)
-    )
+    most = shots * getattr(decider, "largest", 1)
+    counts: NDArray[np.int64] = rng.integers(0, most + 1, size=(calls, decider.n_features))
     times: list[int] = []
     for row in counts:
         start_ns = time.perf_counter_ns()
@@ -169,9 +168,8 @@ class OfferedDecider:
                     f"{self._whose}: its {member} is {found!r}, must be {value!r}",
                     remedy="take the name of the entry point, and the numbers of patterns and classes of the bundle",
                 )
-        for row in np.random.default_rng(CLICKS_SEED).integers(
-            0, shots * self.largest + 1, size=(TRIED, self.n_features)
-        ):
+        tried = np.random.default_rng(CLICKS_SEED)
+        for row in tried.integers(0, shots * self.largest + 1, size=(TRIED, self.n_features)):
             self.decide(row, shots)
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:

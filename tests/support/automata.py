@@ -9,6 +9,11 @@ from bundles import made_bundle
 
 from pans.runtime.bundle import Automaton, Bundle, reachable_automaton
 
+EXPECTED: dict[str, Any] = {
+    **{"profile": "ideal", "task": "test", "split": "test", "objects": 100},
+    **{"accuracy": 0.5, "clicks": 1.2, "photons": 3.0, "illumination": 9.0, "exposures": 2.5},
+}
+
 
 def early_leaf() -> Automaton:
     """Two states, two slots: a click in slot 0 decides at once."""

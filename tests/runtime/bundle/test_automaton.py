@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from automata import automaton_bundle, diamond, early_leaf, random_automaton
+from automata import EXPECTED, automaton_bundle, diamond, early_leaf, random_automaton
 
 from pans.runtime.bundle import Automaton, reachable_automaton, stopped, with_expected
 from pans.runtime.bundle.automaton import SLOTS_MAX, golden_nodes, greatest_light, walk_nodes, words_to
@@ -166,12 +166,6 @@ REFUSED = [
 def test_a_bundle_that_does_not_fit_is_refused(facts: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         automaton_bundle(diamond(), **facts)
-
-
-EXPECTED: dict[str, Any] = {
-    **{"profile": "ideal", "task": "test", "split": "test", "objects": 100},
-    **{"accuracy": 0.5, "clicks": 1.2, "photons": 3.0, "illumination": 9.0, "exposures": 2.5},
-}
 
 
 def test_expected_figures_are_kept_and_checked() -> None:

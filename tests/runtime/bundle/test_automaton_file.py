@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from automata import automaton_bundle, diamond, early_leaf, random_automaton
+from automata import EXPECTED, automaton_bundle, diamond, early_leaf, random_automaton
 
 from pans.runtime.bundle import (
     Automaton,
@@ -24,11 +24,6 @@ from pans.runtime.bundle import (
     write_bundle,
 )
 from pans.runtime.errors import DamagedFileError
-
-EXPECTED: dict[str, Any] = {
-    **{"profile": "ideal", "task": "test", "split": "test", "objects": 100},
-    **{"accuracy": 0.5, "clicks": 1.2, "photons": 3.0, "illumination": 9.0, "exposures": 2.5},
-}
 
 
 def taken_apart(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -21,15 +21,10 @@ def test_no_object_changes_by_more_than_the_bound(levels, top):
     assert found.error_bound == pytest.approx(worst, rel=1e-12)
 
 
-def test_the_brightest_pixel_is_the_top_level():
-    found = quantise_patterns(RNG.uniform(0, 2, (3, 30)), 124)
-    assert found.pattern_levels.max() == 123
-    assert found.pattern_levels.dtype == np.uint16
-
-
-def test_without_clipping_no_pixel_moves_by_more_than_half_a_level():
+def test_the_brightest_pixel_is_the_top_level_and_none_moves_by_more_than_half_a_level():
     patterns = RNG.uniform(0, 2, (3, 30))
     found = quantise_patterns(patterns, 124)
+    assert (found.pattern_levels.max(), found.pattern_levels.dtype) == (123, np.uint16)
     assert np.abs(found.patterns() - patterns).max() <= found.photons_per_level / 2 * (1 + 1e-12)
 
 

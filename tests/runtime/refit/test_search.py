@@ -8,7 +8,7 @@ import pytest
 from pans.firmware_sim.testing import small_automaton_bundle
 from pans.runtime.bundle import load_bundle
 from pans.runtime.errors import DamagedFileError, PlanError
-from pans.runtime.refit.tune import BENDS, STILL, Budget, Cost, Move, Search, Step, moved, paired
+from pans.runtime.refit.tune import BENDS, STILL, Budget, Cost, Measure, Move, Search, Step, moved, paired
 
 NAMES = ("right_px", "down_px", "rotation_deg")
 HARD = np.random.default_rng(0).exponential(size=1000)
@@ -28,15 +28,15 @@ class Table:
         return HARD + self.slope * off + 0.7 * noise, Cost(1000.0, 2.0)
 
 
-def searched(table: Table, budget: Budget = Budget(), journal: list[Step] | None = None) -> Search:  # noqa: B008
-    search = Search(NAMES, 1000, budget, table.measure, lambda journal: None)
+def searched(measure: Measure, budget: Budget = Budget(), journal: list[Step] | None = None) -> Search:  # noqa: B008
+    search = Search(NAMES, 1000, budget, measure, lambda journal: None)
     search.journal = [] if journal is None else list(journal)
     search.run()
     return search
 
 
 def test_the_table_is_found_within_what_the_objects_can_tell() -> None:
-    found = searched(Table(1.0, -2.0, 4.0))
+    found = searched(Table(1.0, -2.0, 4.0).measure)
     assert found.ended == "the smallest steps change nothing more"
     assert (abs(found.best.right_px - 1), abs(found.best.down_px + 2)) <= (0.5, 0.5)
     assert abs(found.best.rotation_deg - 4) <= 2
@@ -53,18 +53,16 @@ def test_steps_that_are_not_clear_alone_are_taken_together() -> None:
         there = (move.right_px - 1, move.down_px + 1, move.rotation_deg / 2 - 1)
         return HARD + table.slope * np.square(there).sum() + (spread if number else -spread), Cost(1000.0, 2.0)
 
-    search = Search(NAMES, 1000, Budget(photons=11_000), measure, lambda journal: None)
-    search.run()
+    search = searched(measure, Budget(photons=11_000))
     assert search.journal[7].move == search.best == Move(right_px=1.0, down_px=-1.0, rotation_deg=2.0)
     assert search.accepted == 1
     assert search.resolution == pytest.approx(2.33 * 0.5 / math.sqrt(800), rel=0.01)  # differences of +-0.5
 
 
 def test_a_table_that_is_right_is_left_alone() -> None:
-    tables = [Table(slope=0.0) for _ in range(3)]
-    tried = [searched(table) for table in tables]
+    tried = [searched(Table(slope=0.0).measure) for _ in range(3)]
     assert sum(search.accepted for search in tried) <= 3  # one in a hundred of about 19 trials each
-    assert searched(Table(slope=0.5)).best == STILL
+    assert searched(Table(slope=0.5).measure).best == STILL
 
 
 def test_objects_that_are_held_out_never_choose() -> None:
@@ -76,15 +74,13 @@ def test_objects_that_are_held_out_never_choose() -> None:
             loss = loss - 5.0 * (np.arange(1000) % 5 == 4)
         return loss, cost
 
-    search = Search(NAMES, 1000, Budget(), tempted, lambda journal: None)
-    search.run()
-    assert search.best == STILL
+    assert searched(tempted).best == STILL
 
 
 def test_a_search_goes_on_where_its_journal_ends() -> None:
-    whole = searched(Table(1.0, 1.0))
+    whole = searched(Table(1.0, 1.0).measure)
     again = Table(1.0, 1.0)
-    resumed = searched(again, journal=[Step.of(step.as_json()) for step in whole.journal[:9]])
+    resumed = searched(again.measure, journal=[Step.of(step.as_json()) for step in whole.journal[:9]])
     assert again.asked == len(whole.journal) - 9
     assert (resumed.best, resumed.journal) == (whole.best, whole.journal)
     with pytest.raises(DamagedFileError, match="trial 1 of the checkpoint is right_px 1, here rotation_deg 2"):
@@ -95,7 +91,7 @@ def test_a_search_goes_on_where_its_journal_ends() -> None:
 
 @pytest.mark.parametrize(("budget", "most"), [(Budget(photons=9_500), 7), (Budget(seconds=17), 6)])
 def test_the_budget_leaves_room_for_the_comparison(budget: Budget, most: int) -> None:
-    found = searched(Table(1.0, 1.0), budget)
+    found = searched(Table(1.0, 1.0).measure, budget)
     assert found.ended == "the budget is spent"
     assert len(found.journal) == most
     assert budget.allows(found.spent, Cost(1000.0, 2.0), 2)
@@ -109,8 +105,7 @@ def test_what_the_device_cannot_show_is_passed_over() -> None:
             raise PlanError("too bright")
         return table.measure(move, number)
 
-    search = Search(NAMES, 1000, Budget(), measure, lambda journal: None)
-    search.run()
+    search = searched(measure)
     assert search.best.right_px <= 0
     assert [step.possible for step in search.journal[:3]] == [True, False, True]
 

@@ -58,19 +58,9 @@ def test_a_run_shows_the_corrected_patterns_and_its_replay_is_the_same(
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["identical"] is True
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"made_utc": "2020-01-01T00:00:00+00:00"}, "allowed are 24 h"),
-        ({"device": {"serial": "another"}}, "made on the device another"),
-        ({"grid": [14, 56]}, "of a grid of 14 x 56 pixels"),
-    ],
-)
-def test_a_run_refuses_a_registration_of_another_time_or_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, Any], words: str
-) -> None:
-    table = registered(tmp_path / "table.json", **changes)
+def test_a_run_refuses_a_registration_of_another_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = registered(tmp_path / "table.json", device={"serial": "another"})
     call = ["run", "fashion10", "--device", URL, "--registration", str(table), "--decisions", "1", "--no-realtime"]
     assert main([*call, "--out", str(tmp_path / "out")]) == 2
-    assert words in capsys.readouterr().err
+    assert "made on the device another" in capsys.readouterr().err
     assert not list((tmp_path / "out").glob("*.pansrec"))
