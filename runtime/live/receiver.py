@@ -166,11 +166,11 @@ class Receiver:
         self._core.steps(run.connection.session.nonce)
 
     def _gathered(self, poll_s: float) -> Sequence[tuple[int, bytes]]:
-        """Return what Python has read; of parallel frames in virtual time many reads, where nobody acts on the first."""
+        """Return what Python has read; in virtual time many reads, where nobody acts on the first."""
         run = self._run
         connection, link = run.connection, run.connection.link
         chunks, self._asked = connection.chunks(poll_s, asked=self._asked), False
-        gathers = isinstance(self._core, Core) and self._core.windows.parallel and self._core.takes
+        gathers = isinstance(self._core, Core) and self._core.takes and run.driver is None
         if not (link.virtual and gathers and chunks) or self._prompt:
             return chunks
         left = run.messages_granted - count_delimiters(chunks[0].data)
