@@ -1,11 +1,9 @@
 """Patterns and a device in; patterns that decide its labelled objects better, and a report, out: the search of `pans tune`.
 
-All patterns are changed at once, as one `Move`. Each trial shows the changed patterns to every object through the ordinary driver and loop,
-and scores the log loss of the bundle's own posterior. For each parameter in turn a step up and a step down are tried. A step is accepted if
-the mean of the paired differences of log loss over the objects is above `CLEARLY` standard errors; it is tried again in the same direction
-next. Steps that look better, too little for that, are tried together at the end of the round: a table is seldom off in one way alone.
-A round without a step halves all steps. Each round but the first begins with what has been reached, once more, so that a lucky trial does
-not stand for it. A journal of trials that is given again is followed without measuring, up to its end: that is how a search is resumed.
+Each trial shows all patterns, changed by one `Move`, to every object through the ordinary driver, and scores the log loss of the bundle's
+own posterior. A step of one parameter is accepted if the mean paired difference of log loss is above `CLEARLY` standard errors; lesser
+gains are tried together at the end of a round, which a new trial of what has been reached begins. A round without a step halves all steps.
+A search is resumed by following the journal of its trials without measuring.
 """
 
 from __future__ import annotations

@@ -83,7 +83,10 @@ def _run(args: argparse.Namespace) -> int:
     from .tune import Bench, Budget, Tuning
 
     bundle, sha256 = load_bundle(path)
-    _demand_tunable(bundle.analyser is not None, bundle.picture_shape is not None, bundle.name)
+    if bundle.analyser is not None:
+        raise UsageError(f"{bundle.name} is passive: nothing is shown that could be adjusted", remedy="use pans refit")
+    if bundle.picture_shape is not None:
+        raise UsageError(f"{bundle.name} returns pictures", remedy="tune a bundle that decides among classes")
     profile = load_profile(args.profile or _profile_of(args.device))
     with stop_signals(continuous=False) as stop:
         labels, labels_sha256 = _labels(args, bundle.classes)
@@ -111,13 +114,6 @@ def _parameters(parts: str) -> tuple[str, ...]:
     if unknown or len(set(chosen)) != len(chosen):
         raise UsageError(f"--only {parts!r}, allowed: some of {', '.join(PARTS)}, each once")
     return tuple(name for part in PARTS if part in chosen for name in PARTS[part])
-
-
-def _demand_tunable(passive: bool, returns_pictures: bool, name: str) -> None:
-    if passive:
-        raise UsageError(f"{name} is passive: nothing is shown that could be adjusted", remedy="use pans refit")
-    if returns_pictures:
-        raise UsageError(f"{name} returns pictures", remedy="tune a bundle that decides among classes")
 
 
 def _profile_of(device: str) -> str:

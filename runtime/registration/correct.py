@@ -1,10 +1,8 @@
 """A bundle and the measured table in; levels so that the object meets what the trained patterns would have shown it, out.
 
 The light that an object x receives is linear in the levels q: x . (M^T q + c) with the measured optics, x . w with those that the bundle
-was trained for. Levels are whole numbers, so the two cannot be equal. The correction makes the mean square of their difference small over
-images of a plain prior (mean 0.3, standard deviation 0.3, correlation exp(-distance / 3 px)), under which light as a whole counts most. It
-begins with the trained patterns at their new places, rounded by the rule of bundles (of two levels: the brightest pixels, as many as keep
-the light), then changes one level at a time, the one that helps most.
+was trained for. The correction makes the mean square of their difference small over images of a plain prior (mean 0.3, standard deviation
+0.3, correlation exp(-distance / 3 px)): it begins with the trained patterns at their new places, rounded, then changes one level at a time.
 """
 
 from __future__ import annotations

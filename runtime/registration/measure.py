@@ -1,8 +1,7 @@
 """A profile and a target in; what each of two stages shows, and from its counts the estimate out.
 
-The patterns that are shown are those that tell most of where the target stands, by the Fisher information: first scattered pixels, which
-tell something wherever the target is, then, once it is roughly known, the pixels on whose light the parameters act most. Patterns are
-levels, uint16 (patterns, pixels). Without clock, files and random numbers but those of the given seed; the caller runs the session.
+First scattered pixels are shown, which tell something wherever the target is, then the patterns of most Fisher information about a target
+that is roughly known. Patterns are levels, uint16 (patterns, pixels). The caller runs the session.
 """
 
 from __future__ import annotations

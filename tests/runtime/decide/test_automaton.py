@@ -116,6 +116,13 @@ def of_objects(automaton: Automaton, seed: int = 3, n: int = 4) -> tuple[np.ndar
     return rng.random((int(automaton.pattern.max()) + automaton.channels, 6)) * 0.6, rng.random((n, 6))
 
 
+def light_of(automaton: Automaton, whole: np.ndarray, brightness: float) -> list[float]:
+    """Photoelectrons of each state, of patterns that give `whole` (n_patterns,) at brightness 1 and full dwell."""
+    return [
+        brightness * float(whole[p]) * d / automaton.dwell_steps for p, d in zip(automaton.pattern, automaton.dwell)
+    ]
+
+
 LAWS = [ClickLaw(), ClickLaw(0.02), ClickLaw(0.01, 0.3, 0.6), ClickLaw(0.0, 0.2, 1.5)]
 
 
@@ -127,10 +134,7 @@ def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLa
     patterns, objects = of_objects(automaton)
     found = expected_walk(automaton, patterns, objects, law, photons_per_level=1.5, afterpulses=Afterpulses(afterpulse))
     for i, seen in enumerate(objects):
-        light = [
-            1.5 * float(patterns[p] @ seen) * d / automaton.dwell_steps
-            for p, d in zip(automaton.pattern, automaton.dwell)
-        ]
+        light = light_of(automaton, patterns @ seen, 1.5)
         click = [float(click_probability(law, mu)) for mu in light]
         wanted = naive.expectation(automaton, [Fraction(p) for p in click], Fraction(1), Fraction(afterpulse))
         assert found.clicks[i] == pytest.approx(float(wanted["clicks"]), rel=1e-12)
@@ -138,12 +142,9 @@ def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLa
         assert found.leaves[i] == pytest.approx([float(chance) for chance in wanted["leaves"]], rel=1e-11, abs=1e-300)
         photons = sum(float(chance) * mu for chance, mu in zip(wanted["shown"], light))
         assert found.photons[i] == pytest.approx(photons, rel=1e-12)
-        whole = [
-            1.5 * patterns[p].sum() * d / automaton.dwell_steps for p, d in zip(automaton.pattern, automaton.dwell)
-        ]
-        assert found.illumination[i] == pytest.approx(
-            sum(float(c) * e for c, e in zip(wanted["shown"], whole)), rel=1e-12
-        )
+        whole = light_of(automaton, patterns.sum(axis=1), 1.5)
+        illumination = sum(float(chance) * e for chance, e in zip(wanted["shown"], whole))
+        assert found.illumination[i] == pytest.approx(illumination, rel=1e-12)
         assert found.leaves[i].sum() == pytest.approx(1.0, abs=1e-13)
 
 
@@ -155,10 +156,7 @@ def test_chances_keep_their_digits_however_small(brightness: float) -> None:
     found = expected_walk(automaton, patterns, objects, ClickLaw(), photons_per_level=brightness)
     with mpmath.workdps(60):
         for i, seen in enumerate(objects):
-            light = [
-                brightness * float(patterns[p] @ seen) * d / automaton.dwell_steps
-                for p, d in zip(automaton.pattern, automaton.dwell)
-            ]
+            light = light_of(automaton, patterns @ seen, brightness)
             click = [1 - mpmath.exp(-mpmath.mpf(mu)) for mu in light]
             wanted = naive.expectation(automaton, click, mpmath.mpf(1))
             for chance, exact in zip(found.leaves[i], wanted["leaves"]):
