@@ -106,10 +106,9 @@ class Bench:
         ended = self.storage.noted(words, self.folder, journal)
         return ended, states(disk, journal)
 
-    def run(self, case: Case, at: int = 0, fault: Fault = Fault.NONE, error: int = 0, *, fresh: bool = False) -> Ended:
+    def run(self, case: Case, at: int = 0, fault: Fault = Fault.NONE, error: int = 0) -> Ended:
         words = case.words.replace("TRACE", str(self.trace)).split()
-        run = self.storage.fresh if fresh else self.storage.run
-        return run(words, self.folder, at, fault, error)
+        return self.storage.run(words, self.folder, at, fault, error)
 
 
 @pytest.fixture(scope="module")
@@ -236,44 +235,10 @@ def tried(bench: Bench, name: str, drawn: int | None) -> int:
     return runs
 
 
+@pytest.mark.parametrize("drawn", [DRAWN, pytest.param(None, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
-def test_a_call_of_every_command(name: str, bench: Bench) -> None:
-    assert tried(bench, name, DRAWN) == DRAWN
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_every_call_of_every_command(name: str, bench: Bench) -> None:
-    runs = tried(bench, name, None)
-    print(f"{name}: {runs} runs")
-
-
-def tried_fresh(bench: Bench, name: str, drawn: int) -> None:
-    """A process that nothing has prepared makes the same calls as a forked one, and fails as well."""
-    case, chosen = CASES[name], random.Random(f"{SEED} fresh {name}")
-    if case.needs:
-        pytest.importorskip(case.needs)
-    bench.fresh()
-    forked = bench.run(case)
-    before = bench.fresh()
-    clean = bench.run(case, fresh=True)
-    judge(bench, case, before, clean, Fault.NONE)
-    if not case.may:  # a state file is written by the clock
-        assert (clean.code, clean.calls) == (forked.code, forked.calls)
-    for fault, error in chosen.sample(FAULTS, drawn):
-        at, before = chosen.randint(1, clean.calls), bench.fresh()
-        ended = bench.run(case, at, fault, error, fresh=True)
-        judge(bench, case, before, ended, fault)
-
-
-def test_a_fresh_process_meets_the_same_storage(bench: Bench) -> None:
-    tried_fresh(bench, "export", 1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_a_fresh_process_of_every_command(name: str, bench: Bench) -> None:
-    tried_fresh(bench, name, 3)
+def test_calls_of_every_command(name: str, drawn: int | None, bench: Bench) -> None:
+    assert tried(bench, name, drawn) >= DRAWN
 
 
 # ---- a power cut: what was not synced is lost ----
@@ -320,12 +285,7 @@ def cut_power(bench: Bench, name: str, drawn: int | None) -> int:
     return len(tried)
 
 
+@pytest.mark.parametrize("drawn", [DRAWN_CUTS, pytest.param(None, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CUT)
-def test_a_power_cut_during_every_command(name: str, bench: Bench) -> None:
-    assert cut_power(bench, name, DRAWN_CUTS) > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CUT)
-def test_a_power_cut_at_every_call_of_every_command(name: str, bench: Bench) -> None:
-    print(f"{name}: {cut_power(bench, name, None)} states")
+def test_a_power_cut_during_every_command(name: str, drawn: int | None, bench: Bench) -> None:
+    assert cut_power(bench, name, drawn) > 0

@@ -68,11 +68,6 @@ def test_a_bundle_shows_its_facts_and_patterns() -> None:
     assert "alert('x')" in words_of(nasty)
 
 
-def test_a_profile_shows_its_figures() -> None:
-    text = words_of(pans.load_profile("oled-qcmos"))
-    assert "dark rate (Hz)" in text
-
-
 def test_a_run_and_its_recording(tmp_path: Path) -> None:
     done = pans.run("fashion10", "sim:oled-qcmos?scene=fashion200&seed=1&pace=fast", decisions=20, out=tmp_path / "out")
     assert done.recording is not None

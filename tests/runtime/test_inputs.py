@@ -20,24 +20,6 @@ from pans.runtime.ranges import FINITE, WHOLE, Range
 from pans.runtime.record.pictures import _images
 from pans.runtime.report.verify import verify_file
 
-RUN = ["run", "none.pans", "--device", "sim:ideal"]
-
-
-@pytest.mark.parametrize("text", [str(1 << 64), "nan", "-1", "1e3", "", "9" * 5000], ids=lambda text: text[:30])
-def test_options_are_refused_with_what_is_allowed(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([*RUN, "--decisions", text])
-    assert ended.value.code == 2
-    assert "argument --decisions" in (told := capsys.readouterr().err)
-    assert " from " in told.split("is not a")[1]
-
-
-@pytest.mark.parametrize("command", [["evaluate", "x.pans", "--eta", "nan"], ["calibrate", "--seconds", "inf"]])
-def test_every_command_refuses_what_is_no_number(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(command)
-    assert f"{command[-1]!r} is not a number from" in capsys.readouterr().err
-
 
 def test_ranges() -> None:
     assert Range(0, 1).checked(1, "x") == 1
@@ -77,23 +59,28 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     assert main(["replay", str(pipe)]) == 2
 
 
-def claiming(shape: tuple[int, ...], name: str = "images") -> bytes:
-    """A .npz of a few bytes whose array claims to be of `shape`."""
-    header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}, }}".encode()
+def claiming(shape: str, descr: str = "|u1") -> bytes:
+    """A .npz of a few bytes whose array claims to be of `shape`, word for word."""
+    end = ", }" if shape.endswith(")") else ""
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}{end}".encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
+        archive.writestr("images.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
     return file.getvalue()
 
 
-@pytest.mark.parametrize("shape", [(100, 28, 28_000_000), (1 << 40, 28, 28), (-1, 28, 28), (0, 28, 28)])
-def test_a_small_file_cannot_ask_for_much(shape: tuple[int, ...], tmp_path: Path) -> None:
+TOO_LARGE = ("(100, 28, 28000000)", f"({1 << 40}, 28, 28)", "(0, 9223372036854775807, 9223372036854775807)")
+NO_SHAPE = ("(-1, 28, 28)", "(0, 28, 28)", "(5,4,4", "(" * 3000, "(True,4,4)", "(5.0,4,4)", "()")
+
+
+@pytest.mark.parametrize("shape", [*TOO_LARGE, *NO_SHAPE], ids=lambda shape: shape[:20])
+def test_a_small_file_cannot_ask_for_much(shape: str, tmp_path: Path) -> None:
     path = tmp_path / "truth.npz"
     path.write_bytes(claiming(shape))
-    with pytest.raises(UsageError, match=r"claims|images are|allowed"):
+    with pytest.raises(UsageError, match=r"truth\.npz"):
         _images(path)
-    with pytest.raises(ConfigError, match=r"claims|must be|allowed"):
+    with pytest.raises(ConfigError, match=r"truth\.npz"):
         load_scene(path)
 
 

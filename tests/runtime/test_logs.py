@@ -71,14 +71,6 @@ def test_foreign_files_stay(tmp_path: Path, name: str, content: bytes) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_folders_and_options_without_a_file_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for words in (["--log-file", str(tmp_path)], ["--log-format", "json"], ["--log-rotate-mb", "3"]):
-        assert main(["devices", *words]) == 2
-        assert "remedy: " in capsys.readouterr().err
-    assert main(["devices", "--log-file", str(tmp_path / "none" / "x")]) == 2
-    assert "cannot be written to: No such file" in capsys.readouterr().err
-
-
 def test_a_fault_that_repeats_does_not_fill_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(logs.time, "monotonic", lambda: now[0])

@@ -72,20 +72,6 @@ class FaultyStorage:
         asked = {"words": list(words), "folder": str(folder), "at": at, "fault": int(fault), "error": error}
         return Ended(**self._ask(asked))
 
-    def fresh(
-        self, words: Sequence[str], folder: Path, at: int = 0, fault: Fault = Fault.NONE, error: int = 0
-    ) -> Ended:
-        """As `run`, in a process that nothing has prepared."""
-        asked = {"words": list(words), "folder": str(folder), "at": at, "fault": int(fault), "error": error}
-        with (folder.parent / "calls").open("w+") as told:
-            done = subprocess.run(
-                [*self._program, json.dumps(asked), str(told.fileno())],
-                env=self._environment, pass_fds=(told.fileno(),), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE, text=True, timeout=LONGEST_S, check=False,
-            )  # fmt: skip
-            told.seek(0)
-            return Ended(done.returncode, int(told.read() or 0), done.stderr)
-
     def noted(self, words: Sequence[str], folder: Path, journal: Path) -> Ended:
         """Run a command in `folder`; what it does to the files there is written to `journal` (power_cut.py reads it)."""
         asked = {"words": list(words), "folder": str(folder), "at": 0, "fault": 0, "error": 0, "journal": str(journal)}

@@ -132,15 +132,6 @@ def said(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str
     return code, *capsys.readouterr()
 
 
-def test_help_of_a_command_is_the_same_in_both_ways(capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = said(["help", "verify"], capsys)
-    assert code == 0
-    assert (0, out) == said(["verify", "--help"], capsys)[:2]
-    assert out.startswith("usage: pans verify [options] PATH [...]\n")
-    assert said(["help"], capsys)[1] == said([], capsys)[1]
-    assert said(["help", "no-such"], capsys)[0] == 2
-
-
 @pytest.mark.parametrize("option", ["-V", "--version"])
 def test_version(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert said([option], capsys) == (0, f"pans {__version__}\n", "")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -130,18 +129,3 @@ def test_photon_hdf5_has_what_the_format_demands(
         assert seconds == pytest.approx((clicks.last_tick - clicks.first_tick) * plan.tick_us * 1e-6)
         assert file["description"][()].startswith(b"SIMULATED")
         assert (file["user/pans/decisions"][:] == recording.decisions()).all()
-
-
-def test_hdf5_without_h5py_names_the_extra(
-    run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    assert main(["export", str(run_of), "--format", "photon-hdf5", "-o", str(tmp_path / "run.h5")]) == 2
-    assert "pans-runtime[export]" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_csv_into_a_file_is_refused(run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "there").write_text("mine")
-    assert main(["export", str(run_of), "--format", "csv", "-o", str(tmp_path / "there")]) == 2
-    assert (tmp_path / "there").read_text() == "mine"

@@ -255,14 +255,6 @@ def test_info_reads_a_damaged_recording_as_far_as_it_goes(tmp_path: Path, capsys
     assert found["decisions"] == 1
 
 
-def test_info_does_not_let_a_file_steer_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_bundle(toy_bundle(provenance={"note\x1b[2J": "\x1b]0;owned\x07", "long": "x" * 5000}), tmp_path / "a.pans")
-    _, text = run(capsys, "info", tmp_path / "a.pans")
-    assert "\x1b" not in text
-    assert "\x07" not in text
-    assert len(text) < 3000
-
-
 def make_inputs(folder: Path, d_f: int = 3, pixels: int = 4) -> list[str]:
     rng = np.random.default_rng(8)
     np.save(folder / "p.npy", rng.uniform(0, 0.7, size=(d_f, pixels)))
@@ -355,33 +347,6 @@ def test_a_profile_gives_levels_and_is_held_against_the_light(
     assert main([*words, "--profile", "oled-qcmos", "-o", str(tmp_path / "o2.pans")]) == 2
     assert "too weak" in capsys.readouterr().err
     assert not (tmp_path / "o2.pans").exists()
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"--classes": "same,same"}, "same name"),
-        ({"--classes": "a,b,c"}, "table has shape"),
-        ({"--classes": "a,"}, "printable"),
-        ({"--image-shape": "3x3"}, "does not fit 4 pixels"),
-        ({"--levels": "1"}, "levels is 1"),
-        ({"--table": ""}, "neither --head nor --table"),
-        ({"--patterns": "missing.npy"}, "cannot be read"),
-    ],
-)
-def test_bundle_arguments_that_cannot_be_meant(
-    changes: dict[str, str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = make_inputs(tmp_path)
-    for option, value in changes.items():
-        if option in words:
-            place = words.index(option)
-            words[place : place + 2] = [option, value] if value else []
-        else:
-            words += [option, value]
-    assert main([*words, "-o", str(tmp_path / "o.pans")]) == 2
-    assert reason in capsys.readouterr().err
-    assert not (tmp_path / "o.pans").exists()
 
 
 def dim_patterns(tmp_path: Path, data: dict[str, Any]) -> list[str]:

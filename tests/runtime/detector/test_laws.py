@@ -127,21 +127,6 @@ def test_the_laws_hold_for_unequal_light() -> None:
         assert wrong < STATED + SIGMAS * error, setting
 
 
-@pytest.mark.parametrize(
-    ("law", "light"),
-    [
-        (Afterpulses(0.1, 0.5), (20.0, 0.0, 0.0)),
-        (Afterpulses(0.2, 1.0), (20.0, 0.0, 0.0)),
-        (Afterpulses(0.3, 0.2), (20.0, 0.0, 0.0)),
-    ],
-)
-def test_a_dark_exposure_behind_bright_light(law: Afterpulses, light: tuple[float, ...]) -> None:
-    wrong, error = off(Setting("afterpulses", light, law), 400_000, 7)
-    assert (
-        wrong < STATED / 3 + SIGMAS * error < 0.0053
-    )  # a law of the mean memory alone was off by 0.011, 0.016 and 0.035
-
-
 def off_without_memory(number: int, rounds: int) -> tuple[str, float, float]:
     """Crosstalk of words, thresholds with read noise and photon numbers, and afterpulses without a time constant: setting `number`."""
     rng = np.random.default_rng(number)

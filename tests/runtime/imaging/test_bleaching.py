@@ -50,17 +50,6 @@ def _dying(light: np.ndarray, dose: float, mixed: bool, emitters: int, steps: in
     return glow
 
 
-@pytest.mark.parametrize(("emitters", "off"), [(3, 0.024), (10, 0.0075), (30, 0.0025), (100, 0.0008)])
-def test_few_emitters_click_less_often_than_the_law_says(emitters: int, off: float) -> None:
-    rng, rounds, dose = np.random.default_rng(emitters), 200_000, 4.0
-    lasts = rng.exponential(dose, (rounds, emitters))  # the dose at which each emitter dies
-    law = -np.expm1(-bleached(Bleaching(dose), np.ones((6, 1)))[:, 0])
-    glow = [np.clip(lasts - shown, 0.0, 1.0).mean(axis=1) for shown in range(6)]
-    clicks = np.array([-np.expm1(-one).mean() for one in glow])
-    assert (law - clicks).max() == pytest.approx(off, rel=0.15)
-    assert (law >= clicks - 5 * 0.2 / math.sqrt(rounds)).all()
-
-
 @pytest.mark.parametrize("mixed", [False, True])
 def test_emitters_that_die_one_by_one_give_the_law(mixed: bool) -> None:
     light = np.array([[4.0, 0.0, 1.0], [0.0, 6.0, 2.0], [3.0, 1.0, 0.5]])

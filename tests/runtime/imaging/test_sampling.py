@@ -130,16 +130,6 @@ def test_the_map_is_linear_and_its_matrix_and_the_form_without_a_matrix_agree():
         )
 
 
-def test_shifts_of_a_blurred_object_add_up_and_turns_come_back():
-    x = np.linspace(-1, 1, 41)
-    blob = np.exp(-8 * (x[:, None] ** 2 + (x - 0.2) ** 2)).reshape(1, -1)
-    shape = (41, 41)
-    twice = seen(Imaging(1.0), seen(Imaging(2.0, 1.0), blob, shape), shape)
-    np.testing.assert_array_equal(twice, seen(Imaging(3.0, 1.0), blob, shape))
-    back = seen(Imaging(rotation_deg=-20.0), seen(Imaging(rotation_deg=20.0), blob, shape), shape)
-    assert np.abs(back - blob).max() < 0.02 < np.abs(seen(Imaging(rotation_deg=20.0), blob, shape) - blob).max()
-
-
 def test_tiny_and_huge_numbers_give_what_their_limits_give():
     images = picture().reshape(3, -1)
     np.testing.assert_allclose(seen(Imaging(psf_px=1e-300), images, SHAPE), images, atol=1e-15)

@@ -16,7 +16,6 @@ from pans.runtime.instrument.click_law import (
     count_chances,
     count_law,
     counting,
-    outcome_weights,
 )
 from pans.runtime.instrument.profile import load_profile
 
@@ -77,12 +76,6 @@ def test_outcomes_together_are_the_click_law(clicks):
     click, miss = both_chances(clicks, light)
     np.testing.assert_allclose(found[0], miss, rtol=1e-12)
     np.testing.assert_allclose(found[1:].sum(axis=0), click, rtol=1e-12)
-
-
-def test_weights_without_noise_are_whole_numbers():
-    weights = outcome_weights(CountLaw(0.0, 0.0, (0.5, 1.5)))
-    assert weights[:, :2].tolist() == [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]
-    assert weights[:, 2].tolist() == [0.0, 0.0, 1.0]
 
 
 def test_law_of_a_profile():

@@ -55,12 +55,6 @@ def test_the_law_against_every_photon_on_the_whole_grid() -> None:
     assert max(wrong for wrong, _ in found) < WORST
 
 
-@pytest.mark.parametrize(("mean", "dead", "share"), [(3.0, 0.1, 0.949), (1.0, 0.5, 0.594)])
-def test_the_figures_of_an_audit_by_other_code(mean: float, dead: float, share: float) -> None:
-    """Simulated elsewhere, contiguous; n / (1 + n tau) as a mean gives 0.900 and 0.487."""
-    assert abs(float(click_probability(ClickLaw(dead_time=DeadTime(dead)), mean)) - share) < WORST
-
-
 @pytest.mark.parametrize(
     "dead_time",
     [DeadTime(0.0, 0.4, True, True), DeadTime(0.3, 0.3), DeadTime(0.3, 0.5, False, True), ClickLaw().dead_time],

@@ -106,15 +106,6 @@ def rigged(request: pytest.FixtureRequest) -> Iterator[Rig]:
     made.vanish()
 
 
-def test_a_link_says_what_it_is(rigged: Rig) -> None:
-    link = rigged.link
-    assert isinstance(link.name, str)
-    assert link.name
-    assert link.simulated in (True, False)
-    assert link.virtual in (True, False)
-    assert link.now_ns() <= link.now_ns()
-
-
 def test_without_data_a_read_comes_back_empty_after_its_time(rigged: Rig) -> None:
     before_ns = rigged.link.now_ns()
     assert rigged.link.read(0.03) == b""
@@ -411,13 +402,6 @@ def test_a_link_that_breaks_while_the_loop_is_busy_ends_every_further_wait() -> 
             while True:
                 reader.wait(0.01)
     reader.stop()
-
-
-def test_an_instrument_in_a_thread_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    instrument = ThreadedInstrument(OPTIONS)
-    instrument.connect().close()
-    instrument.close()
-    assert not instrument._thread.is_alive()
 
 
 # -- a driver of one's own ---------------------------------------------------------------------------------------------

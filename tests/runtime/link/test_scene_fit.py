@@ -11,7 +11,7 @@ from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
-from pans.runtime.link.fit import TEXT_MAX_BYTES, check_scene, scene_facts, scene_words
+from pans.runtime.link.fit import TEXT_MAX_BYTES, check_scene, scene_facts
 
 FASHION = load_bundle(SHIPPED / "fashion10.pans")[0]
 
@@ -49,15 +49,6 @@ def test_names_of_any_length_fit_into_a_welcome() -> None:
     for classes in (["é" * 300] * 3, [str(i) for i in range(10_000)], ["a\nb", "\ud800"]):
         assert all(len(str(fact).encode()) <= 256 for fact in scene_facts((1, 2), classes).values())
     assert TEXT_MAX_BYTES < 256
-
-
-def test_the_default_scene_is_named() -> None:
-    facts = {"scene": "fashion200", "objects": 200}
-    assert scene_words(facts, "sim:ideal") == (
-        "simulated scene fashion200 (the default: no scene= in the device URL), 200 objects"
-    )
-    assert scene_words(facts, "sim:ideal?scene=fashion200") == "simulated scene fashion200, 200 objects"
-    assert scene_words({}, "serial:/dev/ttyACM0") == ""
 
 
 def test_a_run_is_refused_and_leaves_nothing(

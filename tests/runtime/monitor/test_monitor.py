@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from commands import fixed_run
 
-from pans.runtime import SHIPPED, monitor
+from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.commands import one_run
@@ -29,7 +29,6 @@ from pans.runtime.intervals import wilson_interval
 from pans.runtime.monitor import History, Monitor, Snapshots
 from pans.runtime.monitor.figures import class_rows, headline, latest_rows, rows_of, series
 from pans.runtime.monitor.history import MAX_BINS, quantile_us
-from pans.runtime.monitor.server import now_facts
 from pans.runtime.monitor.snapshot import begin_facts
 from pans.runtime.timing.ledger import LatencyHistogram
 
@@ -65,17 +64,6 @@ def test_a_month_takes_the_memory_of_an_hour_and_loses_no_decision() -> None:
     assert sum((one.latency for one in history.bins), Counter()) == history.latency == Counter({200: 100 * n})
     assert all(a.end_s == b.begin_s for a, b in zip(history.bins, history.bins[1:]))
     assert set(series(history)["accuracy"]) == {0.8}
-
-
-def test_repeated_messages_are_told_from_those_that_differ() -> None:
-    def told(**more: int) -> list[tuple[str, str]]:
-        history = History()
-        history.take(picture(1.0, **more))
-        return [(row.text, row.level) for row in rows_of(history) if row.name == "repeats"]
-
-    assert told() == []
-    assert told(repeated=7) == [("7 messages, 0 with other content", "")]
-    assert told(repeated=1200, repeats_differing=2) == [("1,200 messages, 2 with other content", "bad")]
 
 
 def test_quantiles_are_those_of_the_loop_s_histogram() -> None:
@@ -160,18 +148,6 @@ def test_the_alarm_comes_when_it_was_said_to_come(n_channels: int) -> None:
             assert 100 * (block - 1) <= said <= 100 * (block + 1)
             return
     raise AssertionError("no alarm")
-
-
-def test_late_and_lost_are_one_number_each_on_the_page() -> None:
-    history = History()
-    history.take({"kind": "begin"})
-    history.take(picture(1.0, late=90, lost=7))
-    facts = now_facts(history)
-    rows = {row.name: row.text for row in rows_of(history)}
-    assert (facts["late"], rows["late"]) == (90, "90 decisions")
-    assert (facts["lost"], rows["lost"]) == (7, "7 exposures in 0 gaps")
-    page = (Path(monitor.__file__).parent / "live.html").read_text()
-    assert "${now.late} late decisions and ${now.lost} lost exposures" in page
 
 
 def test_the_pictures_of_a_run_add_up_to_its_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -332,17 +308,3 @@ def test_a_drawing_process_that_dies_ends_no_run(capfd: pytest.CaptureFixture[st
         shown._child.kill()
         shown._child.wait()
         assert shown._tell(picture(1.0) | {"fill": "x" * (1 << 20)}) is False
-
-
-def test_a_busy_port_is_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with Monitor(panel=False, address="127.0.0.1:0", lines=False) as shown:
-        address = shown.url.removeprefix("http://").rstrip("/")
-        assert main([*fixed_run(5), "--out", str(tmp_path / "run"), "--serve", address]) == 2
-    assert "choose another port" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("address", ["0.0.0.0:8000", "example.org:80", "[::]:1"])
-def test_a_page_for_others_must_be_meant(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*fixed_run(5), "--out", str(tmp_path / "run"), "--serve", address]) == 2
-    assert "--serve-public" in capsys.readouterr().err

@@ -130,33 +130,6 @@ def test_foreign_files_are_no_journals(lab: Path, capsys: pytest.CaptureFixture[
         assert Path("r.jsonl").read_text() == text
 
 
-@pytest.mark.parametrize(
-    ("words", "wrong"),
-    [
-        (["info", "none*", "-o", "r.jsonl"], "no such file"),
-        (["info", "a/grid.pans", "-o", "r.csv"], "allowed are .parquet and .jsonl"),
-        (["info", "a/grid.pans", "-o", "a/grid.pans/r.jsonl"], "not a folder"),
-        (["refit", "a/grid.pans", "-o", "r.jsonl"], "no `pans refit`"),
-    ],
-)
-def test_what_cannot_be_meant(lab: Path, words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
-    if words[0] == "refit" and "refit" in batch.find_commands():
-        pytest.skip("pans refit is there")
-    assert main(["batch", *words]) == 2
-    said = capsys.readouterr().err
-    assert wrong in said
-    assert "remedy: " in said
-    assert not Path("r.jsonl").exists()
-
-
-def test_a_wrong_option_is_found_before_anything_runs(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["batch", "info", "a/grid.pans", "-o", "r.jsonl", "--with", "--colour red"])
-    assert ended.value.code == 2
-    assert "--colour" in capsys.readouterr().err
-    assert not Path("r.jsonl").exists()
-
-
 def test_an_item_is_a_process_with_an_answer_or_an_error(lab: Path) -> None:
     good, bad = run_item(("info", "a/grid.pans"), str(lab)), run_item(("info", "none"), str(lab))
     assert (good["exit"], good["error"]) == (0, None)

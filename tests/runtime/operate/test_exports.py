@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -72,15 +71,6 @@ def test_parquet_holds_every_decision(recording: Path, tmp_path: Path, capsys: p
     ]
     facts = json.loads(table.schema.metadata[b"pans"])
     assert (facts["simulated"], facts["decisions_sha256"]) == (True, source.decisions_sha256)
-
-
-def test_without_pyarrow_the_extra_is_named(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    assert main(["export", str(recording), "--format", "parquet", "-o", str(tmp_path / "x.parquet")]) == 2
-    assert "pans-runtime[parquet]" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_rows_of_mixed_kinds_become_columns(tmp_path: Path) -> None:

@@ -68,19 +68,6 @@ def test_every_option_comes_back_from_a_file(action: argparse.Action, tmp_path: 
     assert all(f"# {other.help}"[:20] in path.read_text() for other in options() if other.help)
 
 
-def test_all_options_at_once_and_a_second_generation(tmp_path: Path) -> None:
-    first, second = tmp_path / "one.toml", tmp_path / "two.toml"
-    words = [
-        word for action in options() if action.dest not in ("bundle", "device", "force") for word in words_for(action)
-    ]
-    given = parsed(*NEEDED, *words, "--gate-class", "b", "--write-config", str(first))
-    write_options(given)
-    again = parsed("--config", str(first), "--write-config", str(second))
-    write_options(again)
-    assert facts(given) == facts(again)
-    assert first.read_text() == second.read_text()
-
-
 def test_the_command_line_overrides_the_file(tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(
@@ -154,11 +141,3 @@ def test_the_command_writes_reads_and_runs(
     assert "is the input" in capsys.readouterr().err
     assert main(["run", "--config", "none.toml"]) == 2
     assert "remedy: " in capsys.readouterr().err
-
-
-def test_a_run_that_cannot_be_meant_is_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "lab.toml"
-    words = ["run", "b.pans", "--device", "sim:ideal", "--keep-mb", "3", "--write-config", str(path)]
-    assert main(words) == 2
-    assert "--rotate-mb" in capsys.readouterr().err
-    assert not path.exists()

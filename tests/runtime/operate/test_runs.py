@@ -118,28 +118,3 @@ def test_links_are_not_followed(root: Path, tmp_path: Path) -> None:
 def test_times_and_sizes() -> None:
     assert (duration_s("30d"), duration_s("1.5 h"), duration_s("2w")) == (2_592_000, 5400, 1_209_600)
     assert (size_bytes("5GB"), size_bytes("200 MiB")) == (5 * 10**9, 200 << 20)
-
-
-@pytest.mark.parametrize(
-    ("words", "wrong"),
-    [
-        (["prune", "."], "which runs may go"),
-        (["none"], "cannot be read"),
-        ([".", "--yes"], "no effect on a list"),
-        (["a", "b"], "allowed: one"),
-    ],
-)
-def test_what_cannot_be_meant(words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["runs", *words]) == 2
-    said = capsys.readouterr().err
-    assert wrong in said
-    assert "remedy: " in said
-
-
-@pytest.mark.parametrize(
-    "words", [["--older-than", "30"], ["--older-than", "x d"], ["--larger-than", "5 gb"], ["--keep", "-1"]]
-)
-def test_quantities_that_are_none(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["runs", "prune", ".", *words])
-    assert words[0] in capsys.readouterr().err

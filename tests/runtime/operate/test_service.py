@@ -94,12 +94,6 @@ def test_folders_that_the_run_writes_to_are_writable(lab: Path, capsys: pytest.C
     assert not Path("units").exists()
 
 
-def test_the_users_own_manager(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shown = service(capsys, "show", "--config", "lab.toml", "--user")["text"]
-    assert "User=" not in shown
-    assert "WantedBy=default.target" in shown
-
-
 def test_foreign_units_stay(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     unit = Path("units/pans-lab.service")
     unit.parent.mkdir()
@@ -108,30 +102,6 @@ def test_foreign_units_stay(lab: Path, capsys: pytest.CaptureFixture[str]) -> No
         assert main(["service", *words, "--unit-dir", "units"]) == 2
         assert "remedy: " in capsys.readouterr().err
     assert unit.read_text() == "[Service]\nExecStart=/bin/true\n"
-
-
-@pytest.mark.parametrize(
-    ("words", "wrong"),
-    [
-        (["install"], "needs --config"),
-        (["show", "--name", "x"], "needs --config"),
-        (["verify"], "needs --name"),
-        (["remove", "--name", "none"], "cannot be read"),
-        (["install", "--config", "none.toml"], "none.toml"),
-        (["install", "--config", "lab.toml", "--folder", "none"], "is not a folder"),
-        (["install", "--config", "lab.toml", "--start", "3"], "--start has no effect"),
-        (["verify", "--name", "lab", "--force"], "--force has no effect"),
-        (["monitoring"], "needs a folder"),
-        (["monitoring", "--out", "m", "--config", "lab.toml"], "--config has no effect"),
-        (["install", "--config", "lab.toml", "--name", "a/b"], "--name"),
-    ],
-)
-def test_what_cannot_be_meant(lab: Path, words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["service", *words]) == 2
-    said = capsys.readouterr().err
-    assert wrong in said
-    assert "remedy: " in said
-    assert sorted(path.name for path in lab.iterdir()) == ["grid.pans", "lab.toml"]
 
 
 @pytest.mark.skipif(not hasattr(socket, "AF_UNIX") or sys.platform == "win32", reason="needs AF_UNIX")

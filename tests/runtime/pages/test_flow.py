@@ -119,23 +119,6 @@ def test_late_decisions_are_counted_once_however_many_events_are_held(
         }
 
 
-def test_late_decisions_stand_on_the_page_with_their_causes(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = read_recording(run)
-    extra = [
-        {"kind": "late", "decision": 5, "latency_us": 2000.0},
-        {"kind": "blame", "what": "late", "cause": "gc", "decisions": 1, "first_decision": 5, "last_decision": 5, "why": "it swept"},
-        {"kind": "blame", "what": "lost", "cause": "device", "exposures": 40, "why": "it dropped them"},
-    ]  # fmt: skip
-    events = list(recording.events())
-    monkeypatch.setattr(type(recording), "events", lambda self: iter([*events, *extra]))
-    words = words_of(page_of(run, tmp_path))
-    assert "Late and missing work, by cause" in words
-    for text in ("gc", "it swept", "device", "it dropped them", "Late decisions over the run"):
-        assert text in words
-
-
 def test_parts_of_a_flow_tell_of_their_passages(
     flow_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -25,7 +25,6 @@ from pans.runtime.pages.pixels import heat_png, png
 from pans.runtime.pages.rates import count_rates
 from pans.runtime.pages.results import accuracy_bins, sum_decisions
 from pans.runtime.pages.timing import CLOCK_MAX, EXACT_MAX, Durations, _probes
-from pans.runtime.pages.verdict import advice_on
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.sent_plan import recorded_plan
@@ -144,24 +143,6 @@ def test_events_become_sentences_and_foreign_ones_stay_whole() -> None:
     assert sentence_of(blame) == "The cause of 40 missing exposures is device, not surely: it dropped them."
 
 
-def test_every_fault_has_advice() -> None:
-    faults = (
-        "3 decisions later than 2 ms (cause: host 3)",
-        "40 exposures lost in 1 gaps, 40 of them dropped by the device",
-        "the device was lost and found again 2 times",
-        "the link was lost: the device fell silent",
-        "2 messages contradict the evidence: malformed 2",
-        "5 exposures showed another pattern than planned",
-        "6 slots stayed dark because the host named their state too late; the longest turn took 900 us",
-        "4 decisions abstained",
-        "10 of 20 decisions were made; the run ended: time is up",
-    )
-    advice = [advice_on(fault) for fault in faults]
-    assert all(advice)
-    assert len(set(advice)) == len(faults)
-    assert advice_on("something new") == ""
-
-
 def test_a_curve_of_many_points_keeps_its_outliers() -> None:
     y = np.zeros(20_000)
     y[[7, 12_345]] = 50.0, -30.0
@@ -267,11 +248,6 @@ def test_a_stranger_s_text_stays_text() -> None:
     assert "\x1b" not in text
     assert "inner.x" in text
     assert dict(flat({"a": {"b": [1, 2]}})) == {"a.b": "1, 2"}
-
-
-def test_a_profile_has_no_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", "ideal", "-o", str(tmp_path / "a.html")]) == 2
-    assert "pans info" in capsys.readouterr().err
 
 
 def test_an_automaton_s_page(tmp_path: Path) -> None:

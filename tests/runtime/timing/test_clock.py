@@ -16,39 +16,6 @@ PROBE_EVERY_NS = 97_000_000
 REQUIRED = 0.999  # of the conversions are within their uncertainty
 
 
-def simulate(
-    drift_ppm: float, offset_ticks: int, seconds: float, seed: int, jitter_us: float = 30.0
-) -> tuple[list[float], list[float]]:
-    """Probe every 97 ms over a jittery, asymmetric link; return true errors and published uncertainties, in ns."""
-    rng = np.random.default_rng(seed)
-    rate = 1 + drift_ppm * 1e-6
-    model = ClockModel(TICK_HZ)
-    errors, bounds = [], []
-
-    def tick_at(host_ns: int) -> int:
-        return offset_ticks + int(host_ns * rate / NS_PER_TICK)
-
-    for step in range(16 + int(seconds / 0.097)):
-        sent = 5_000_000_000 + (step * 1_000_000 if step < 16 else step * 97_000_000)
-        out, back = (40_000 + rng.exponential(jitter_us * 1000, 2)).astype(int)
-        arrived = sent + int(out)
-        model.add_probe(sent, tick_at(arrived), tick_at(arrived + 20_000), arrived + 20_000 + int(back))
-        when = arrived + int(rng.integers(0, 97_000_000))
-        host_ns, bound = model.to_host_ns(tick_at(when))
-        errors.append(abs(host_ns - when))
-        bounds.append(bound)
-    return errors, bounds
-
-
-@pytest.mark.parametrize("drift_ppm", [-100.0, 0.0, 20.0, 100.0])
-@pytest.mark.parametrize("offset_ticks", [0, 2**31 - 5, 2**62])
-def test_the_true_error_lies_within_the_published_uncertainty(drift_ppm: float, offset_ticks: int) -> None:
-    errors, bounds = simulate(drift_ppm, offset_ticks, 60.0, seed=1)
-    assert np.mean(np.array(errors) <= np.array(bounds)) >= 0.999
-    assert np.median(errors[100:]) < 30_000
-    assert np.median(bounds[100:]) < 120_000
-
-
 def test_the_drift_is_found() -> None:
     model = ClockModel(TICK_HZ)
     for step in range(100):

@@ -50,7 +50,6 @@ from pans.runtime.timing.evidence import (
 from pans.runtime.wire.tracker import Gap
 
 MS = 1_000_000
-linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the counters are those of Linux")
 
 
 def facts(
@@ -247,17 +246,6 @@ def test_memory_is_bounded() -> None:
     known = evidence.facts(0, 0, 10**13, 0)
     assert len(known.spans) == 1024
     assert len(known.stamped) == 64
-
-
-@linux_only
-def test_a_reading_is_taken_apart() -> None:
-    counters = Counters(time.perf_counter_ns, [threading.get_native_id()])
-    counters.close()
-    tick_ns = 10**9 // os.sysconf("SC_CLK_TCK")
-    stat = b"cpu  1 2 3 4 5 6 7 120 9 10\ncpu0 1 2 3 4 5 6 7 99 9 10\n"
-    files = (stat, b"120 77 12\n", b"5 240 3\n")
-    assert counters._sample(0, 1, files) == (0, 1, 120, (77, 240), 120 * tick_ns)
-    assert counters._sample(0, 1, (b"", b"", b"damaged")) == (0, 1, 0, (0, 0), 0)
 
 
 @given(

@@ -34,7 +34,7 @@ from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.part_names import parts_in
 from pans.runtime.report.verify import verify_parts
 from pans.runtime.watch.metrics import FIGURES, MetricsServer, parse_address
-from pans.runtime.watch.state_file import FORMAT, StateFile, picture_of
+from pans.runtime.watch.state_file import StateFile, picture_of
 
 DEVICE = "sim:ideal?scene=uniform&seed=3"
 PATIENCE_S = 600.0  # kernels may be compiled, and on a busy machine
@@ -67,15 +67,6 @@ def test_what_a_full_disk_cut_off_does_not_stay(tmp_path: Path, monkeypatch: pyt
     assert "No space left" in state.trouble
     assert [one.name for one in tmp_path.iterdir()] == ["state.json"]
     assert json.loads((tmp_path / "state.json").read_text()) == {"n": 1}
-
-
-def test_before_the_run_there_is_a_picture_too() -> None:
-    picture = picture_of(None, None, time.monotonic())
-    assert (picture["format"], picture["state"], picture["pid"]) == (FORMAT, "setting up", os.getpid())
-    if sys.platform == "linux":
-        assert picture["rss_bytes"] > 1 << 20
-        assert picture["handles"] > 2
-    assert picture["threads"] >= 1
 
 
 def test_metrics_are_served_and_only_here() -> None:
@@ -201,18 +192,6 @@ def test_exit_codes_of_a_run(facts: dict[str, Any], code: int) -> None:
     assert _exit_code(SimpleNamespace(**{**fine, **facts})) == code  # type: ignore[arg-type]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="needs kill -9 and files that are read without a name")
-def test_after_kill_9_the_recording_has_every_decision_that_the_state_file_names(
-    bundle_file: Path, tmp_path: Path
-) -> None:
-    with _running(bundle_file, tmp_path) as process:
-        _wait_for(lambda: _state(tmp_path).get("decisions", 0) > 50)
-        process.kill()
-        process.communicate()
-    named = _state(tmp_path)["decisions"]
-    assert 50 < named <= read_recording(tmp_path / "out" / "run.pansrec").n_decisions
-
-
 def test_the_state_names_only_what_is_written(tmp_path: Path) -> None:
     with Recorder(tmp_path / "run.pansrec", {"simulated": True}) as recorder:
         run: Any = MagicMock()
@@ -309,25 +288,6 @@ def _wait_for(condition: Any) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.05)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--keep-mb", "1"],
-        ["--rotate-mb", "-1"],
-        ["--rotate-mb", "2", "--keep-mb", "3"],
-        ["--metrics", "nowhere"],
-        ["--rotate-mb", "2", "--on-dark", "abstain"],
-    ],
-)
-def test_what_cannot_be_meant(bundle_file: Path, tmp_path: Path, options: list[str]) -> None:
-    words = ["run", str(bundle_file), "--device", "sim:ideal?pace=fast&scene=uniform", "--out", str(tmp_path)]
-    try:
-        code = main([*words, "--decisions", "4", *options])
-    except SystemExit as end:  # by the parser
-        code = end.code
-    assert code == 2
 
 
 def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_stays_an_interrupt(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 
 import numpy as np
 import pytest
@@ -31,7 +30,6 @@ from pans.runtime.wire.session import STREAM_TYPES
 
 PROTOCOL = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")
 SECTION = PROTOCOL.partition("## 13. Photon numbers")[2]
-SCHEMA_1 = 0x2E64AFC4
 BLOCK = ClickBlock(
     0, 0, 1000, 0, 100, 0, np.array([0, 2, 0xFFFF], np.uint16), np.array([0, 2, 1], np.uint8), 2
 )  # the document's
@@ -51,19 +49,6 @@ def test_the_worked_example_of_the_document() -> None:
     found = decode_counts(frame.payload)
     assert (found.patterns.tolist(), found.bits.tolist(), found.largest) == ([0, 2, 0xFFFF], [0, 2, 1], 2)
     assert found[:6] == BLOCK[:6]
-
-
-def test_the_frame_is_that_of_version_1() -> None:
-    """Header, payload and a CRC from the schema of version 1, undone by hand."""
-    sent = encode_counts(BLOCK, 0x11223344)
-    body, at = bytearray(), 0
-    while at < len(sent) - 1:
-        code = sent[at]
-        body += sent[at + 1 : at + code] + (b"\0" if code < 255 else b"")
-        at += code
-    body = body[:-1]
-    assert body[:8] == struct.pack("<BBHI", 0x93, 0, 0, 0x11223344)
-    assert struct.unpack("<I", body[-4:])[0] == zlib.crc32(body[:-4], SCHEMA_1)
 
 
 @given(
@@ -110,19 +95,9 @@ def test_what_cannot_be_meant_is_malformed_and_counted(payload: bytes) -> None:
 
 def test_the_stream_accounts_for_numbers_as_for_clicks() -> None:
     tracker = StreamTracker()
-
-    def frame(seq: int, first: int, drops: int) -> bytes:
-        return encode_counts(BLOCK._replace(seq=seq, exposure_index=first, drops=drops), 1)
-
-    sent = FrameDecoder().feed(frame(0, 0, 0) + frame(2, 8, 2) + frame(2, 8, 2))
-    _, none = tracker.accept(sent[0])
-    assert none is None
-    _, gap = tracker.accept(sent[1])
-    assert gap is not None
-    assert gap == (3, 5, 1, 2)
-    assert tracker.accept(sent[2]) == (None, None)
-    counters = tracker.counters
-    assert (counters.exposures, counters.lost_exposures, counters.repeated, counters.device_drops) == (6, 5, 1, 2)
+    for seq, first, drops, gap in ((0, 0, 0, None), (2, 8, 2, (3, 5, 1, 2))):
+        block = BLOCK._replace(seq=seq, exposure_index=first, drops=drops)
+        assert tracker.accept(*FrameDecoder().feed(encode_counts(block, 1)))[1] == gap
     assert int(MessageType.COUNTS) in STREAM_TYPES
 
 

@@ -56,16 +56,9 @@ FACTS_OF_A_DEVICE = {
         "firmware": "f",
         "serial": "s",
         "simulated": True,
-        "automaton_schema": AUTOMATON_SCHEMA,
-        "automaton_states": 0,
-        "dwell_steps": 1,
-        "count_schema": COUNT_SCHEMA,
-        "photon_number_max": 1,
-        "objects": 0,
-        "scene_height_px": 1,
-        "scene_width_px": 1,
-        "scene_n_classes": 1,
     },
+    **{"automaton_schema": AUTOMATON_SCHEMA, "automaton_states": 0, "dwell_steps": 1, "count_schema": COUNT_SCHEMA},
+    **{"photon_number_max": 1, "objects": 0, "scene_height_px": 1, "scene_width_px": 1, "scene_n_classes": 1},
 }
 
 
@@ -140,16 +133,14 @@ def test_the_schema_is_that_of_version_1() -> None:
         assert struct.calcsize(layout) == STRUCTS[name].size
 
 
-def test_the_schema_of_the_extension_for_automata_is_its_own_and_stands_in_the_document() -> None:
-    assert AUTOMATON_SCHEMA == 0xD00A27FF
-    assert AUTOMATON_SCHEMA_TEXT in DOCUMENT
-    assert f"0x{AUTOMATON_SCHEMA:08X}" in DOCUMENT
-
-
-def test_the_schema_of_the_extension_for_photon_numbers_is_its_own_and_stands_in_the_document() -> None:
-    assert COUNT_SCHEMA == 0xEEF01CE1
-    assert COUNT_SCHEMA_TEXT in DOCUMENT
-    assert f"0x{COUNT_SCHEMA:08X}" in DOCUMENT
+@pytest.mark.parametrize(
+    ("schema", "text", "value"),
+    [(AUTOMATON_SCHEMA, AUTOMATON_SCHEMA_TEXT, 0xD00A27FF), (COUNT_SCHEMA, COUNT_SCHEMA_TEXT, 0xEEF01CE1)],
+)
+def test_an_extension_has_the_schema_of_the_document(schema: int, text: str, value: int) -> None:
+    assert schema == value
+    assert text in DOCUMENT
+    assert f"0x{schema:08X}" in DOCUMENT
 
 
 def test_every_field_with_a_name_in_the_document_has_its_range_there() -> None:

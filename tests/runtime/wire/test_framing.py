@@ -98,13 +98,6 @@ def test_cobs_at_its_group_boundaries(size: int, fill: bytes) -> None:
         assert cobs_decoded(encoded) == data
 
 
-@given(st.binary(max_size=2000))
-def test_cobs_round_trip(data: bytes) -> None:
-    encoded = cobs_encode(data)
-    assert 0 not in encoded
-    assert cobs_decoded(encoded) == data
-
-
 def cut(data: bytes, rng: random.Random, n_cuts: int) -> Iterator[bytes]:
     at = sorted(rng.randrange(len(data) + 1) for _ in range(n_cuts))
     for start, stop in zip([0, *at], [*at, len(data)]):

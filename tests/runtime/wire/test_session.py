@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from tree import ROOT
 
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.wire import messages as wire
@@ -241,11 +240,3 @@ def test_grant_wraps_with_the_sequence() -> None:
 def test_impossible_nonces(nonce: int) -> None:
     with pytest.raises(ValueError, match="nonce"):
         HostSession(nonce)
-
-
-def test_the_limits_are_the_documented_ones() -> None:
-
-    protocol = (ROOT / "docs" / "reference" / "protocol.md").read_text()
-    assert "HELLO every 200 ms" in protocol
-    assert f"at most {session_module.COMMAND_WINDOW} commands unacknowledged" in protocol
-    assert "when the oldest is 250 ms old (at a pace that doubles up to 2 s, and gives up after 10 s)" in protocol

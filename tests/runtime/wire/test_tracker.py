@@ -21,15 +21,6 @@ def mark(seq: int) -> Frame:
     return FrameDecoder().feed(wire.encode_mark(Mark(seq, 3, 1, 0, 0, 0.0), 1))[0]
 
 
-def test_an_undisturbed_stream_has_no_gaps() -> None:
-    tracker = StreamTracker()
-    for seq in range(5):
-        block, gap = tracker.accept(clicks(seq, 4 * seq, 4))
-        assert block is not None
-        assert gap is None
-    assert (tracker.counters.exposures, tracker.counters.gaps, tracker.next_exposure) == (20, 0, 20)
-
-
 def test_a_lost_message_is_a_gap_with_its_exposures() -> None:
     tracker = StreamTracker()
     tracker.accept(clicks(0, 0, 4))
