@@ -1,7 +1,7 @@
 """Whole runs under faults in virtual time, judged afterwards from outside.
 
 `run_case` lets the real host (`run_live`) run against a simulated instrument behind a bad link. Three parties keep books that share
-no code: the instrument logs what it emits and executes, `ObservedLink` decodes what passes on the wire, the host records. `judge.py`
+no code: the instrument logs what it emits and executes, `ObservedLink` decodes what passes on the wire, the host records. `run_judge.py`
 compares them when the run is over.
 """
 
@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 from run_books import DeviceLog, LoggedInstrument, ObservedLink, SlowReads
-from run_judge import FlowJudge, Judge
-from small_flows import KINDS, SmallFlow, small_flow
+from run_judge import Judge
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.ports.faults import NAMES, parse_faults
@@ -30,17 +29,14 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import LinkError
-from pans.runtime.flow.core import FlowCore
 from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
-from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import Recorder, read_recording
 
 SHOTS = 1
-STILL = (
+MODES = (
     "sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", "host-driven-counts",
     "device-driven-detectors", "host-driven-detectors",
 )  # fmt: skip
-MODES = (*STILL, *KINDS)
 CASES = ("none", *NAMES, "host_stop", "all")
 # Slow faults come more often here than usually: a run lasts some five seconds of virtual time.
 GRID_TIMES = {
@@ -92,17 +88,12 @@ class Case:
     scene: Any
     bundle: Any
     plan: Plan
-    core: Core | FlowCore
+    core: Core
     n_cycles: int
-    flow: SmallFlow | None = None
 
     @classmethod
     def of(cls, mode: str, frames: int) -> Case:
         """Return a case of one of MODES that gives about `frames` stream messages."""
-        if mode in KINDS:
-            flow = small_flow(mode)
-            n_cycles = max(1, frames // _blocks_of(flow.plan))
-            return cls(flow.profile, flow.scene, flow.bundle, flow.plan, flow.core(n_cycles), n_cycles, flow)
         profile, bundle, plan = small_setup(mode)
         images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
         scene = scene_from_arrays("grid", images, np.arange(6) % 3, ("a", "b", "c"))
@@ -124,7 +115,7 @@ class Case:
             facts["channels_at_once"] = plan.channels_at_once
         elif plan.largest > 1:
             facts["photon_number_max"] = plan.largest
-        return facts if self.flow is None else facts | {"flow": FlowRun(self.core, None).header()}
+        return facts
 
 
 def case_faults(case: str) -> str:
@@ -171,14 +162,11 @@ def run_case(
     device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
     slow = 0.0 if one.plan.drive == "host" else SLOW_READS
     link = ObservedLink(SlowReads(device, clock, f"grid:{case}", seed, slow))
-    flow = FlowRun(one.core, None) if isinstance(one.core, FlowCore) else None
 
     def prepared(run: LiveRun) -> None:
         host.began = True
-        if flow is not None:
-            flow.prepared(run)
 
-    judge = Judge(one.plan, SHOTS) if one.flow is None else FlowJudge(one.flow)
+    judge = Judge(one.plan, SHOTS)
     config = RunOptions(shots=SHOTS, n_cycles=one.n_cycles, deadline_us=1e9, realtime=False)
     result: RunResult | None = None
     with TemporaryDirectory() as folder:

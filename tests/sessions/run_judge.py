@@ -12,17 +12,13 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any, NamedTuple
 
-import naive_flow
 import numpy as np
 from run_books import STOPPED, DeviceLog, Emitted, Heard, ObservedLink
-from small_flows import SmallFlow
 
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
-from pans.runtime.flow.settings import BACKGROUND_BITS
 from pans.runtime.live import RunResult
 from pans.runtime.record import Recording, replay
 from pans.runtime.wire.messages import (
@@ -42,8 +38,6 @@ from pans.runtime.wire.session import STREAM_TYPES
 MAX_VIOLATIONS = 20
 DECODED = ("frames", "crc_errors", "cobs_errors", "short_frames", "oversized_frames")
 LATE_ANSWER = ("the link was lost before the device answered", "no answer before the end of the run")
-NEAR = 2  # exposures that a window may be beside the centre of a cell, rounding included
-SWING = 0.3  # of a pitch, by which a tape that is tracked may be early or late
 
 
 @dataclass(slots=True)
@@ -339,104 +333,6 @@ class Judge:
         found = int(row["counts_crc"]), int(row["exposures"]), int(row["exposure_index"])
         if flagged or found != wanted:
             self.fail(f"decision {row['index']}: clicks, exposures and the last are {found}, emitted were {wanted}")
-
-
-class FlowJudge(Judge):
-    """The same for objects in flow: each that passed is decided once, from its own clicks, or is reported as spoilt."""
-
-    def __init__(self, flow: SmallFlow) -> None:
-        super().__init__(flow.plan, 1)
-        core = flow.core(0)
-        self._limits, self._settings, self._frames, self._table = (
-            core.limits,
-            flow.settings,
-            core.frames,
-            flow.bundle.table,
-        )
-        self._dark_cycle = flow.plan.slots_per_cycle if flow.settings.dark_every else 0
-        period_us = flow.plan.slot_period_ticks * flow.plan.tick_us
-        if flow.settings.kind == "tape":  # exposures from one position to the next, and where the first stands
-            self._pitch = 1e6 / flow.settings.bars_per_s / period_us
-            self._origin = (
-                flow.settings.first_bar * 1e6 / flow.settings.bars_per_s - flow.plan.exposure_us / 2
-            ) / period_us
-
-    def decisions(self, stream: Stream, rows: Any) -> int:
-        """See Judge."""
-        return self._cells(stream, rows) if self._settings.kind == "cells" else self._bars(stream, rows)
-
-    def _cells(self, stream: Stream, rows: Any) -> int:
-        limits = self._limits
-        clicks = [
-            None if not came else 0 if self._is_dark(at) else int(word).bit_count()
-            for at, (word, came) in enumerate(zip(stream.words[: stream.end].tolist(), stream.delivered.tolist()))
-        ]
-        background = Fraction(limits.background, 1 << BACKGROUND_BITS)
-        passed = naive_flow.passages(
-            clicks, limits.onset_frames, limits.onset_clicks, limits.release_clicks, limits.longest, limits.refractory,
-            background,
-        )  # fmt: skip
-        taken = 0
-        for (first, last, centre, _, broken, too_long), row in zip(passed, rows):
-            middle = int(row["exposure_index"]) - (self._frames - 1) / 2
-            if abs(middle - (first + centre)) > NEAR:
-                self.fail(f"decision {row['index']} is centred at {middle}, a cell was at {first + centre}")
-            must = DecisionFlag.GAP if broken else DecisionFlag(0)
-            if not broken and (too_long or last - first >= limits.longest):
-                must = DecisionFlag.COINCIDENCE
-            self._sound(stream, row, must, DecisionFlag.COINCIDENCE)
-            taken += 1
-        if taken < len(passed):
-            self.fail(f"{len(passed) - taken} cells were never decided")
-        if taken < len(rows) and rows[taken]["flags"] & DecisionFlag.INCOMPLETE:
-            taken += 1  # an object that was still in the field
-        return taken
-
-    def _bars(self, stream: Stream, rows: Any) -> int:
-        taken, before = 0, -1
-        for row in rows:
-            last = int(row["exposure_index"])
-            if last <= before or last >= stream.end:
-                break
-            away = last - (self._frames - 1) - self._start(taken)
-            if self._settings.track:
-                away = last - before - self._pitch if before >= 0 else 0.0
-            if abs(away) > (SWING * self._pitch if self._settings.track else 1.0):
-                self.fail(f"position {taken} ends with exposure {last}, {away:.1f} away from where it is aligned")
-            self._sound(stream, row, DecisionFlag(0), DecisionFlag(0))
-            taken, before = taken + 1, last
-        following = (
-            before + (1 + SWING) * self._pitch + 1 if self._settings.track else self._start(taken) + self._frames
-        )
-        if taken and following + 1 < stream.end:
-            self.fail(f"position {taken} was never decided: exposures up to {stream.end} came")
-        if taken < len(rows) and rows[taken]["flags"] & DecisionFlag.INCOMPLETE:
-            taken += 1
-        return taken
-
-    def _start(self, position: int) -> float:
-        return self._origin + position * self._pitch - (self._frames - 1) / 2
-
-    def _is_dark(self, exposure: int) -> bool:
-        return bool(self._dark_cycle) and exposure % self._dark_cycle == self._dark_cycle - 1
-
-    def _sound(self, stream: Stream, row: Any, must: DecisionFlag, may: DecisionFlag) -> None:
-        """Compare flags, clicks and label of a decision with what was emitted in its window."""
-        last, flags = int(row["exposure_index"]), DecisionFlag(int(row["flags"]))
-        window = [at for at in range(last - self._frames + 1, last + 1) if 0 <= at < len(stream.words)]
-        missing = len(window) < self._frames or not stream.delivered[window].all() or any(map(self._is_dark, window))
-        must |= DecisionFlag.GAP if missing else DecisionFlag(0)
-        words = stream.words[window].tolist()
-        counts = np.array(
-            [sum(word >> channel & 1 for word in words) for channel in range(self.plan.n_patterns)], np.int64
-        )
-        label = int(self._table[sum(int(count) << channel for channel, count in enumerate(counts))].argmax())
-        crc, clicks = (0, 0) if flags & DecisionFlag.GAP else (zlib.crc32(counts.tobytes()), int(counts.sum()))
-        may |= must | (DecisionFlag.AMBIGUOUS if self._settings.sure else DecisionFlag(0)) | DecisionFlag.ABSTAINED
-        wanted = crc, clicks, NO_LABEL if flags else label
-        found = int(row["counts_crc"]), int(row["clicks"]), int(row["label"])
-        if must & ~flags or flags & ~may or bool(flags) != bool(flags & DecisionFlag.ABSTAINED) or found != wanted:
-            self.fail(f"decision {row['index']}: {flags!r}, due {must!r}; CRC, clicks, label {found}, emitted {wanted}")
 
 
 def _decoded(frame: Frame) -> Any:

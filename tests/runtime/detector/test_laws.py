@@ -233,3 +233,9 @@ def test_no_shipped_profile_leaves_the_stated_range() -> None:
 def test_a_profile_gives_its_dead_time_to_the_afterpulses() -> None:
     profile = changed("dmd-spad", afterpulse_time_us=50.0, dead_time_ns=500.0)
     assert afterpulses_of(profile, 50.0).dead == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("wrong", [(0.7, 1.0), (-0.1, 0.0), (0.1, float("inf")), (0.1, 1.0, -1.0)])
+def test_what_no_traps_do_is_refused(wrong: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="allowed"):
+        Afterpulses(*wrong)

@@ -1,4 +1,4 @@
-"""What the simulator does with neighbours, jitter, jumping pixels and a drifting threshold, against single events."""
+"""What the simulator does with traps, neighbours, jitter, jumping pixels and a drifting threshold, against single events."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lab_readout import crosstalk, jittered, telegraph
+from readout_events import crosstalk, jittered, telegraph
+from single_events import rounds_of
 
 from pans.firmware_sim.scene.changes import Changes, Telegraph
 from pans.firmware_sim.scene.detector import sample_clicks
@@ -15,11 +16,39 @@ from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model
 from pans.firmware_sim.scene.drawing import moved_parts
 from pans.firmware_sim.scene.moving import Change
 from pans.firmware_sim.scene.scene_file import reading_changes, scene_on_table
+from pans.runtime.detector import Afterpulses
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.instrument.profile import Profile, load_profile
 
 SIGMAS = 4.5
+SEQUENCE = (1.5, 0.1, 0.02, 0.8, 3.0, 0.05, 0.3, 0.0)  # mean photoelectrons of exposures one after the other
+
+
+@pytest.mark.parametrize("law", [Afterpulses(0.1, 2.0, 0.2), Afterpulses(0.2, 1.0, 0.5, True)])
+def test_the_simulator_clicks_as_trapped_carriers_do(law: Afterpulses) -> None:
+    n, rounds = len(SEQUENCE), 12
+    model = DetectorModel(
+        ClickLaw(), law.probability, trap_time=law.time, pause=law.pause, on_in_pause=law.free_running
+    )
+    chance = np.tile(-np.expm1(-np.array(SEQUENCE)), 8000)[:, None]
+    found = sample_clicks(model, chance, 11, 0, np.zeros(1, np.uint8))[:, 0].reshape(-1, n)
+    facts = {"pause": law.pause, "free_running": law.free_running, "afterpulse": law.probability, "tau": law.time}
+    single = rounds_of(list(SEQUENCE * rounds), 2000, 4, **facts).reshape(2000, rounds, n)
+    expected = single[:, rounds // 2 :].mean(axis=(0, 1))  # the traps have settled
+    errors = np.sqrt(np.maximum(expected * (1 - expected), 1e-4) * (1 / len(found) + 1 / 12_000))
+    assert np.all(np.abs(found.mean(axis=0) - expected) < SIGMAS * errors)
+
+
+def test_how_exposures_are_cut_into_batches_changes_no_click() -> None:
+    model = DetectorModel(
+        ClickLaw(), 0.3, trap_time=3.0, pause=0.1, crosstalk_probability=0.1, crosstalk_further=(0.05,)
+    )
+    chance, none = np.full((40, 5), 0.2), np.zeros(5, np.uint8)
+    whole = sample_clicks(model, chance, 2, 100, none)
+    memory = np.zeros(5)
+    parts = [sample_clicks(model, chance[a:b], 2, 100 + a, none, memory) for a, b in ((0, 1), (1, 17), (17, 40))]
+    assert np.array_equal(whole, np.concatenate(parts))
 
 
 def test_crosstalk_reaches_as_far_as_is_stated() -> None:
