@@ -170,7 +170,8 @@ class Receiver:
         run = self._run
         connection, link = run.connection, run.connection.link
         chunks, self._asked = connection.chunks(poll_s, asked=self._asked), False
-        gathers = isinstance(self._core, Core) and self._core.takes and run.driver is None
+        core, ahead = self._core, hasattr(link, "read_ahead")
+        gathers = isinstance(core, Core) and core.takes and run.driver is None and (core.windows.parallel or ahead)
         if not (link.virtual and gathers and chunks) or self._prompt:
             return chunks
         left = run.messages_granted - count_delimiters(chunks[0].data)
