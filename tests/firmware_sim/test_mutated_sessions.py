@@ -11,7 +11,6 @@ from mutated_sessions import STAMP, Mutation, Session, Stage, by, to
 
 from pans.runtime.commands.one_run import _exit_code
 
-ALL = 1 << 30
 SECOND = 1_000_000  # ticks of the instrument in these sessions
 
 
@@ -183,9 +182,3 @@ def test_a_device_that_never_ends_its_plan_does_not_keep_the_host(
         summary = ended(one.run(tmp_path, 1, Mutation("ARM", "n_cycles", *by(1_000_000))))
         assert summary.ended == "the device goes on beyond its plan"
         assert (summary.verdict, _exit_code(summary)) == ("FAIL", 4)
-
-
-def test_over_a_socket_in_real_time_the_host_finds_the_same(tmp_path: Path) -> None:
-    stage = Stage("sequential", "tcp")
-    session = stage.run(tmp_path, 1, Mutation("CLICKS", "object_index", *by(17), most=1))
-    assert "object" in ended(session).contradictions

@@ -8,12 +8,10 @@ decisions, and no PASS where the evidence contradicts what was said.
 from __future__ import annotations
 
 import struct
-import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,16 +19,14 @@ from typing import Any, NamedTuple
 import msgpack
 import numpy as np
 
-from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
+from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.shell import TcpPort, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import Scene, scene_from_arrays
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError
-from pans.runtime.link.base import Link, open_link
 from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.report.summary import Summary, summarise
@@ -245,10 +241,10 @@ class Session:
 
 
 class Stage:
-    """What sessions of one mode have in common, made once; `over` is "virtual", or "tcp" for a socket in real time."""
+    """What sessions of one mode have in common, made once."""
 
-    def __init__(self, mode: str, over: str = "virtual") -> None:
-        self.mode, self._over = mode, over
+    def __init__(self, mode: str) -> None:
+        self.mode = mode
         self.profile, self.bundle, self.plan = small_setup(mode)
         images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
         self.scene: Scene = scene_from_arrays("fields", images, np.arange(6) % 3, ("a", "b", "c"))
@@ -279,12 +275,11 @@ class Stage:
 
     def _run(self, path: Path, seed: int, session: Session) -> None:
         clock = DeviceClock(self.profile.clock.tick_hz)
-        start_ns = time.perf_counter_ns() if self._over == "tcp" else START_NS
-        device = Instrument(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(start_ns))
+        device = Instrument(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
         exposures = OBJECTS * self.plan.cycles_per_object * self.plan.slots_per_cycle
         evidence = Evidence(exposures, len(self.bundle.classes), self.profile.clock.tick_hz)
-        with tcp_link(device, clock) if self._over == "tcp" else virtual_link(device, clock) as way:
-            self._drive(MutatedLink(way, session.mutations, evidence), path, session)
+        link = VirtualLink(device, clock, "fields")
+        self._drive(MutatedLink(link, session.mutations, evidence), path, session)
 
     def _drive(self, link: MutatedLink, path: Path, session: Session) -> None:
         # No claim on the processor: many sessions share it, and none is judged by its latencies.
@@ -311,23 +306,3 @@ class Stage:
             session.wrong.append(
                 f"a replay gives {again.decisions} decisions of {recording.n_decisions}, or other ones"
             )
-
-
-@contextmanager
-def virtual_link(device: SteppedDevice, clock: DeviceClock) -> Iterator[Link]:
-    """A link to `device` whose time passes while the host waits."""
-    yield VirtualLink(device, clock, "fields")
-
-
-@contextmanager
-def tcp_link(device: SteppedDevice, clock: DeviceClock) -> Iterator[Link]:
-    """A socket to `device`, which a thread serves in real time."""
-    port, stopped = TcpPort("127.0.0.1", 0), threading.Event()
-    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
-    thread.start()
-    try:
-        yield open_link(port.url)
-    finally:
-        stopped.set()
-        thread.join(2.0)
-        port.close()

@@ -13,7 +13,6 @@ from pans.firmware_sim.scene.detector import sample_clicks
 from pans.firmware_sim.scene.detector_model import detector_model
 from pans.runtime.core.calibration import CalibrationCore, calibration_exposure_us, counts_of, design_run, profile_level
 from pans.runtime.decide import make_decider
-from pans.runtime.detector.crosstalk import with_crosstalk
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.evaluate.accuracy import Light, evaluate_exactly, evaluate_sampled, light_of, sampled_shares
 from pans.trainer.evaluate.readings import Numbers
@@ -136,21 +135,3 @@ def test_a_calibration_takes_the_clicks_of_all_neighbours_back() -> None:
         )  # the light that is left when its neighbours are taken away
         wanted = design.drives[channel] * level
         assert found == pytest.approx(wanted, abs=5 * math.sqrt(math.expm1(2.2) / n))
-
-
-def test_training_clicks_as_often_as_the_evaluation() -> None:
-    torch = pytest.importorskip("torch", reason="needs the train extra")
-    from trainings import bars_task
-
-    from pans.trainer.options import Options
-    from pans.trainer.train.data import TrainingData
-    from pans.trainer.train.loop import Run
-
-    options = Options(features=5, epochs=2, batch=50, restarts=1)
-    found = []
-    for profile in (neighbours(), neighbours(crosstalk_probability=0.0, crosstalk_further=())):
-        torch.manual_seed(0)
-        run = Run(TrainingData(bars_task(200), profile, options), profile, options, restart=0)
-        found.append(run.probabilities(0, 50).numpy())
-    assert found[0] == pytest.approx(with_crosstalk(found[1], KERNEL), rel=1e-9)
-    assert (found[0] > found[1]).all()

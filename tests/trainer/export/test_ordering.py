@@ -14,37 +14,53 @@ from pans.runtime.bundle.layers import Layer, quantise_head
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.imaging import Bleaching
-from pans.runtime.instrument.profile import load_profile
+from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.dose import of_first, training_readings
 from pans.trainer.export.ordering import information_order, reordered
 from pans.trainer.tasks.registry import Objects
 
-IDEAL = load_profile("ideal")
+IDEAL, COUNTING = load_profile("ideal"), load_profile("dmd-qcmos")
+OUTCOMES = 3
 RNG = np.random.default_rng(21)
 IMAGES = RNG.integers(0, 256, (24, 2, 3), dtype=np.uint8)
 LABELS = RNG.integers(0, 3, 24)
 OBJECTS = Objects(IMAGES, LABELS)
 
 
-def bundle_of(d_f: int, levels: np.ndarray | None = None) -> Bundle:
-    layers = (
+def layers_of(d_f: int) -> tuple[Layer, ...]:
+    return (
         Layer(RNG.normal(size=(d_f, 6)).astype(np.float32), RNG.normal(size=6).astype(np.float32), True),
         Layer(RNG.normal(size=(6, 3)).astype(np.float32), RNG.normal(size=3).astype(np.float32), False),
     )
+
+
+def bundle_of(d_f: int, levels: np.ndarray | None = None) -> Bundle:
+    layers = layers_of(d_f)
     shown = RNG.integers(1, 16, (d_f, 6)) if levels is None else levels
     facts = {"levels": 16, "pattern_levels": shown, "photons_per_level": 0.1, "image_shape": (2, 3)}
     return made_bundle(d_f, 3, head_onnx=chain_onnx(layers), int8_head=quantise_head(layers), **facts)
 
 
-def bits_of(probability: np.ndarray) -> float:
-    """I(class; clicks) in bits, by the definition: all words, all classes, all objects."""
-    n, d_f = probability.shape
-    total = 0.0
-    of_class = np.bincount(LABELS, minlength=3) / n
-    for word in itertools.product((0, 1), repeat=d_f):
-        chance = [math.prod(p if bit else 1 - p for p, bit in zip(row, word)) / n for row in probability]
+def bundle_of_numbers(d_f: int = 3) -> Bundle:
+    levels = RNG.integers(0, 2, (d_f, 6)) | np.eye(d_f, 6, dtype=np.int64)
+    facts = {"image_shape": (2, 3), "levels": 2, "pattern_levels": levels, "photons_per_level": 1.3}
+    return made_bundle(d_f, 3, head_onnx=chain_onnx(layers_of(d_f)), outcomes=OUTCOMES, **facts)
+
+
+def chances_of(bundle: Bundle, profile: Profile, **bleaching: Bleaching) -> np.ndarray:
+    """Chances of the outcomes, float64 (objects, patterns, outcomes)."""
+    light = light_of(bundle, profile, IMAGES, **bleaching)
+    return light.chances if bundle.outcomes > 2 else np.stack([1 - light.probability, light.probability], axis=2)
+
+
+def bits_of(chances: np.ndarray) -> float:
+    """I(class; outcomes) in bits, by the definition: all words, all classes, all objects."""
+    n, d_f, outcomes = chances.shape
+    of_class, total = np.bincount(LABELS, minlength=3) / n, 0.0
+    for word in itertools.product(range(outcomes), repeat=d_f):
+        chance = [math.prod(row[i][number] for i, number in enumerate(word)) / n for row in chances]
         for label in range(3):
             joint = sum(c for c, own in zip(chance, LABELS) if own == label)
             if joint > 0:
@@ -53,22 +69,26 @@ def bits_of(probability: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("by", ["information", "dose"])
-def test_the_order_takes_what_tells_most_next(by: str) -> None:
-    bundle = bundle_of(4)
-    probability, light = light_of(bundle, IDEAL, IMAGES).probability, bundle.patterns().sum(axis=1)
+@pytest.mark.parametrize("counts", [False, True], ids=["clicks", "numbers"])
+def test_the_order_takes_what_tells_most_next(by: str, counts: bool) -> None:
+    bundle, profile = (bundle_of_numbers(), COUNTING) if counts else (bundle_of(4), IDEAL)
+    chances, light = chances_of(bundle, profile), bundle.patterns().sum(axis=1)
+    assert chances.sum(axis=2) == pytest.approx(1.0)
     chosen: list[int] = []
     bits: list[float] = []
-    while len(chosen) < 4:
-        rest = [j for j in range(4) if j not in chosen]
-        after = {j: bits_of(probability[:, [*chosen, j]]) for j in rest}
+    while rest := [j for j in range(bundle.n_patterns) if j not in chosen]:
+        after = {j: bits_of(chances[:, [*chosen, j]]) for j in rest}
         before = bits[-1] if bits else 0.0
         best = max(rest, key=lambda j: (after[j] - before) / (light[j] if by == "dose" else 1.0))
         chosen.append(best)
         bits.append(after[best])
-    found = information_order(bundle, IDEAL, OBJECTS, by=by)
+    found = information_order(bundle, profile, OBJECTS, by=by)
     assert found.patterns == tuple(chosen)
     assert found.exact
     assert found.bits == pytest.approx(bits, abs=1e-12)
+    bleached = information_order(bundle, profile, OBJECTS, by=by, bleaching=Bleaching(3.0))
+    left = chances_of(reordered(bundle, bleached.patterns, {}), profile, bleaching=Bleaching(3.0))
+    assert bleached.bits[-1] == pytest.approx(bits_of(left), abs=1e-12)
 
 
 def test_a_sample_that_bleaches_changes_the_order() -> None:
@@ -83,8 +103,8 @@ def test_a_sample_that_bleaches_changes_the_order() -> None:
     bleaching = information_order(bundle, IDEAL, objects, bleaching=Bleaching(0.1))
     assert steady.patterns == (0, 1, 2)
     assert bleaching.patterns == (0, 2, 1) or bleaching.patterns == (1, 2, 0)
-    light = light_of(reordered(bundle, bleaching.patterns, {}), IDEAL, images, bleaching=Bleaching(0.1))
-    shown = bits_of(light.probability)
+    p = light_of(reordered(bundle, bleaching.patterns, {}), IDEAL, images, bleaching=Bleaching(0.1)).probability
+    shown = bits_of(np.stack([1 - p, p], axis=2))
     assert bleaching.bits[-1] == pytest.approx(shown, abs=1e-12)
 
 
@@ -130,82 +150,19 @@ def test_the_command_orders_and_caps(tmp_path: Path, capsys: pytest.CaptureFixtu
     capped = json_of(capsys, "evaluate", tmp_path / "new.pans", *words, "--dose-cap", cap)
     assert capped["accuracy_mean"] == pytest.approx(judged["accuracy_mean"], abs=1e-12)
     assert capped["illumination"] == pytest.approx(cap)
-    refused = json_of(capsys, "order", bundle_file(tmp_path), "--by", "none", "-o", tmp_path / "no.pans", code=2)
+    refused = json_of(capsys, "order", tmp_path / "old.pans", "--by", "none", "-o", tmp_path / "no.pans", code=2)
     assert "changes nothing" in refused["error"]["message"]
     assert not (tmp_path / "no.pans").exists()
-
-
-def bundle_file(folder: Path) -> Path:
-    return folder / "old.pans"
-
-
-PROFILE = load_profile("dmd-qcmos")
-RNG_ORDERED_NUMBERS = np.random.default_rng(33)
-OUTCOMES = 3
-
-
-def bundle_of_ordered_numbers(d_f: int = 3) -> Bundle:
-    layers = (
-        Layer(
-            RNG_ORDERED_NUMBERS.normal(size=(d_f, 6)).astype(np.float32),
-            RNG_ORDERED_NUMBERS.normal(size=6).astype(np.float32),
-            True,
-        ),
-        Layer(
-            RNG_ORDERED_NUMBERS.normal(size=(6, 3)).astype(np.float32),
-            RNG_ORDERED_NUMBERS.normal(size=3).astype(np.float32),
-            False,
-        ),
-    )
-    levels = RNG_ORDERED_NUMBERS.integers(0, 2, (d_f, 6)) | np.eye(d_f, 6, dtype=np.int64)
-    facts = {"image_shape": (2, 3), "levels": 2, "pattern_levels": levels, "photons_per_level": 1.3}
-    return made_bundle(d_f, 3, head_onnx=chain_onnx(layers), outcomes=OUTCOMES, **facts)
 
 
 def row_of(word: np.ndarray) -> int:
     return int(sum(int(number) * OUTCOMES**place for place, number in enumerate(word)))
 
 
-def bits_of_ordered_numbers(chances: np.ndarray) -> float:
-    """I(class; numbers) in bits, by the definition, of chances (n, patterns, outcomes)."""
-    n, d_f, _ = chances.shape
-    of_class, total = np.bincount(LABELS, minlength=3) / n, 0.0
-    for word in itertools.product(range(OUTCOMES), repeat=d_f):
-        chance = [math.prod(row[i][number] for i, number in enumerate(word)) / n for row in chances]
-        for label in range(3):
-            joint = sum(c for c, own in zip(chance, LABELS) if own == label)
-            if joint > 0:
-                total += joint * math.log2(joint / (sum(chance) * of_class[label]))
-    return total
-
-
-@pytest.mark.parametrize("by", ["information", "dose"])
-def test_numbers_that_tell_most_come_first(by: str) -> None:
-    bundle = bundle_of_ordered_numbers()
-    chances, light = light_of(bundle, PROFILE, IMAGES).chances, bundle.patterns().sum(axis=1)
-    assert chances.sum(axis=2) == pytest.approx(1.0)
-    chosen: list[int] = []
-    bits: list[float] = []
-    while len(chosen) < 3:
-        rest = [j for j in range(3) if j not in chosen]
-        after = {j: bits_of_ordered_numbers(chances[:, [*chosen, j]]) for j in rest}
-        before = bits[-1] if bits else 0.0
-        best = max(rest, key=lambda j: (after[j] - before) / (light[j] if by == "dose" else 1.0))
-        chosen.append(best)
-        bits.append(after[best])
-    found = information_order(bundle, PROFILE, OBJECTS, by=by)
-    assert found.patterns == tuple(chosen)
-    assert found.exact
-    assert found.bits == pytest.approx(bits, abs=1e-12)
-    bleached = information_order(bundle, PROFILE, OBJECTS, by=by, bleaching=Bleaching(3.0))
-    left = light_of(reordered(bundle, bleached.patterns, {}), PROFILE, IMAGES, bleaching=Bleaching(3.0))
-    assert bleached.bits[-1] == pytest.approx(bits_of_ordered_numbers(left.chances), abs=1e-12)
-
-
 def test_what_is_left_of_numbers_sums_over_the_others() -> None:
-    bundle = bundle_of_ordered_numbers()
+    bundle = bundle_of_numbers()
     assert bundle.table is not None
-    readings = training_readings(bundle, PROFILE, OBJECTS)
+    readings = training_readings(bundle, COUNTING, OBJECTS)
     found = of_first(bundle, 2, readings)
     assert (found.n_features, found.outcomes) == (2, OUTCOMES)
     assert found.table is not None
@@ -217,8 +174,8 @@ def test_what_is_left_of_numbers_sums_over_the_others() -> None:
             odds = np.exp(bundle.table[row_of(word)].astype(np.float64))
             joint += chance * odds / odds.sum()
         np.testing.assert_allclose(np.exp(found.table[row_of(np.array(seen))]), joint / joint.sum(), rtol=2e-6)
-    many = bundle_of_ordered_numbers(8)  # 6561 words: the head takes the means
-    readings = training_readings(many, PROFILE, OBJECTS)
+    many = bundle_of_numbers(8)  # 6561 words: the head takes the means
+    readings = training_readings(many, COUNTING, OBJECTS)
     shorter = of_first(many, 2, readings)
     mean = readings.mean(axis=0) @ [0, 1, 2]
     wanted = _head_at(many, np.array([[1.0, 2.0, *mean[2:]]]) / 2)

@@ -114,24 +114,6 @@ def test_restarts_keep_the_best(task):
     assert np.array_equal(best.quantised.pattern_levels, single[int(np.argmin(losses))].quantised.pattern_levels)
 
 
-def test_an_interrupted_training_goes_on_to_the_same_result(task, tmp_path):
-    options = replace(SMALL, epochs=5, restarts=2)
-    whole = train(task, PROFILE, options)
-
-    def interrupt(report):
-        if (report.restart, report.epoch) == (1, 3):
-            raise KeyboardInterrupt
-
-    checkpoint = tmp_path / "state"
-    with pytest.raises(KeyboardInterrupt):
-        train(task, PROFILE, options, checkpoint=checkpoint, report=interrupt)
-    seen = []
-    resumed = train(task, PROFILE, options, checkpoint=checkpoint, resume=True, report=seen.append)
-    assert (seen[0].restart, seen[0].epoch) == (1, 3)  # the last whole epoch on disk is the one before
-    assert np.array_equal(resumed.quantised.pattern_levels, whole.quantised.pattern_levels)
-    assert resumed.validation_losses == whole.validation_losses
-
-
 def test_the_best_start_goes_on_and_an_interruption_changes_nothing(task, tmp_path):
     options = replace(SMALL, epochs=6, starts=3, warm=0.34, polish=0.5, shots=3)
     reports = []
