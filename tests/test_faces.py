@@ -16,8 +16,6 @@ FACES = sorted(
     for path in ROOT.glob(f"{top}/*/__init__.py")
 )
 SLOW_TO_LOAD = ("numba", "onnxruntime", "torch", "matplotlib", "h5py", "serial", "usb", "rich")
-# scipy is not among them: numba loads it where it is installed; that ours names none is checked in test_house.py
-NEVER_IN_RUNTIME = ("torch", "matplotlib", "h5py", "optuna")
 
 
 def loaded_by(package: str, libraries: tuple[str, ...]) -> list[str]:
@@ -29,10 +27,6 @@ def loaded_by(package: str, libraries: tuple[str, ...]) -> list[str]:
 @pytest.mark.parametrize("package", ["pans", "pans.runtime", "pans.runtime.cli", "pans.firmware_sim"])
 def test_what_every_command_loads_is_light(package: str) -> None:
     assert loaded_by(package, SLOW_TO_LOAD) == []
-
-
-def test_no_package_of_the_lean_half_loads_a_heavy_library() -> None:
-    assert loaded_by(", ".join(face for face in FACES if "firmware_sim" not in face), NEVER_IN_RUNTIME) == []
 
 
 @pytest.mark.parametrize("package", FACES)

@@ -11,7 +11,7 @@ import pytest
 
 from pans.runtime.cli import main
 
-BLOCKED = ("torch", "onnx", "PIL", "optuna", "matplotlib", "sklearn", "h5py", "prometheus_client")
+BLOCKED = ("torch", "onnx", "PIL", "optuna", "matplotlib", "sklearn", "h5py", "pyarrow", "prometheus_client")
 NEEDS = {  # command line: what it needs, and the extra that has it
     "train s.npz --features 2 -o new.pans": ("torch", "train"),
     "train s.npz --encoder automaton --photons 3 -o new.pans": ("torch", "train"),
@@ -20,6 +20,8 @@ NEEDS = {  # command line: what it needs, and the extra that has it
     "reproduce alpha --collect --cache new -o out": ("torch", "train"),
     "export r.pansrec --format photon-hdf5 -o new.h5": ("h5py", "export"),
     "bench decide --quick --plot new.png": ("matplotlib", "plot"),
+    "run fashion10 --device sim:ideal?pace=fast --decisions 3 --metrics 0 --out new": ("prometheus-client", "metrics"),
+    "export r.pansrec --format parquet -o new.parquet": ("pyarrow", "parquet"),
     "evaluate fashion10 --task s.npz --objects 2 --pictures new": ("matplotlib", "plot"),
 }
 WORK_WITHOUT = (
@@ -62,17 +64,22 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str]
     folder = tmp_path_factory.mktemp("lean")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        words = [
-            "run",
-            "fashion10",
-            "--device",
-            "sim:oled-qcmos?pace=fast",
-            "--decisions",
-            "3",
-            "--record",
-            "r.pansrec",
-        ]
-        assert main([*words, "-q"]) == 0
+        assert (
+            main(
+                [
+                    "run",
+                    "fashion10",
+                    "--device",
+                    "sim:oled-qcmos?pace=fast",
+                    "--decisions",
+                    "3",
+                    "--record",
+                    "r.pansrec",
+                    "-q",
+                ]
+            )
+            == 0
+        )
     images = np.random.default_rng(0).integers(0, 255, (200, 28, 28)).astype(np.uint8)
     names = ["T-shirt/top", "Trouser", "Pullover", "Dress", "Coat", "Sandal", "Shirt", "Sneaker", "Bag", "Ankle boot"]
     np.savez(folder / "s.npz", images=images, labels=np.arange(200) % 10, classes=np.array(names))

@@ -111,14 +111,6 @@ def test_no_command_writes_into_its_input(name: str, folder: Path, capsys: pytes
     refused([*words.split(), "--force"], folder, "is the input", capsys)
 
 
-@pytest.mark.parametrize("name", [name for name, (words, *_) in COMMANDS.items() if "OUT" in words])
-def test_a_file_in_the_way_of_a_folder_is_found_before(
-    name: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = COMMANDS[name][0].replace("OUT", "b.pans/x").replace("DIR", "new")
-    refused(words.split(), folder, "not a folder", capsys)
-
-
 def test_every_command_is_in_one_of_these_lists() -> None:
     known = {words.split()[0] for words, *_ in COMMANDS.values()} | WRITES_NO_FILE | CHECKED_ELSEWHERE
     assert known == {point.name for point in entry_points(group="pans.commands")}

@@ -145,6 +145,7 @@ BY_HAND = {
         **{more: 2 for more in ("--metrics-public", "--calibration-max-age-h 3", "--rotate-mb 0", "--keep-mb 1", "--drive host")},
         **{more: 2 for more in ("--confidence 0.9", "--flow nonsense", "--profile dmd-spad", "--state no/such/x.json")},
         **{more: 2 for more in ("--metrics nowhere", "--metrics 127.0.0.1:99999", "--metrics 0.0.0.0:9464", "--metrics BUSY")},
+        **{more: 2 for more in ("--serve 0.0.0.0:8000", "--serve example.org:80", "--serve BUSY")},
         **{more: 2 for more in ("--record new.pansrec --trace new.pansrec", "--record b.pans --force", "--trace b.pans --force")},
         **{more: 2 for more in ("--flow cells --decisions 3", "--rotate-mb 1 --on-dark mask", "--backend automaton", "--core 9999")},
     },
@@ -186,7 +187,7 @@ BY_HAND = {
         **{more: 2 for more in ("show --config missing.toml", "monitoring -o new --start 3", "show --config f.toml --watchdog-s 3")},
     },
     "batch": {
-        **{f"{more} -o new.jsonl": 2 for more in ("info none*", "nonsense b.pans", "info missing.pans", "info b.pans --vary x")},
+        **{f"{more} -o new.jsonl": 2 for more in ("info none*", "fuzz b.pans", "info missing.pans", "info b.pans --vary x")},
         **{f"info b.pans -o new.jsonl {more}": 2 for more in ("--vary =3", "--workers 0", "--with '", "--with=--colour")},
         **{f"info b.pans -o {name}": 2 for name in ("new.csv", "no/such/new.jsonl", "b.pans", "fifo.txt")},
         "info b.pans": 2,

@@ -116,35 +116,25 @@ def test_a_full_queue_and_a_full_disk_cost_lines_and_say_so(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs the journal's environment")
 def test_stderr_has_priorities_where_it_is_the_journal(tmp_path: Path) -> None:
-    code = (
+    said = (
         "from pans.runtime.cli import say, warn; from pans.runtime.cli.printing import fail; from pans.runtime.errors import LinkError;"
         "say('a\\nb'); warn('c'); fail(LinkError('d', remedy='e'), 3)"
     )
-    for journal, wanted in (
-        (True, "<6>a\n<6>b\n<4>pans: warning: c\n<3>pans: d\n<3>  remedy: e\n"),
-        (False, "a\nb\npans: warning: c\npans: d\n  remedy: e\n"),
+    events = (
+        "import logging; from argparse import Namespace; from pans.runtime.logs import log_event, logging_of\n"
+        "with logging_of(Namespace(log_file=None, log_format=None, log_rotate_mb=None)):\n"
+        "    log_event('gap', {'lost': 3}, logging.WARNING); log_event('session', {'nonce': 'a\\nb'})"
+    )
+    for code, journal, wanted in (
+        (said, True, "<6>a\n<6>b\n<4>pans: warning: c\n<3>pans: d\n<3>  remedy: e\n"),
+        (said, False, "a\nb\npans: warning: c\npans: d\n  remedy: e\n"),
+        (events, True, "<4>pans: gap lost=3\n<6>pans: session nonce=a\\nb\n"),
     ):
         with open(tmp_path / "stderr", "w") as stderr:
             found = os.fstat(stderr.fileno())
             stream = f"{found.st_dev}:{found.st_ino}" if journal else "1:2"
             subprocess.run([sys.executable, "-c", code], stderr=stderr, env=os.environ | {"JOURNAL_STREAM": stream})
         assert (tmp_path / "stderr").read_text() == wanted
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs the journal's environment")
-def test_events_reach_the_journal_without_a_log_file(tmp_path: Path) -> None:
-    code = (
-        "import logging; from argparse import Namespace; from pans.runtime.logs import log_event, logging_of\n"
-        "with logging_of(Namespace(log_file=None, log_format=None, log_rotate_mb=None)):\n"
-        "    log_event('gap', {'lost': 3}, logging.WARNING); log_event('session', {'nonce': 'a\\nb'})"
-    )
-    with open(tmp_path / "stderr", "w") as stderr:
-        found = os.fstat(stderr.fileno())
-        stream = f"{found.st_dev}:{found.st_ino}"
-        subprocess.run(
-            [sys.executable, "-c", code], stderr=stderr, env=os.environ | {"JOURNAL_STREAM": stream}, check=True
-        )
-    assert (tmp_path / "stderr").read_text() == "<4>pans: gap lost=3\n<6>pans: session nonce=a\\nb\n"
 
 
 def test_a_run_logs_its_words_its_events_and_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from automata import automaton_bundle, random_automaton
-from bundles import made_bundle
-from heads import head_bundle, onnx_chain, random_layers
+from heads import head_bundle, random_layers
 
 from pans.runtime.bench import decide, ingest, streams, turn
 from pans.runtime.bench.rows import (
@@ -63,24 +62,6 @@ def test_every_back_end_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch
     assert 0 < rows["chain int8"]["score_error"] < 0.2
     assert rows["chain float64"]["score_error"] < 1e-5
     assert any(row.get("pareto") for row in rows.values())
-
-
-def test_a_picture_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decide, "cpu_time", lambda work, repeats=1: (work(), Spent(1e-3, 1e-3, 1))[1])
-    bundle = made_bundle(
-        name="chain",
-        task="pictures",
-        classes=(),
-        image_shape=(1, 6),
-        levels=2,
-        pattern_levels=np.eye(6, dtype=np.uint16),
-        photons_per_level=1.0,
-        head_onnx=onnx_chain(random_layers([6, 16, 12])),
-        picture_shape=(3, 4),
-    )
-    row = decide.picture_row(bundle, 50)
-    assert row["name"] == "chain picture of 12 pixels, onnx"
-    assert 0 < row["score_error"] < 1e-5
 
 
 def test_rows_of_walks_have_their_checks() -> None:

@@ -19,7 +19,7 @@ import pytest
 from pans.runtime import __version__, cli
 from pans.runtime.cli import Command, finding, main, printing
 from pans.runtime.cli.command import parser_of
-from pans.runtime.errors import DamagedFileError, LinkError, PansError, TimingError, UsageError
+from pans.runtime.errors import DamagedFileError, LinkError, TimingError, UsageError
 
 
 class Point:
@@ -68,17 +68,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
 def test_exit_codes(installed: dict[str, object], outcome: object, code: int) -> None:
     installed["lab"] = command(outcome)
     assert main(["lab"]) == code
-
-
-def test_an_error_is_two_lines_on_stderr_and_one_object_with_json(
-    installed: dict[str, object], capsys: pytest.CaptureFixture[str]
-) -> None:
-    installed["lab"] = command(PansError("what happened", remedy="do this"))
-    main(["lab", "--json"])
-    out, err = capsys.readouterr()
-    error = {"message": "what happened", "where": "", "remedy": "do this", "exit": 2}
-    assert json.loads(out) == {"error": error}
-    assert err == "pans: what happened\n  remedy: do this\n"
 
 
 def test_json_is_one_object_with_plain_numbers(

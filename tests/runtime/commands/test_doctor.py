@@ -22,16 +22,7 @@ from pans.runtime.link.base import TracedLink
 def test_doctor_on_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json"]) == 0
     findings = json.loads(capsys.readouterr().out)["findings"]
-    assert {
-        "python",
-        "numba",
-        "onnxruntime",
-        "libusb",
-        "clock resolution",
-        "numba cache",
-        "numba's target",
-        "torch's products",
-    } <= {f["check"] for f in findings}
+    assert {"python", "numba", "onnxruntime", "libusb", "numba cache"} <= {finding["check"] for finding in findings}
     assert all(finding["ok"] or finding["remedy"] for finding in findings)
     assert main(["doctor"]) == 0
     assert "ready to run" in capsys.readouterr().out
@@ -62,10 +53,7 @@ def test_what_is_needed_and_missing_is_an_alert(
 
 def test_the_udev_rule_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--udev"]) == 0
-    rule = capsys.readouterr().out
-    assert rule.strip() == udev_rule().strip()
-    assert 'TAG+="uaccess"' in rule
-    assert 'GROUP="dialout"' in rule
+    assert capsys.readouterr().out.strip() == udev_rule().strip()
     assert int(doctor.RULE.partition("-")[0]) < 73  # later, systemd has already handed out the access rights
 
 

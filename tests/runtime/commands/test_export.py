@@ -16,15 +16,6 @@ from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.sent_plan import recorded_plan
 
-# what the format's definition calls mandatory, and that a photon's detector is named
-MANDATORY = {
-    *("acquisition_duration", "description", "photon_data/timestamps", "photon_data/detectors"),
-    *("photon_data/timestamps_specs/timestamps_unit", "setup/num_pixels", "setup/num_spots", "setup/num_spectral_ch"),
-    *("setup/num_polarization_ch", "setup/num_split_ch", "setup/modulated_excitation", "setup/lifetime"),
-    *("setup/excitation_alternated", "identity/format_name", "identity/format_version", "identity/format_url"),
-    *("identity/software", "identity/software_version", "identity/creation_time"),
-}
-
 
 @pytest.fixture(scope="module", params=["oled-qcmos", "wdm-snspd"])
 def run_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -104,28 +95,3 @@ def test_the_clicks_are_in_order_and_within_the_plan(run_of: Path) -> None:
     assert clicks.channel.max() < (plan.n_patterns if plan.mode == "parallel" else 1)
     slot = clicks.exposure % plan.slots_per_cycle
     assert (plan.slot_pattern[slot] == clicks.pattern).all()
-
-
-def test_photon_hdf5_has_what_the_format_demands(
-    run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    h5py = pytest.importorskip("h5py", reason="needs the export extra")
-    found = exported(run_of, "photon-hdf5", tmp_path / "run.h5", capsys)
-    recording = read_recording(run_of)
-    plan = recorded_plan(recording)
-    clicks = click_list(recording, plan)
-    with h5py.File(tmp_path / "run.h5", "r") as file:
-        missing = {name for name in MANDATORY if name not in file}
-        assert not missing
-        assert file.attrs["format_name"] == b"Photon-HDF5"
-        assert file["identity/format_version"][()] == b"0.5"
-        times = file["photon_data/timestamps"][:]
-        assert times.dtype == np.int64
-        assert times.tolist() == clicks.start_tick.tolist()
-        assert len(file["photon_data/detectors"]) == len(times) == found["clicks"]
-        assert file["photon_data/timestamps_specs/timestamps_unit"][()] == pytest.approx(plan.tick_us * 1e-6)
-        assert file["setup/num_pixels"][()] == (5 if plan.mode == "parallel" else 1)
-        seconds = file["acquisition_duration"][()]
-        assert seconds == pytest.approx((clicks.last_tick - clicks.first_tick) * plan.tick_us * 1e-6)
-        assert file["description"][()].startswith(b"SIMULATED")
-        assert (file["user/pans/decisions"][:] == recording.decisions()).all()

@@ -46,16 +46,6 @@ def test_a_run_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert (REACHES in capsys.readouterr().err) is blinded
 
 
-@pytest.mark.data
-@pytest.mark.parametrize("blinded", [False, True])
-def test_an_evaluation_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("torch", reason="needs the train extra")
-    profile = microled(tmp_path, blinded=blinded)
-    words = ["evaluate", str(ADAPTIVE), "--profile", profile, "--objects", "5", "--task", "fashion-mnist"]
-    assert main(words) in (0, 1)
-    assert (REACHES in capsys.readouterr().err) is blinded
-
-
 @pytest.mark.parametrize("encoder", ["active", "automaton"])
 def test_a_training_warns(encoder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("torch", reason="needs the train extra")
@@ -65,7 +55,10 @@ def test_a_training_warns(encoder: str, tmp_path: Path, capsys: pytest.CaptureFi
         "barcode",
         "--profile",
         microled(tmp_path, blinded=True),
-        *["--photons", "4", "--epochs", "1"],
+        "--photons",
+        "4",
+        "--epochs",
+        "1",
         *size,
     ]
     assert main([*words, "--encoder", encoder, "-o", str(tmp_path / "out.pans")]) == 0

@@ -21,12 +21,6 @@ def test_mcnemar_is_the_sign_test_of_discordant_pairs(first: int, second: int, p
     assert statistics.mcnemar_exact(second, first) == statistics.mcnemar_exact(first, second)
 
 
-def test_mcnemar_over_all_signs_of_the_pairs() -> None:
-    n, seen = 9, (2, 7)
-    as_extreme = sum(abs(2 * sum(signs) - n) >= abs(seen[0] - seen[1]) for signs in itertools.product((0, 1), repeat=n))
-    assert statistics.mcnemar_exact(*seen) == pytest.approx(as_extreme / 2**n)
-
-
 def share_of_draws(right_1: int, n_1: int, right_2: int, n_2: int) -> float:
     """Draw in every possible way which objects are right: the share of draws whose first sample is no likelier than the one seen."""
     total = right_1 + right_2

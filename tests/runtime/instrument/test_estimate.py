@@ -47,13 +47,11 @@ def counts_of(drive: list[float], clicks: list[int], exposures: list[int]) -> Co
 def test_likelihood_in_40_digits(level: float, dark: float) -> None:
     mpmath.mp.dps = 40
     n = 1 << 33  # counters past 2**32
-    mean = 2.0 * level + dark
     p = 1 - mpmath.exp(-mpmath.mpf(2.0) * mpmath.mpf(level) - mpmath.mpf(dark))
     clicks = round(n * float(p))
     exact = (clicks * mpmath.log(p) if clicks else 0) + (n - clicks) * mpmath.log(1 - p)
     found = log_likelihood(counts_of([2.0], [clicks], [n]), PLAIN, level, dark)
     assert found == pytest.approx(float(exact), rel=1e-12, abs=1e-12)
-    assert mean >= 0
 
 
 @pytest.mark.parametrize("mean", [1e-9, 1e-3, 0.9, 4.0, 40.0])
@@ -121,6 +119,7 @@ def test_spread_of_patterns(spread: float) -> None:
         assert 0.0 < np.mean(np.array(p_values) < 0.1) < 0.3
 
 
+@pytest.mark.slow
 def test_intervals_cover() -> None:
     some = [few_clicks(20.0, 3_000_009 + trial) for trial in range(150)]
     assert 0.89 <= np.mean([one.level_interval.low <= one.level <= one.level_interval.high for one in some]) <= 0.99

@@ -11,7 +11,7 @@ import pytest
 from tree import ROOT
 
 from pans.runtime.cli import main
-from pans.runtime.instrument.light_level import BATCH, LightWatch, make_baseline
+from pans.runtime.instrument.light_level import LightWatch, make_baseline
 
 
 def dim_clicks(efficiency: float, n: int, seed: int) -> np.ndarray:
@@ -65,12 +65,6 @@ def test_threshold_is_siegmunds() -> None:
             low, high = max(0.0, low - x - base.slack), max(0.0, high + x - base.slack)
         lengths.append(n)
     assert 0.55e4 < np.mean(lengths) < 1.8e4
-
-
-def test_no_clicks_at_all_have_no_baseline() -> None:
-    watch = LightWatch()
-    assert watch.take(np.zeros(50 * BATCH, np.int64)) == []
-    assert watch.baseline is None
 
 
 def test_a_run_with_a_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

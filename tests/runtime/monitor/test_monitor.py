@@ -150,29 +150,40 @@ def test_the_alarm_comes_when_it_was_said_to_come(n_channels: int) -> None:
     raise AssertionError("no alarm")
 
 
-def test_the_pictures_of_a_run_add_up_to_its_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[tuple[Any, History]] = []
+class Watched(Monitor):
+    """Takes a picture after every seventh decision and at the end, and draws nothing."""
 
-    class Watched(Monitor):
-        def begin(self, bundle: Any, recorder: Any, facts: dict[str, Any]) -> None:
-            self.bundle, self.history = bundle, History()
-            self.history.take(json.loads(json.dumps(facts)))
+    def begin(self, bundle: Any, recorder: Any, facts: dict[str, Any]) -> None:
+        self.bundle, self.history, self.pictures = bundle, History(), list[dict[str, Any]]()
+        self.history.take(json.loads(json.dumps(facts)))
 
-        def prepared(self, run: Any) -> None:
-            self.snapshots = Snapshots(run, self.bundle, None, self._latest)
-            made.append((run, self.history))
+    def prepared(self, run: Any) -> None:
+        self.run, self.snapshots = run, Snapshots(run, self.bundle, None, self._latest)
 
-        def watch(self, run: Any, output: Any) -> None:
-            super().watch(run, output)
-            if output.decisions and output.decisions[-1].number % 7 == 0:
-                self.history.take(json.loads(json.dumps(self.snapshots.take(lambda _: None))))
+    def watch(self, run: Any, output: Any) -> None:
+        super().watch(run, output)
+        if output.decisions and output.decisions[-1].number % 7 == 0:
+            self.picture()
 
-        def __exit__(self, *_: Any) -> None:
-            self.history.take(json.loads(json.dumps(self.snapshots.take(lambda _: None))))
+    def picture(self) -> None:
+        self.pictures.append(json.loads(json.dumps(self.snapshots.take(lambda _: None))))
+        self.history.take(self.pictures[-1])
 
-    monkeypatch.setattr(one_run, "_monitor_of", lambda job: Watched(panel=False))
+    def __exit__(self, *_: Any) -> None:
+        self.picture()
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> Watched:
+    """The monitor of the next run."""
+    made = Watched(panel=False)
+    monkeypatch.setattr(one_run, "_monitor_of", lambda job: made)
+    return made
+
+
+def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path: Path) -> None:
     assert main([*fixed_run(60, trials=2), "--out", str(tmp_path / "run")]) == 0
-    (run, history) = made[0]
+    run, history = watched.run, watched.history
     tally, last = run.tally, history.picture
     assert last["decisions"] == tally.decisions == 120
     assert last["right"] / last["known"] == tally.accuracy == tally.confusion.trace() / 120
@@ -188,34 +199,17 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(tmp_path: Path, monkeypatch
     assert f"{tally.clicks / 120:.2f} clicks, {tally.photons / 120:.2f} photons" in text
 
 
-def test_a_walk_is_told_pattern_by_pattern(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words: list[dict[str, Any]] = []
-
-    class Watched(Monitor):
-        def begin(self, bundle: Any, recorder: Any, facts: dict[str, Any]) -> None:
-            self.bundle = bundle
-
-        def prepared(self, run: Any) -> None:
-            self.run, self.snapshots = run, Snapshots(run, self.bundle, None, self._latest)
-
-        def watch(self, run: Any, output: Any) -> None:
-            super().watch(run, output)
-            if output.decisions:
-                words.append(self.snapshots.take(lambda _: None))
-
-        def __exit__(self, *_: Any) -> None:
-            automaton = self.run.plan.automaton
-            for one in words:
-                word, node = one["word"], 0
-                for pattern, click in zip(word["patterns"], word["clicks"]):
-                    assert automaton.pattern[node] == pattern
-                    node = automaton.successors[node][click]
-                assert node >= automaton.n_states  # at a leaf
-                assert sum(word["clicks"]) == one["latest"][-1][4]
-
-    monkeypatch.setattr(one_run, "_monitor_of", lambda job: Watched(panel=False))
-    assert main(["demo", "--pace", "fast", "--seconds", "0.2", "--out", str(tmp_path / "run")]) == 0
-    assert len(words) > 10
+def test_a_walk_is_told_pattern_by_pattern(watched: Watched, tmp_path: Path) -> None:
+    assert main(["demo", "--pace", "fast", "--seconds", "2", "--out", str(tmp_path / "run")]) == 0
+    automaton = watched.run.plan.automaton
+    assert len(watched.pictures) > 3
+    for one in watched.pictures:
+        word, node = one["word"], 0
+        for pattern, click in zip(word["patterns"], word["clicks"]):
+            assert automaton.pattern[node] == pattern
+            node = automaton.successors[node][click]
+        assert node >= automaton.n_states  # at a leaf
+        assert sum(word["clicks"]) == one["latest"][-1][4]
     assert begin_facts(load_bundle(SHIPPED / "fashion-adaptive.pans")[0])["encoder"] == "automaton"
 
 

@@ -16,9 +16,8 @@ from commands import json_of
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
-from pans.runtime.errors import UsageError
 from pans.runtime.operate import batch
-from pans.runtime.operate.batch import FORMAT, Journal, flat_rows, items_of, run_item
+from pans.runtime.operate.batch import FORMAT, items_of, run_item
 
 
 @pytest.fixture
@@ -58,12 +57,6 @@ def test_items_are_inputs_times_values(lab: Path) -> None:
         items_of("report", ["b/grid.pans"], ["seed=7"], "-o '{folder}/my {stem}-{seed}.html'", files=True)[0].key
         != item.key
     )
-
-
-@pytest.mark.parametrize("vary", ["seed", "=1", "seed=", "seed=0-99999999", "--=3"])
-def test_values_that_are_none(vary: str, lab: Path) -> None:
-    with pytest.raises(UsageError, match="--vary"):
-        items_of("evaluate", ["a/grid.pans"], [vary], "", files=True)
 
 
 def test_a_batch_goes_on_where_it_was(
@@ -136,12 +129,6 @@ def test_an_item_is_a_process_with_an_answer_or_an_error(lab: Path) -> None:
     assert good["answer"]["classes"]
     assert (bad["exit"], bad["answer"]) == (2, None)
     assert "none" in bad["error"]
-
-
-def test_the_journal_is_flat_in_a_table() -> None:
-    rows = flat_rows([{"format": FORMAT, "key": "k", "item": "i", "exit": 2, "answer": None, "error": "e"}])
-    assert rows == [{"item": "i", "exit": 2, "error": "e"}]
-    assert Journal(Path("x")).rows == {}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills a process")

@@ -8,17 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from automata import automaton_bundle
 from commands import fixed_run, json_of
 
 from pans.runtime import SHIPPED
-from pans.runtime.bundle.model import load_bundle, write_bundle
+from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.grey_png import png_bytes, read_grey_png
 from pans.runtime.operate.parquet import write_rows
 from pans.runtime.record import read_recording
+from pans.runtime.record.exposures import click_list
+from pans.runtime.record.sent_plan import recorded_plan
 
 FASHION = SHIPPED / "fashion10.pans"
 
@@ -37,13 +38,16 @@ def test_phconvert_accepts_and_loads_the_file(
     hdf5 = pytest.importorskip("phconvert.hdf5", reason="needs the dev extra")
     path = tmp_path / "run.h5"
     found = json_of(capsys, "export", recording, "--format", "photon-hdf5", "-o", path)
+    source = read_recording(recording)
     hdf5.assert_valid_photon_hdf5(str(path), warnings=False, strict_description=True, require_rootformat=True)
     loaded = hdf5.load_photon_hdf5(str(path))
     try:
         times = loaded.root.photon_data.timestamps.read()
+        clicks = click_list(source, recorded_plan(source))
         assert len(times) == found["clicks"]
+        assert times.tolist() == clicks.start_tick.tolist()
         names = [name.decode() for name in loaded.root.user.pans.classes.read()]
-        assert tuple(names) == read_recording(recording).bundle().classes
+        assert tuple(names) == source.bundle().classes
         assert loaded.root.identity.format_name.read() == b"Photon-HDF5"
         assert loaded.root.description.read().startswith(b"SIMULATED")
     finally:
@@ -125,20 +129,6 @@ def test_the_exported_head_is_an_onnx_model_that_says_what_it_is(
     session = onnxruntime.InferenceSession(path)
     scores = session.run(None, {session.get_inputs()[0].name: bundle.golden_means})[0]
     assert np.allclose(scores, bundle.golden_scores, atol=1e-5)
-
-
-def test_what_a_bundle_does_not_have_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    walks = tmp_path / "walks.pans"
-    write_bundle(automaton_bundle(), walks)
-    assert main(["export", str(walks), "--format", "onnx", "-o", str(tmp_path / "x.onnx")]) == 2
-    assert "decides by an automaton" in capsys.readouterr().err
-    found = json_of(capsys, "export", walks, "--format", "npy", "-o", tmp_path / "parts")
-    names = {Path(path).name for path in found["files"]}
-    assert {"automaton-successors.npy", "automaton-posteriors.npy", "patterns.npy", "about.json"} <= names
-    for words in ((str(walks), "csv"), (str(tmp_path / "none"), "npy")):
-        assert main(["export", words[0], "--format", words[1], "-o", str(tmp_path / "out")]) == 2
-        assert "remedy: " in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -14,7 +14,7 @@ from pans.runtime import SHIPPED
 from pans.runtime.cli import main
 from pans.runtime.cli.command import parser_of
 from pans.runtime.commands.run import RUN
-from pans.runtime.errors import ConfigError, PansError, UsageError
+from pans.runtime.errors import ConfigError
 from pans.runtime.operate.option_file import HERE, prepare_options, write_options
 
 NEEDED = ("b.pans", "--device", "sim:ideal")
@@ -110,18 +110,6 @@ def test_what_a_file_cannot_mean(line: str, wrong: str, tmp_path: Path) -> None:
         parsed(*NEEDED, "--config", str(path))
     assert caught.value.message.startswith(str(path))
     assert line != "no_realtime = true" or caught.value.remedy == "did you mean no-realtime?"
-
-
-def test_files_that_are_none(tmp_path: Path) -> None:
-    (tmp_path / "bytes").write_bytes(b"\xff\xfe")
-    for path in (tmp_path / "missing", tmp_path, tmp_path / "bytes"):
-        with pytest.raises(PansError):
-            parsed(*NEEDED, "--config", str(path))
-    with pytest.raises(UsageError, match="no effect"):
-        parsed(*NEEDED, "--unset", "shots")
-    (tmp_path / "empty").write_text("")
-    with pytest.raises(UsageError, match="no such option"):
-        parsed(*NEEDED, "--config", str(tmp_path / "empty"), "--unset", "shots")
 
 
 def test_the_command_writes_reads_and_runs(

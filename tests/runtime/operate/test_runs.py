@@ -80,14 +80,6 @@ def test_prune_lists_first_and_deletes_only_what_is_ours(root: Path, capsys: pyt
     assert sorted(path.name for path in root.rglob("*")) == ["notes.txt", "whole"]
 
 
-def test_a_run_that_goes_on_stays(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with locked(root / "whole" / ".pans-run.lock"):
-        found = listed(capsys, "prune", root, "--keep", "0", "--yes")
-        assert [Path(run["folder"]).name for run in found["runs"]] == ["parts"]
-    assert (root / "whole" / "run.pansrec").exists()
-    assert not (root / "parts").exists()
-
-
 def made(name: str, days: float, size: int, *, is_locked: bool = False) -> Run:
     started = NOW - timedelta(days=days)
     return Run(Path(name), started, "b", "PASS", 1, None, size, True, is_locked, ())

@@ -43,15 +43,6 @@ def test_the_page_says_what_the_run_said(run: Path, tmp_path: Path) -> None:
     assert "Late and missing work" not in words
 
 
-def test_a_cut_recording_still_tells_of_its_passages(run: Path, tmp_path: Path) -> None:
-    cut = tmp_path / "cut.pansrec"
-    data = run.read_bytes()
-    cut.write_bytes(data[: int(len(data) * 0.7)])
-    words = words_of(page_of(cut, tmp_path))
-    assert "INCOMPLETE" in words
-    assert "accuracy per passage alone" in words
-
-
 def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> None:
     recording = read_recording(run)
     bundle = recording.bundle()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from automata import automaton_bundle, random_automaton
-from commands import json_of, page_of, words_of
+from commands import json_of
 
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
@@ -62,14 +62,6 @@ def test_the_tree_tells_what_was_shown_and_what_clicked(recording: Recording) ->
         for outcome, lead in enumerate(node.leads):
             successor = int(plan.automaton.successors[node.state, outcome])
             assert lead == (nodes.tolist().index(successor) if successor in nodes else -1)
-
-
-def test_the_page_has_the_walks(recording: Recording, tmp_path: Path) -> None:
-    words = words_of(page_of(recording.path, tmp_path))
-    decisions = recording.decisions()
-    assert f"{decisions['exposures'].mean():.2f} exposures of 6 at most" in words
-    assert "the automaton was driven by the" in words
-    assert "step of the walk" in words
 
 
 def test_reliability_is_that_of_the_decisions() -> None:

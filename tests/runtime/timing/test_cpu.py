@@ -67,14 +67,6 @@ def test_a_thread_of_real_time_priority_is_not_shut_out_by_its_own_spinner() -> 
     assert spinners() == []
 
 
-def test_nothing_is_done_unasked() -> None:
-    before = os.sched_getaffinity(0)
-    with busy_core(None) as granted:
-        assert granted == {}
-        assert os.sched_getaffinity(0) == before
-        assert spinners() == []
-
-
 def test_a_core_that_is_not_there_is_refused_with_those_that_are() -> None:
     allowed = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
     with pytest.raises(UsageError, match=f"--core 4095, allowed: {allowed}"):

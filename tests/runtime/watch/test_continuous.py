@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -26,7 +25,6 @@ from pans.firmware_sim.ports.virtual import VirtualLink
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
-from pans.runtime.commands import one_run
 from pans.runtime.commands.one_run import _exit_code
 from pans.runtime.errors import UsageError
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
@@ -85,13 +83,6 @@ def test_metrics_are_served_and_only_here() -> None:
     assert 'pans_late_decisions_by_cause_total{cause="link"} 3.0' in text
     assert "pans_running 1.0" in text
     assert "pans_open_handles 7.0" in text
-
-
-def test_metrics_without_the_library_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "prometheus_client", None)
-    with pytest.raises(UsageError) as caught:
-        MetricsServer("0", dict)
-    assert "pans-runtime[metrics]" in caught.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -257,23 +248,6 @@ def test_the_summary_comes_before_the_link_is_closed(
     words = ["--device", "sim:ideal?scene=uniform&pace=fast", "--decisions", "20", "--out", str(tmp_path / "out")]
     assert main(["run", str(bundle_file), "--json", *words]) == 0
     assert there[0] == (True, True)
-
-
-def test_a_busy_port_is_refused_before_anything_is_prepared(
-    bundle_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("prometheus_client")
-    begun = list[str]()
-    for name in ("open_link", "load_ahead", "_prepare"):
-        monkeypatch.setattr(one_run, name, lambda *_, name=name: begun.append(name))
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        address = f"127.0.0.1:{taken.getsockname()[1]}"
-        words = ["run", str(bundle_file), "--device", f"{DEVICE}&pace=fast", "--out", str(tmp_path / "out")]
-        assert main([*words, "--metrics", address, "--decisions", "4"]) == 2
-    assert (begun, list(tmp_path.iterdir())) == ([], [])
-    said = capsys.readouterr().err
-    assert f"--metrics {address}: cannot listen there" in said
-    assert "choose another port" in said
 
 
 def _state(folder: Path) -> dict[str, Any]:

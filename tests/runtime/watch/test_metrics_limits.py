@@ -67,6 +67,8 @@ def test_half_open_connections_are_few_and_shut_nobody_out(server: PageServer) -
         (b"GET / HTTP/1.1\r\nX: " + b"x" * 100_000, b"431"),
         (b"POST / HTTP/1.1", b"405"),
         (b"GET /secret HTTP/1.1", b"404"),
+        (b"GET /../../etc/passwd HTTP/1.1", b"404"),
+        (b"HEAD /metrics HTTP/1.1\r\nHost: [::1]:8000", b"200"),
         (b"GET /metrics HTTP/1.1\r\nHost: evil.example:1", b"403"),
         (b"\0\xff", b"400"),
         (b"HEAD /metrics?x=1 HTTP/1.0", b"200"),

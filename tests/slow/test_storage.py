@@ -1,17 +1,15 @@
 """A storage that fails at the n-th call, is full, tears a write or ends the process: no earlier file is lost, what is left is readable.
 
-The commands that write are run on a storage with faults (storage.py), and on one that loses what was not synced (power_cut.py). The
-short form draws calls at random, from a seed that is printed; the long form (`-m slow`) takes every call of every command, with every
-fault.
+The commands that write are run on a storage with faults (storage.py) at every call, and on one that loses what was not synced
+(power_cut.py).
 """
 
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
-import random
-import secrets
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -34,10 +32,9 @@ from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import FrameDecoder, MessageType, Opcode, decode_command
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(not (compiler() and os.path.isdir("/proc/self/fd")), reason="needs a C compiler and Linux"),
 ]
-SEED = int(os.environ.get("PANS_SEED", secrets.randbelow(1 << 32)))
-DRAWN = 3  # of the faults, for each command, in the short form
 KILLED = 137
 PRECIOUS = {"notes.txt": b"mine", "out/earlier.pansrec": b"another run's", "out/pattern.csv": b"1,2"}
 DEVICE = "sim:oled-qcmos?pace=fast"
@@ -208,9 +205,9 @@ def light_is_off(trace: Path) -> bool:
     return last is Opcode.STOP
 
 
-def tried(bench: Bench, name: str, drawn: int | None) -> int:
-    """Try a command with every fault at every call, or with `drawn` faults at one call each; return how many runs that were."""
-    case, chosen = CASES[name], random.Random(f"{SEED} {name}")
+@pytest.mark.parametrize("name", CASES)
+def test_every_call_of_every_command(name: str, bench: Bench) -> None:
+    case = CASES[name]
     if case.needs:
         pytest.importorskip(case.needs)
     before = bench.fresh()
@@ -218,33 +215,21 @@ def tried(bench: Bench, name: str, drawn: int | None) -> int:
     judge(bench, case, before, clean, Fault.NONE)
     assert clean.code in (0, 1), clean
     assert clean.calls > 0
-    runs, wrong = 0, []
-    for fault, error in FAULTS if drawn is None else chosen.sample(FAULTS, drawn):
-        calls = range(1, clean.calls + 1)
-        for at in calls if drawn is None else [chosen.choice(calls)]:
-            before = bench.fresh()
-            ended = bench.run(case, at, fault, error)
-            try:
-                judge(bench, case, before, ended, fault)
-            except (AssertionError, pytest.fail.Exception) as found:
-                wrong.append(
-                    f"{fault.name} {errno.errorcode.get(error, '')} at call {at} of {clean.calls}: {found}; {ended}"
-                )
-            runs += 1
-    assert not wrong, f"{name}, PANS_SEED={SEED}, {len(wrong)} of {runs} runs:\n" + "\n".join(wrong)
-    return runs
-
-
-@pytest.mark.parametrize("drawn", [DRAWN, pytest.param(None, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", CASES)
-def test_calls_of_every_command(name: str, drawn: int | None, bench: Bench) -> None:
-    assert tried(bench, name, drawn) >= DRAWN
+    wrong = []
+    for (fault, error), at in itertools.product(FAULTS, range(1, clean.calls + 1)):
+        before = bench.fresh()
+        ended = bench.run(case, at, fault, error)
+        try:
+            judge(bench, case, before, ended, fault)
+        except (AssertionError, pytest.fail.Exception) as found:
+            what = f"{fault.name} {errno.errorcode.get(error, '')} at call {at} of {clean.calls}"
+            wrong.append(f"{what}: {found}; {ended}")
+    assert not wrong, f"{name}, {len(wrong)} runs:\n" + "\n".join(wrong)
 
 
 # ---- a power cut: what was not synced is lost ----
 
 CUT = [name for name in CASES if name not in ("export hdf5", "train")]  # which write without `write`
-DRAWN_CUTS = 4  # of each command, in the short form, and its end
 
 
 def lay_out(folder: Path, files: Files) -> None:
@@ -266,26 +251,18 @@ def judge_cut(bench: Bench, case: Case, before: Files, left: Files) -> None:
         check_readable(bench.folder / name, whole=False)
 
 
-def cut_power(bench: Bench, name: str, drawn: int | None) -> int:
-    """Cut the power at every call of a command, or at `drawn` of them and at its end; return how many states were judged."""
-    case, chosen = CASES[name], random.Random(f"{SEED} cut {name}")
+@pytest.mark.parametrize("name", CUT)
+def test_a_power_cut_at_every_call_of_every_command(name: str, bench: Bench) -> None:
+    case = CASES[name]
     before = bench.fresh()
     ended, cuts = bench.cut(case)
     assert ended.code in (0, 1), ended
     after = contents(bench.folder)
-    tried = cuts if drawn is None else chosen.sample(cuts[:-1], min(drawn, len(cuts) - 1))
-    for words, left in tried:
+    for words, left in cuts:
         try:
             judge_cut(bench, case, before, left)
         except (AssertionError, pytest.fail.Exception) as wrong:
-            raise AssertionError(f"{name}: {words}, PANS_SEED={SEED}: {wrong}") from wrong
+            raise AssertionError(f"{name}: {words}: {wrong}") from wrong
     _, last = cuts[-1]
     for one in case.leaves:
         assert last.get(one) == after[one], f"{name}: {one} is lost at a power cut after the command has ended"
-    return len(tried)
-
-
-@pytest.mark.parametrize("drawn", [DRAWN_CUTS, pytest.param(None, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", CUT)
-def test_a_power_cut_during_every_command(name: str, drawn: int | None, bench: Bench) -> None:
-    assert cut_power(bench, name, drawn) > 0

@@ -1,6 +1,6 @@
 """What a file can cost: none that is accepted takes 400 MiB to be verified, run or replayed, program and simulated instrument included.
 
-Each command runs in a process of its own. The short form takes one of the largest bundles; the long form (`-m slow`) all kinds of files.
+Each command runs in a process of its own. The long form (`-m slow`) takes all kinds of files.
 """
 
 from __future__ import annotations
