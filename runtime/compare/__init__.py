@@ -1,6 +1,7 @@
 """Two runs side by side: what was different about them, and whether their results differ by more than chance.
 
-Owns the tests and their words. It reads recordings, folders of runs and summaries; it never runs anything and never changes a file.
+What comes in are recordings, folders of runs or summaries; what goes out are findings with their tests, as text, JSON or a page. Start
+with comparison.py; statistics.py has the tests.
 
 >>> from pans.runtime.compare import mcnemar_exact
 >>> round(mcnemar_exact(1, 9), 6)

@@ -4,6 +4,10 @@ In come a profile, a bundle and stream messages; out come a `Plan` (`build_plan`
 output, no clock and no random number, so that a live run, a replay and a simulation give the same decisions bit for bit. Start with
 plan.py, then follower.py (what every core does with a stream) and still.py. Objects in flow are in the package flow.
 
+Gaps: wire/tracker.py finds them, window.py says which windows they break, still.py what becomes of these (flagged, abstained);
+stream_kernels.py is the compiled form of both, so change them together. A bundle is compared with the profile in plan.py, with what the
+device says of itself in link/fit.py.
+
 >>> from importlib.resources import files
 >>> from pans.runtime.bundle import load_bundle
 >>> from pans.runtime.core import build_plan

@@ -1,7 +1,9 @@
 """From clicks to a label and its probability, or to a picture: the back ends behind one call, `make_decider`.
 
 A back end answers the bundle's golden vectors before it answers anything else. Scores that are not finite come back with probability 0.
-Start reading in verdict.py (what a decision is), then backends.py (the choice among table, kernels, ONNX and automaton).
+Start with verdict.py (the answer on one object: `Decider`, `Verdict`; the verdict of a run is in report), then backends.py. A new back end
+is a file here, a name in `BACKENDS` and a line in `_make` of backends.py, one in `_choose` if `auto` may choose it, and one in
+bench/decide.py; one of another package is an entry point (`pans.backends`).
 
 >>> import numpy as np
 >>> from pans.runtime.bundle import BackEnd, Shown, make_bundle

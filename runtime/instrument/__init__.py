@@ -1,7 +1,8 @@
 """One instrument as numbers: its profile, the laws of its clicks, its calibration, and tests of whether it still is as it was.
 
 What comes in are TOML profiles, calibration files and counts of clicks; what goes out are frozen facts, probabilities, estimates and
-findings. Start with profile.py, then click_law.py; cusum.py, channel_health.py and light_level.py watch a run.
+findings. Start with profile.py, then click_law.py (the chance of a click) and dead_time.py (the law of dead
+time, for trainer and simulator too); cusum.py, channel_health.py and light_level.py watch a run.
 
 >>> from pans.runtime.instrument import load_profile
 >>> load_profile("oled-qcmos").mode

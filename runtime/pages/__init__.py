@@ -1,7 +1,8 @@
 """HTML pages of recordings and bundles in one file each, readable on a screen of any width, in light and dark, and on paper.
 
-Owns layout, drawings and which sections stand on a page. It reads recordings and bundles and judges nothing: verdicts and figures of a
-whole run are those of its summary. No page runs a script or loads anything.
+What comes in are recordings and bundles; what goes out is HTML. Verdicts and figures of a whole run are those of its summary
+(report/summary.py); verdict.py adds why a run passed, and the advice on each fault, which it finds by the words of its sentence: change
+both together. No page runs a script or loads anything. Start with run.py and page.py.
 
 >>> from pans.runtime.pages import Page
 >>> page = Page("A & B", simulated=False)

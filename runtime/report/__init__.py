@@ -1,7 +1,8 @@
 """Files and results for people: the summary of a run, pages, verification, facts, exports.
 
-Owns figures in words and what a file may claim; it reads recordings, bundles, profiles and calibrations, and never runs a device or
-changes a file. `summarise` turns a run's result into a `Summary`, `verify_file` returns what is wrong with a file.
+What comes in are a run's result, recordings, bundles, profiles and calibrations; what goes out are figures, words and files for other
+tools. The verdict of a run (PASS or FAIL, a sentence for each fault) is made in summary.py; words.py has the closing lines, verify.py what
+a file may claim. Start with `summarise` and `verify_file`.
 
 >>> from pans.runtime.report import verify_file
 >>> verify_file("oled-qcmos").ok
