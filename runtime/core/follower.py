@@ -78,7 +78,7 @@ class PlanRules:
     def of_block(self, block: ClickBlock | FrameBlock, start_tick: int) -> Contradiction | None:
         """Spacing, object, time and stamps of a block: an exposure may be late, but never a whole period early.
 
-        With an automaton an exposure is dark or shows one of its states; whether it is the right one, the walk says (window_kernels.py).
+        With an automaton an exposure is dark or shows one of its states; whether it is the right one, the walk says (window.py).
         """
         first = block.exposure_index
         if block.period_ticks != self._period:
@@ -232,7 +232,7 @@ class Follower:
         raise NotImplementedError
 
     def steps(self, session: int) -> Any:
-        """Return what the kernel continues of this core (turn/engine.Steps), ready for messages of `session`."""
+        """Return what the kernel continues of this core (kernel/calls.py), ready for messages of `session`."""
         if self._idle_steps is None:
             from .kernel_state import IdleSteps  # numba is loaded only by who receives
 

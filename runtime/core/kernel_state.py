@@ -1,6 +1,6 @@
 """The state of a `still.Core` as arrays that the kernel continues: loaded before a call, stored after it.
 
-Both continue the same state, so that the kernel's rows are those that the core alone would give. `Core.steps` makes it; turn/engine.py
+Both continue the same state, so that the kernel's rows are those that the core alone would give. `Core.steps` makes it; kernel/calls.py
 calls the kernel.
 """
 

@@ -318,7 +318,7 @@ class DecisionWindows:
 
     @property
     def position(self) -> tuple[int, int, int]:
-        """The visit under way, its next window to be settled, and the object before the detector; stream.py continues from here."""
+        """The visit under way, its next window to be settled, and the object before the detector; the kernel continues from here."""
         return self._visit, self._next_window, self._object
 
     @position.setter
@@ -360,7 +360,7 @@ class DecisionWindows:
         return bool(self._seen[self._next_window :].any())
 
     def arrays(self) -> tuple[I32, I32, I64, I64, I64, I64, Walks, I64]:
-        """Return the arrays that hold the visit under way, the first eight of window_kernels.WindowArrays."""
+        """Return the arrays that hold the visit under way, the first eight of kernel_state.py."""
         visit = self._counts, self._seen, self.tallies
         return self._feature_at, self._window_at, self._last, *visit, self.walks, self._longest
 
