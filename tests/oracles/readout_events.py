@@ -1,20 +1,8 @@
-"""Single events of a row of detectors: clicks that fire neighbours, events seen at another time. Shares no code with the package."""
+"""Single events that are seen at another time, and a pixel that jumps. Shares no code with the package."""
 
 from __future__ import annotations
 
 import numpy as np
-
-
-def crosstalk(primary: np.ndarray, by_distance: list[float], seed: int) -> np.ndarray:
-    """Return clicks bool (exposures, channels) of `primary` ones, each of which fires every channel at distance 1, 2, ... with a chance."""
-    rng = np.random.default_rng(seed)
-    clicks = primary.copy()
-    for exposure, channel in np.argwhere(primary).tolist():
-        for distance, chance in enumerate(by_distance, 1):
-            for other in (channel - distance, channel + distance):
-                if 0 <= other < primary.shape[1] and rng.random() < chance:
-                    clicks[exposure, other] = True
-    return clicks
 
 
 def jittered(light: np.ndarray, sigma: float, pause: float, runs: int, seed: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -56,6 +57,19 @@ def random_machine(seed: int = 0, bits: bool = False, shared: bool = False) -> A
         levels.append(Level(light, torch.tensor(edges)))
     counts = [torch.rand((n, 4), generator=random, dtype=torch.float64) + 0.1 for n in (1, 2, 5)]
     return Machine(levels, counts)
+
+
+def assert_slope(tensor: Any, loss: Callable[[], float], step: float = 1e-6) -> None:
+    """Hold `tensor.grad` against differences of `loss`, which is asked with one value of `tensor` moved at a time."""
+    gradient = tensor.grad.clone()
+    for index in np.ndindex(*tensor.shape):
+        there = tensor[index].item()
+        tensor[index] = there + step
+        above = loss()
+        tensor[index] = there - step
+        below = loss()
+        tensor[index] = there
+        assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
 
 
 SCRIPT = ROOT / "docs/tutorial/practice_images.py"

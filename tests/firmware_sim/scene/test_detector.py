@@ -129,17 +129,6 @@ def test_afterpulsing_raises_the_mean_as_a_markov_chain_does() -> None:
     assert stationary - p > 10 * sigma  # the effect itself is visible
 
 
-def test_crosstalk_reaches_both_neighbours_and_no_further() -> None:
-    model = DetectorModel(QUIET, crosstalk_probability=0.1)
-    probability = np.zeros((N, 5))
-    probability[:, 2] = 0.5
-    clicks = sample_clicks(model, probability, 6, 0, no_clicks(5))
-    assert not clicks[:, [0, 4]].any()
-    for neighbour in (1, 3):
-        assert abs(clicks[:, neighbour].mean() - 0.05) < five_sigma(0.05, N)
-        assert not (clicks[:, neighbour] & ~clicks[:, 2] & 1).any()
-
-
 # -- the profile's effects ---------------------------------------------------------------------------------------------
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from readout_events import crosstalk, jittered, telegraph
-from single_events import rounds_of
+from readout_events import jittered, telegraph
+from single_events import crosstalk_on, rounds_of
 
 from pans.firmware_sim.scene.changes import Changes, Telegraph
 from pans.firmware_sim.scene.detector import sample_clicks
@@ -57,7 +57,7 @@ def test_crosstalk_reaches_as_far_as_is_stated() -> None:
     chance = np.zeros((n, channels))
     chance[:, 4] = 0.5
     found = sample_clicks(model, chance, 3, 0, np.zeros(channels, np.uint8))
-    wanted = crosstalk(np.random.default_rng(1).random((n, channels)) < chance, kernel, 2)
+    wanted = crosstalk_on((np.random.default_rng(1).random((n, channels)) < chance).astype(np.uint8), kernel, 2)
     for channel in range(channels):
         here, there = float(found[:, channel].mean()), float(wanted[:, channel].mean())
         assert abs(here - there) < SIGMAS * math.sqrt(2 * max(there, 1e-4) / n)

@@ -1,14 +1,13 @@
 """The exact forward pass and its gradient: against all click words one by one, and against differences of the loss."""
 
 # ruff: noqa: E402  (what follows needs torch)
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from mpmath import mp, mpf
 from naive_adaptive import every_word
-from trainings import random_machine
+from trainings import assert_slope, random_machine
 
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.trainer.adaptive.machine import WRONG, Aim, Sight, as_bits, backward, brought, forward
@@ -79,17 +78,8 @@ AIMS = [Aim(0.07), Aim(0.07, decide=1.0), Aim(0.05, 0.03, 0.6)]
 def test_gradient_of_grey_patterns_is_that_of_the_loss(law, floor, aim):
     machine, sight = random_machine(3), wide(law, floor)
     backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), aim)
-    step = 1e-6
     for level in machine.levels:
-        gradient = level.light.root.grad.clone()
-        for index in np.ndindex(*level.light.root.shape):
-            there = level.light.root[index].item()
-            level.light.root[index] = there + step
-            above = loss_of(machine, sight, aim)
-            level.light.root[index] = there - step
-            below = loss_of(machine, sight, aim)
-            level.light.root[index] = there
-            assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
+        assert_slope(level.light.root, lambda: loss_of(machine, sight, aim))
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -97,19 +87,10 @@ def test_gradient_of_grey_patterns_is_that_of_the_loss(law, floor, aim):
 def test_gradient_of_the_brightness_of_bits(shared, aim):
     machine, sight = random_machine(4, bits=True, shared=shared), wide(ClickLaw(0.01), 0.01)
     backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), aim)
-    step = 1e-6
     tensors = {id(level.light.log_light): level.light.log_light for level in machine.levels}
     assert len(tensors) == (1 if shared else 3)
     for tensor in tensors.values():
-        gradient = tensor.grad.clone()
-        for index in np.ndindex(*tensor.shape):
-            there = tensor[index].item()
-            tensor[index] = there + step
-            above = loss_of(machine, sight, aim)
-            tensor[index] = there - step
-            below = loss_of(machine, sight, aim)
-            tensor[index] = there
-            assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
+        assert_slope(tensor, lambda: loss_of(machine, sight, aim))
 
 
 def test_figures_are_means_over_the_objects():
@@ -170,15 +151,6 @@ def test_the_gradient_through_optics_holds_the_light_of_dark_pixels(bits):
     wanted = scale * (mask @ GREY.T + light.full(mask) * torch.tensor([40.0, 90.0, 10.0])) / 255
     torch.testing.assert_close(brought(light, sight, grey), wanted)
     backward(machine, sight, grey, ONE_HOT, forward(machine, sight, grey), Aim(0.07))
-    step = 1e-6
     for level in machine.levels:
         tensor = level.light.log_light if bits else level.light.root
-        gradient = tensor.grad.clone()
-        for index in np.ndindex(*tensor.shape):
-            there = tensor[index].item()
-            tensor[index] = there + step
-            above = loss()
-            tensor[index] = there - step
-            below = loss()
-            tensor[index] = there
-            assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
+        assert_slope(tensor, loss)

@@ -157,19 +157,15 @@ def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
     machine, sight, blocks = shared
     monkeypatch.setattr(module, "_use_all", lambda *_: None)  # it changes no figure, but would hide what was chosen
 
-    def cost():
-        found = figures(machine, sight, blocks)
-        return found.loss + PRICE * found.photons
-
     for level in machine.levels:
         level.light.rows = torch.zeros_like(level.light.rows)
-    spoiled = cost()
+    spoiled = cost(machine, sight, blocks)
     told = [choose_patterns(machine, sight, blocks, PRICE) for _ in range(3)]
     assert told[0] > 0
-    assert cost() < spoiled - 0.05
-    before = cost()
+    assert cost(machine, sight, blocks) < spoiled - 0.05
+    before = cost(machine, sight, blocks)
     choose_patterns(machine, sight, blocks, PRICE)
-    assert cost() <= before + 2e-3  # what the sweep keeps is rounded to bfloat16
+    assert cost(machine, sight, blocks) <= before + 2e-3  # what the sweep keeps is rounded to bfloat16
     level = machine.levels[-1]  # behind it stands nothing but leaves: by hand, over all patterns and 200 brightnesses
     steps = [forward(machine, sight, block.grey).steps[-1] for block in blocks]
     losses = [leaf_losses(machine.counts[-1], block.one_hot) for block in blocks]

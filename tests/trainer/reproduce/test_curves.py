@@ -10,12 +10,13 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 pytest.importorskip("matplotlib", reason="needs the plot extra")
 pytest.importorskip("sklearn", reason="needs the plot extra")
 
+from trainings import short_fits  # noqa: F401 - a fixture
+
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import Options
 from pans.trainer.reproduce import curves, dynamics, readouts, ways
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
 from pans.trainer.tasks.registry import Objects, Task
-from pans.trainer.train import head_fit
 from pans.trainer.train.history import follow
 from pans.trainer.train.loop import train
 
@@ -187,12 +188,6 @@ def test_a_table_of_words_is_their_chance_under_every_class():
 
 
 # ---- trainings that are followed ----
-
-
-@pytest.fixture
-def short_fits(monkeypatch):
-    """The last stage of a training takes 1500 steps however small the task is; nothing here asks for a good head."""
-    monkeypatch.setattr(head_fit, "STEPS", 30)
 
 
 SMALL = Options(features=3, estimator="ste", alpha=1e-3, epochs=6, hidden=8, batch=25, front_rate=5e-2, head_rate=2e-2)
