@@ -13,6 +13,7 @@ import pytest
 from automata import automaton_bundle, diamond, early_leaf
 from bundles import made_bundle
 from commands import fixed_run
+from heads import affine_head
 
 from pans.runtime.bundle import Automaton, with_expected
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, write_bundle
@@ -304,19 +305,8 @@ def test_a_bundle_of_photon_numbers(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_bundle_from_a_head(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("onnx")
-    from onnx import TensorProto, helper, numpy_helper
-
-    weights = numpy_helper.from_array(np.array([[1, -1], [2, 0], [0, 3]], dtype=np.float32), "w")
-    graph = helper.make_graph(
-        [helper.make_node("MatMul", ["x", "w"], ["y"])],
-        "head",
-        [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 3])],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, ["n", 2])],
-        [weights],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    (tmp_path / "h.onnx").write_bytes(model.SerializeToString())
+    weights = np.array([[1, -1], [2, 0], [0, 3]])
+    (tmp_path / "h.onnx").write_bytes(affine_head(weights, np.zeros(2)))
     words = make_inputs(tmp_path)
     words[3:5] = ["--head", str(tmp_path / "h.onnx")]
     out = tmp_path / "made.pans"

@@ -1,11 +1,8 @@
-"""An upload over real links: what the device then holds, with and without the extension, and a device that knows no automata."""
+"""An upload: what the device then holds, with and without the extension, and a device that knows no automata."""
 
 from __future__ import annotations
 
-import time
-from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +10,6 @@ from bundles import automaton_bundle, made_bundle, six_states
 from lab_bench import SCENE, VirtualLab
 from lab_firmware import Firmware
 from lab_light import Light
-from mutated_sessions import tcp_link
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
@@ -41,36 +37,22 @@ def grey_bundle(profile: Profile) -> Bundle:
     return automaton_bundle(six_states(), photons=top / (levels - 1), levels=levels, pattern_levels=masks)
 
 
-@contextmanager
-def connected(profile: Profile, over: str) -> Any:
-    clock = DeviceClock(profile.clock.tick_hz)
-    start_ns = START_NS if over == "virtual" else time.perf_counter_ns()
-    device = Instrument(profile, load_scene("uniform"), power_on_tick=clock.tick_at(start_ns))
-    if over == "virtual":
-        yield device, Connection(VirtualLink(device, clock, "upload"))
-        return
-    with tcp_link(device, clock) as link:
-        connection = Connection(link)
-        yield device, connection
-        connection.close()
-
-
-@pytest.mark.parametrize("over", ["virtual", "tcp"])
 @pytest.mark.parametrize("levels", [2, 100])
-def test_the_device_holds_what_the_bundle_has(over: str, levels: int) -> None:
+def test_the_device_holds_what_the_bundle_has(levels: int) -> None:
     profile = replace(PROFILE, projector=replace(PROFILE.projector, levels=levels))
     bundle = BUNDLE if levels == 2 else grey_bundle(profile)
-    plan = build_plan(profile, bundle)
-    with connected(profile, over) as (device, connection):
-        facts = connection.handshake().facts
-        check_device(facts, plan, bundle, profile.clock.tick_hz)
-        connection.upload(plan, bundle)
-        assert np.array_equal(device._patterns.stack(3), bundle.pattern_levels)
-        held = device._states.states
-        assert np.array_equal(held.successors, six_states().successors)
-        assert np.array_equal(held.light, six_states().dwell / 4)
-        opcodes = {opcode for opcode, _ in upload_commands(plan, bundle, facts)}
-        assert (Opcode.LOAD_MASKS in opcodes) is (levels == 2)
+    plan, clock = build_plan(profile, bundle), DeviceClock(profile.clock.tick_hz)
+    device = Instrument(profile, load_scene("uniform"), power_on_tick=clock.tick_at(START_NS))
+    connection = Connection(VirtualLink(device, clock, "upload"))
+    facts = connection.handshake().facts
+    check_device(facts, plan, bundle, profile.clock.tick_hz)
+    connection.upload(plan, bundle)
+    assert np.array_equal(device._patterns.stack(3), bundle.pattern_levels)
+    held = device._states.states
+    assert np.array_equal(held.successors, six_states().successors)
+    assert np.array_equal(held.light, six_states().dwell / 4)
+    opcodes = {opcode for opcode, _ in upload_commands(plan, bundle, facts)}
+    assert (Opcode.LOAD_MASKS in opcodes) is (levels == 2)
 
 
 def test_an_older_device_gets_fixed_patterns_as_before() -> None:
