@@ -8,10 +8,12 @@ import numpy as np
 
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.scene.still import load_scene
+from pans.runtime.bundle.automaton import Automaton
+from pans.runtime.core.plan import Plan
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_arm, pack_pattern, pack_plan
-from pans.runtime.wire.messages import DARK_PATTERN, SLOT_DTYPE, MessageType, Opcode, decode_counts
+from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, Show, pack_arm, pack_pattern, pack_plan, pack_show
+from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MessageType, Opcode, decode_counts
 
 NONCE = 0x11223344
 POWER_ON = 1000
@@ -126,3 +128,32 @@ def plan(n_patterns: int, patterns: list[int], **changes: Any) -> PlanChunk:
 
 def of_type(messages: list[Any], kind: type) -> list[Any]:
     return [message for message in messages if isinstance(message, kind)]
+
+
+def stamps_and_readings(messages: list[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is stamped on the exposures of all blocks, and what was read in them."""
+    blocks = of_type(messages, wire.ClickBlock)
+    return np.concatenate([block.patterns for block in blocks]), np.concatenate([block.bits for block in blocks])
+
+
+def show(automaton: Automaton, state: int, exposure: int) -> Show:
+    """Return the command that names a state for an exposure."""
+    return Show(exposure, state, int(automaton.pattern[state]), int(automaton.dwell[state]), automaton.dwell_steps)
+
+
+def run_hosted(bench: Bench, made: Plan, automaton: Automaton, cycles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Arm and name every state as soon as the reading before it is known."""
+    start = bench.device.tick + 2000
+    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 1_000_000)))
+    slots, node, messages = made.slots_per_cycle, 0, []
+    for exposure in range(cycles * slots):
+        cycle, slot = divmod(exposure, slots)
+        node = node if slot else 0
+        shown = made.slot_pattern[slot] == ADAPTIVE_PATTERN and node < automaton.n_states
+        if shown:
+            bench.done(Opcode.SHOW, pack_show(show(automaton, node, exposure)))
+        end = start + cycle * made.cycle_ticks + int(made.slot_offset_ticks[slot]) + made.exposure_ticks
+        (block,) = of_type(bench.run_to(end), wire.ClickBlock)
+        messages.append(block)
+        node = int(automaton.successors[node, int(block.bits[0])]) if shown else node
+    return stamps_and_readings(messages)

@@ -12,7 +12,7 @@ import pytest
 from bundles import automaton_bundle, six_states, two_states
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from instrument_bench import IDEAL, Bench, of_type, plan
+from instrument_bench import IDEAL, Bench, of_type, plan, run_hosted, show, stamps_and_readings
 
 from pans.firmware_sim.device import readings
 from pans.firmware_sim.scene.moving import Change, SceneFile
@@ -26,7 +26,6 @@ from pans.runtime.wire.commands import (
     Arm,
     MaskChunk,
     PatternChunk,
-    Show,
     StateChunk,
     announced,
     mask_chunks,
@@ -90,36 +89,7 @@ def run(bench: Bench, made: Plan, cycles: int, start: int = 2000) -> tuple[np.nd
     start = bench.device.tick + start
     bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 100_000)))
     messages = bench.run_to(start + cycles * made.cycle_ticks)
-    return (*joined(messages), messages)
-
-
-def joined(messages: list[Any]) -> tuple[np.ndarray, np.ndarray]:
-    blocks = of_type(messages, wire.ClickBlock)
-    return np.concatenate([block.patterns for block in blocks]), np.concatenate([block.bits for block in blocks])
-
-
-def run_hosted(bench: Bench, made: Plan, automaton: Automaton, cycles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Arm and name every state as soon as the click before it is known."""
-    start = bench.device.tick + 2000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 100_000)))
-    slots, node, messages = made.slots_per_cycle, 0, []
-    for exposure in range(cycles * slots):
-        cycle, slot = divmod(exposure, slots)
-        node = node if slot else 0
-        shown = made.slot_pattern[slot] == ADAPTIVE_PATTERN and node < automaton.n_states
-        if shown:
-            bench.done(Opcode.SHOW, pack_show(show(automaton, node, exposure)))
-        end = start + cycle * made.cycle_ticks + int(made.slot_offset_ticks[slot]) + made.exposure_ticks
-        (block,) = of_type(bench.run_to(end), wire.ClickBlock)
-        messages.append(block)
-        if shown:
-            node = int(automaton.successors[node, int(block.bits[0])])
-    return joined(messages)
-
-
-def show(automaton: Automaton, state: int, exposure: int) -> Show:
-    facts = int(automaton.pattern[state]), int(automaton.dwell[state]), automaton.dwell_steps
-    return Show(exposure, state, *facts)
+    return (*stamps_and_readings(messages), messages)
 
 
 def naive(bench: Bench, made: Plan, automaton: Automaton, count: int) -> tuple[list[int], list[int]]:
@@ -241,7 +211,7 @@ def test_the_size_of_time_steps_changes_nothing(cuts: list[int]) -> None:
     for cut in cuts:
         bench.run_to(bench.device.tick + cut)
     bench.run_to(bench.device.tick + 41 * made.cycle_ticks)
-    stamps, clicks = joined([message for _, message in bench.got])
+    stamps, clicks = stamps_and_readings([message for _, message in bench.got])
     assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
 
 
@@ -252,7 +222,7 @@ def test_work_that_is_done_ahead_changes_nothing_and_ends() -> None:
     for _ in range(100):
         bench.run_to(bench.device.tick + made.cycle_ticks // 2)
         bench.device.draw_ahead()
-    stamps, clicks = joined([message for _, message in bench.got])
+    stamps, clicks = stamps_and_readings([message for _, message in bench.got])
     assert len(stamps) == 40 * made.slots_per_cycle
     assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
 
@@ -263,7 +233,7 @@ def test_a_broken_off_walk_is_sent_as_far_as_it_went() -> None:
     bench.done(Opcode.ARM, pack_arm(Arm(start, 10, 100_000)))
     bench.run_to(start + 3 * made.cycle_ticks + 2 * made.slot_period_ticks + made.exposure_ticks + 1)
     bench.done(Opcode.STOP)
-    stamps, clicks = joined([message for _, message in bench.got])
+    stamps, clicks = stamps_and_readings([message for _, message in bench.got])
     assert len(stamps) == 3 * made.slots_per_cycle + 3
     assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
 
@@ -318,7 +288,11 @@ def test_the_latest_name_of_an_exposure_counts() -> None:
     for state in (0, 1, 4):
         bench.done(Opcode.SHOW, pack_show(show(six_states(), state, 1)))
     bench.run_to(start + made.cycle_ticks)
-    assert joined([message for _, message in bench.got])[0].tolist() == [DARK_PATTERN, 4, *[DARK_PATTERN] * 3]
+    assert stamps_and_readings([message for _, message in bench.got])[0].tolist() == [
+        DARK_PATTERN,
+        4,
+        *[DARK_PATTERN] * 3,
+    ]
 
 
 # -- uploads -----------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from automata import random_automaton
 from bundles import automaton_bundle
-from instrument_bench import Bench, of_type
+from instrument_bench import Bench, of_type, run_hosted, stamps_and_readings
 from instrument_bench import plan as fixed_plan
 
 from pans.firmware_sim.scene.moving import Change, SceneFile
@@ -24,7 +24,6 @@ from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import (
     Arm,
     PatternChunk,
-    Show,
     announced_counts,
     mask_chunks,
     pack_arm,
@@ -32,7 +31,6 @@ from pans.runtime.wire.commands import (
     pack_pattern,
     pack_plan,
     pack_read_counts,
-    pack_show,
 )
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
 
@@ -76,34 +74,10 @@ def set_up(automaton: Automaton, drive: str, profile: Profile | None = None, sce
     return bench, made
 
 
-def blocks_of(messages: list[Any]) -> tuple[np.ndarray, np.ndarray]:
-    blocks = of_type(messages, wire.ClickBlock)
-    return np.concatenate([block.patterns for block in blocks]), np.concatenate([block.bits for block in blocks])
-
-
 def run(bench: Bench, made: Plan, cycles: int) -> tuple[np.ndarray, np.ndarray]:
     start = bench.device.tick + 2000
     bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 1_000_000)))
-    return blocks_of(bench.run_to(start + cycles * made.cycle_ticks))
-
-
-def run_hosted(bench: Bench, made: Plan, automaton: Automaton, cycles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Arm and name every state as soon as the number before it is known."""
-    start = bench.device.tick + 2000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 1_000_000)))
-    slots, node, messages = made.slots_per_cycle, 0, []
-    for exposure in range(cycles * slots):
-        cycle, slot = divmod(exposure, slots)
-        node = node if slot else 0
-        shown = made.slot_pattern[slot] == ADAPTIVE_PATTERN and node < automaton.n_states
-        if shown:
-            facts = int(automaton.pattern[node]), int(automaton.dwell[node]), automaton.dwell_steps
-            bench.done(Opcode.SHOW, pack_show(Show(exposure, node, *facts)))
-        end = start + cycle * made.cycle_ticks + int(made.slot_offset_ticks[slot]) + made.exposure_ticks
-        (block,) = of_type(bench.run_to(end), wire.ClickBlock)
-        messages.append(block)
-        node = int(automaton.successors[node, int(block.bits[0])]) if shown else node
-    return blocks_of(messages)
+    return stamps_and_readings(bench.run_to(start + cycles * made.cycle_ticks))
 
 
 def test_fixed_patterns_are_counted_as_the_physics_says() -> None:
@@ -122,7 +96,7 @@ def test_fixed_patterns_are_counted_as_the_physics_says() -> None:
     cycles, start = 2500, bench.device.tick + 2000
     bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 3_600_000)))
     messages = bench.run_to(start + cycles * plan.cycle_ticks)
-    shown, numbers = blocks_of(messages)
+    shown, numbers = stamps_and_readings(messages)
     assert {block.largest for block in of_type(messages, wire.ClickBlock)} == {4}
     assert shown.tolist() == [0, 1, DARK_PATTERN] * cycles
     objects = np.arange(cycles) // plan.cycles_per_object % 5
@@ -157,7 +131,7 @@ def test_an_object_that_stays_for_ever_is_counted_as_one_that_goes() -> None:
         bench.grant(1 << 20)
         start = bench.device.tick + 2000
         bench.done(Opcode.ARM, pack_arm(Arm(start, 3000, 3_600_000)))
-        drawn.append(blocks_of(bench.run_to(start + 3000 * 20_000))[1].tolist())
+        drawn.append(stamps_and_readings(bench.run_to(start + 3000 * 20_000))[1].tolist())
     assert len(drawn[0]) == 3000
     assert drawn[0] == drawn[1]
 
