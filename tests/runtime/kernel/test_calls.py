@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fault_grid import STILL, run_case
+from fault_grid import MODES, run_case
 from heads import head_bundle, random_layers
 from inner_kernels import called
 from plans import shot_major
@@ -167,7 +167,7 @@ def test_a_core_alone_leaves_the_same(mode: str, acts: bool, tmp_path: Path, mon
     assert [body[8:] for _, body in ours_recorded.messages()] == [body[8:] for _, body in theirs_recorded.messages()]
 
 
-@pytest.mark.parametrize("seed", range(len(STILL)))
+@pytest.mark.parametrize("seed", range(len(MODES)))
 def test_runs_under_all_faults_are_sound(seed: int) -> None:
     """The quick form of the fault grid: every kind of plan for objects that stand still, judged from outside."""
     assert run_case("all", seed, 1200).violations == []
