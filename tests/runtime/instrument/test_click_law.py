@@ -28,7 +28,6 @@ LAWS = [
     ClickLaw(dark_per_exposure=0.9),
     ClickLaw(1.8e-5, 0.20, 0.84),
     ClickLaw(3e-5, 0.21, 0.83),
-    ClickLaw(0.0, 1e-3, 0.5),
     ClickLaw(0.0, 0.3, 0.5),
     ClickLaw(0.0, 1.0, 0.5),
     ClickLaw(0.0, 3.0, 0.5),
@@ -88,6 +87,12 @@ def test_survival_coefficients_are_the_definition():
         assert relative_error(value, truth) < 1e-12
     assert len(found) > 3
     assert survival_coefficients(ClickLaw()).tolist() == [1.0]
+
+
+def test_no_read_noise_is_the_limit_of_little():
+    means = np.array([0.0, 1e-7, 0.3, 1.0, 50.0])
+    little = click_probability(ClickLaw(0.0, 1e-3, 0.5), means)
+    np.testing.assert_allclose(little, -np.expm1(-means), rtol=1e-14)
 
 
 def test_paper_figures_follow_from_the_shipped_profile():
