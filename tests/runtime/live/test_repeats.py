@@ -18,10 +18,8 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime import SHIPPED
-from pans.runtime.flow.core import FlowCore
 from pans.runtime.link.base import open_link
-from pans.runtime.live import Observers, RunOptions, RunResult, run_live
-from pans.runtime.live.flow_run import FlowRun
+from pans.runtime.live import RunOptions, RunResult, run_live
 from pans.runtime.record import Recorder, Recording, read_recording, replay
 from pans.runtime.report.summary import contradictions_of, find_faults
 from pans.runtime.wire.framing import FrameDecoder, encode_frame
@@ -95,13 +93,11 @@ def session(path: Path, mode: str, how: int, seed: int, often: float) -> tuple[R
     clock = DeviceClock(one.profile.clock.tick_hz)
     device = Repeating(one.profile, one.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
     device.repeats = repeats
-    flow = FlowRun(one.core, None) if isinstance(one.core, FlowCore) else None
     config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False)
     header = one.recorded()
-    observers = Observers(prepared=lambda run: None if flow is None else flow.prepared(run))
     with Recorder(path, {"config": header}, overwrite=True) as recorder:
         link = VirtualLink(device, clock, "sim:repeats")
-        result = run_live(link, one.profile, one.bundle, one.plan, one.core, config, recorder, None, observers)
+        result = run_live(link, one.profile, one.bundle, one.plan, one.core, config, recorder)
         recorder.close({})
     recording = read_recording(path)
     again = replay(recording, one.bundle)
