@@ -32,7 +32,14 @@ LEAST_BEYOND = 10  # decisions slower than a quantile, or nothing is said about 
 PAIRINGS = ("auto", "same", "different")
 # Facts that differ between any two runs, or that follow from others.
 _ALWAYS_DIFFERENT = ("created_utc", "command", "format_version", "toml", "decisions_sha256", "tick", "part")
-_DERIVED = ("config.dark.guard.", "config.backend_choice.")
+_DERIVED = (
+    "config.dark.guard.",
+    "config.backend_choice.",
+    "options.device",
+    "options.out",
+    "options.record",
+    "options.force",
+)
 _FIRST = ("bundle_sha256", "profile.", "device_url")  # what a reader asks for first
 F64 = NDArray[np.float64]
 

@@ -175,7 +175,15 @@ class Receiver:
         if not (link.virtual and gathers and chunks) or self._prompt:
             return chunks
         left = run.messages_granted - count_delimiters(chunks[0].data)
-        return [*chunks, *connection.reader.ahead(poll_s, left, GATHERED_BYTES, run.due_ns)]
+        more = connection.reader.ahead(poll_s, left, GATHERED_BYTES, run.due_ns)
+        began_ns = chunks[-1].arrival_ns
+        for arrival_ns, _ in more:
+            run.lateness.evidence.waited(began_ns, poll_s, arrival_ns)
+            run.lateness.evidence.arrived(arrival_ns)
+            began_ns = arrival_ns
+        if link.now_ns() > began_ns:
+            run.lateness.evidence.waited(began_ns, poll_s, link.now_ns())  # the read that brought nothing
+        return [*chunks, *more]
 
     # -- after a call --------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from pans.runtime.cli import warn
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import Tolerance
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.ranges import Range
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
@@ -37,7 +38,8 @@ def add_data_dir(parser: argparse.ArgumentParser) -> None:
 
 def add_threads(parser: argparse.ArgumentParser, consequence: str = "; changes the rounding") -> None:
     """Add --threads, the number of threads of torch."""
-    parser.add_argument("--threads", type=int, default=1, metavar="T", help=f"of torch (default 1){consequence}")
+    kind = Range(1, 1024, whole=True).option
+    parser.add_argument("--threads", type=kind, default=1, metavar="T", help=f"of torch (default 1){consequence}")
 
 
 def interruptible(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
