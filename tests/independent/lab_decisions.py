@@ -1,13 +1,13 @@
 """From recorded messages to decisions, as a lab would write it from docs/reference/formats.md, "From exposures to decisions".
 
-Still runs of fixed patterns, in plain loops; the back ends are in lab_backends.py. Imports nothing of the package.
+Owns the rules of still runs, in plain loops; the back ends are lab_backends.py's. Imports nothing of the package.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -164,7 +164,7 @@ class Decisions:
             return
         self.exposure = first + n
         plan, shown = self.plan, () if kind == FRAMES else struct.unpack_from(f"<{n}H", rest)
-        fits = first % plan.visit + n <= plan.visit and first + n <= self.end
+        fits = first % plan.visit + n <= plan.visit and first + n <= self.end and self._stamps_fit(shown)
         largest = width if kind == COUNTS else 1
         if (kind == FRAMES) != plan.parallel or not fits or (kind == FRAMES and 8 * width < plan.patterns):
             return
@@ -188,6 +188,9 @@ class Decisions:
                     window.right += plan.patterns
         self._settle(first + n, lambda exposure: tick + (exposure - first) * spacing + plan.exposure_ticks)
 
+    def _stamps_fit(self, _stamps: Sequence[int]) -> bool:
+        return True  # of fixed patterns any stamp is counted, right or wrong
+
     def _count_one(self, exposure: int, shown: int, bit: int) -> None:
         within = exposure % self.plan.visit
         window = self.window_of.get(within)
@@ -209,34 +212,43 @@ class Decisions:
                     return
                 self._next_visit()
             window = self.windows[self.next_window]
-            last = self.visit * self.plan.visit + window.members[-1]
-            if window.right < self._needed and last >= up_to:
+            last = self.visit * self.plan.visit + self._last(window)
+            if window.right < self._needed(window) and last >= up_to:
                 return
             self._decide(window, tick_of(last), 0)
 
-    @property
-    def _needed(self) -> int:
+    def _last(self, window: Window) -> int:
+        """Its last exposure in the visit."""
+        return window.members[-1]
+
+    def _needed(self, _window: Window) -> int:
         return self.shots * self.plan.patterns
+
+    def _verdict(self, window: Window) -> tuple[int, np.float32, int]:
+        return verdict(self.scores(window.counts, self.shots))
 
     def _next_visit(self) -> None:
         self.visit += 1
         self._open_visit()
 
     def _decide(self, window: Window, tick: int, flags: int) -> None:
-        missing = self._needed - window.right - window.wrong
+        missing = self._needed(window) - window.right - window.wrong
         flags |= (GAP if missing else 0) | (WRONG if window.wrong else 0)
         label, probability = NO_LABEL, np.float32(0)
         if flags:
             flags |= ABSTAINED
         else:
-            label, probability, flags = verdict(self.scores(window.counts, self.shots))
-        last = self.visit * self.plan.visit + window.members[-1]
+            label, probability, flags = self._verdict(window)
+        last = self.visit * self.plan.visit + self._last(window)
         shot = self.next_window * self.shots
         truth = -1 if self.object == NO_OBJECT else self.marks.get(self.object, -1)
         clicks, crc = int(window.counts.sum()), zlib.crc32(window.counts.astype("<i8").tobytes())
         place = (len(self.rows), tick, last, self.object, shot)
-        self.rows.append((*place, clicks, label, truth, flags, probability, crc, 0))
+        self.rows.append((*place, clicks, label, truth, flags, probability, crc, self._exposures(window)))
         self.next_window += 1
+
+    def _exposures(self, _window: Window) -> int:
+        return 0  # of fixed patterns
 
     # -- the end -------------------------------------------------------------------------------------------------------
 
@@ -279,14 +291,21 @@ def _bits(data: bytes) -> NDArray[np.uint8]:
 def decide_again(recording: Recording, bundle: Bundle, backend: str = "") -> NDArray[np.void]:
     """Return the rows that the messages of `recording` give, ROW (n,); the patterns are fixed."""
     config = recording.header["config"]
-    demand("drive" not in config, "patterns follow from the clicks")
+    demand("drive" not in config, "patterns follow from the clicks: lab_automaton.py")
+    scores = BACKENDS[backend or config["backend"]](bundle)
+    return run_again(recording, lambda plan: Decisions(plan, scores, config["shots"]))
+
+
+def run_again(recording: Recording, make: Callable[[Plan], Decisions]) -> NDArray[np.void]:
+    """Give the messages of `recording` to what `make` returns for its plan; return the rows."""
+    config = recording.header["config"]
     demand("flow" not in config, "objects flow past")
     demand(config["dark"].get("guard", {}).get("policy", "warn") == "warn", "the dark counts decide too")
     plan, arms = sent_plan(recording)
     channels = config.get("channels_at_once", 0)
     largest = 2**channels - 1 if channels else config.get("photon_number_max", 1)
     demand((plan.largest, plan.channels) == (largest, channels), "the numbers that were asked for")
-    run = Decisions(plan, BACKENDS[backend or config["backend"]](bundle), config["shots"])
+    run = make(plan)
     run.begin(arms.pop(0))
     for _, body in recording.messages:
         kind, session, payload = open_body(body)

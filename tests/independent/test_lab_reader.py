@@ -55,7 +55,7 @@ CASES = [
     Case("sequential", "table", trials=2, order="shot-major", faults=TROUBLE, decisions=3000),
     Case("parallel", "int8", shots=4, trials=3, faults=TROUBLE, decisions=6000),
 ]
-COUNTED = [  # photon numbers: bundles of version 5, recordings of version 6
+COUNTED = [  # photon numbers
     Case("sequential", "table", trials=3, outcomes=4),
     Case("sequential", "float64", shots=3, trials=2, order="pattern-major", outcomes=3),
     Case("sequential", "int8", shots=2, order="shot-major", outcomes=16),
