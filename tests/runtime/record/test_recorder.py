@@ -319,6 +319,30 @@ def test_what_is_flushed_is_readable_while_recording_goes_on(tmp_path: Path) -> 
         assert facts(read_recording(path)) == (2, False)
 
 
+def test_decisions_are_in_the_file_before_what_acts_upon_them(tmp_path: Path) -> None:
+    """`flush_decisions`, with the messages that they are made of; the rest may wait."""
+    path = tmp_path / "a.pansrec"
+    with Recorder(path, HEADER) as recorder:
+        recorder.add_message(1, b"hi")
+        recorder.add_decision(decision(0))
+        recorder.add_timing((0, 1, 2, 3, 4))
+        recorder.flush_decisions()
+        found = read_recording(path)
+        assert facts(found) == (1, False)
+        assert list(found.messages()) == [(1, b"hi")]
+        assert len(found.timings()) == 0
+
+
+def test_a_block_of_times_stays_below_what_a_reader_allows(tmp_path: Path) -> None:
+    runs = np.zeros(40, TIMING_RUN_DTYPE)
+    runs["count"] = 1 << 16
+    with Recorder(tmp_path / "a", {}) as recorder:
+        for run in range(len(runs)):
+            recorder.add_timing_runs(runs[run : run + 1])
+        recorder.close({})
+    assert len(read_recording(tmp_path / "a").timings()) == 40 << 16
+
+
 def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
     rng = np.random.default_rng(4)

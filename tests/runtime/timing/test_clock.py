@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pans.runtime.errors import LinkError
-from pans.runtime.timing.clock import CLOCK_DTYPE, ClockModel, unwrap_tick
+from pans.runtime.timing.clock import CLOCK_DTYPE, WANDER, ClockModel, unwrap_tick
 
 TICK_HZ = 10_000_000
 NS_PER_TICK = 100
@@ -46,6 +46,18 @@ def test_slow_probes_do_not_pull_the_line() -> None:
     host_ns, bound = model.to_host_ns(5_000_000_000 // NS_PER_TICK)
     assert abs(host_ns - 5_000_000_000) < 60_000
     assert bound < 200_000
+
+
+def test_the_uncertainty_grows_away_from_the_probes() -> None:
+    """By three sigma of the fitted rate and what the crystal may wander, as docs/reference/links.md says."""
+    model = ClockModel(TICK_HZ)
+    for step in range(200):
+        sent = step * PROBE_EVERY_NS
+        tick = (sent + 50_000) // NS_PER_TICK
+        model.add_probe(sent, tick, tick, sent + 100_000)
+    assert model.fit is not None
+    near, far = (model.to_host_ns(tick + model.fit.reference_tick)[1] for tick in (0, 100 * TICK_HZ))
+    assert far - near >= WANDER * 100e9
 
 
 def test_before_the_first_probe_nothing_is_converted() -> None:

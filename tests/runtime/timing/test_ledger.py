@@ -72,6 +72,9 @@ def test_blame_goes_to_the_slowest_stage(marks: tuple[int, int, int, int, int], 
 
 def test_recording_is_not_part_of_the_deadline() -> None:
     ledger = TimingLedger(deadline_ns=1000)
+    slow = TimingLedger(deadline_ns=1000)
+    assert judge(slow, (0, 1, 2, 2000, 90_000), 0)
+    assert slow.blame == {"decide": 1}
     assert not judge(ledger, (0, 1, 2, 3, 10_000), 0)
     assert ledger.stages["record"].max_ns == 9997
 

@@ -190,6 +190,27 @@ def test_malformed_and_unknown_messages_are_counted() -> None:
     assert (session.counters.malformed, session.counters.unknown_type) == (1, 1)
 
 
+def test_an_answer_with_another_echo_is_no_probe() -> None:
+    session = opened()
+    session.probe(2)
+    deliver(session, wire.encode_pong(wire.Pong(1, 3, 3, 4), NONCE), 55)
+    assert (session.counters.implausible, len(session.pongs)) == (1, 0)
+    deliver(session, wire.encode_pong(wire.Pong(1, 2, 3, 4), NONCE), 56)
+    assert len(session.pongs) == 1
+
+
+def test_a_lost_command_is_repeated_at_once_but_not_for_every_answer() -> None:
+    session = opened()
+    for _ in range(3):
+        session.submit(Opcode.STOP)
+    session.poll(0)
+    assert ids(sent(session)) == [1, 2, 3]
+    nothing_done = wire.encode_ack(Ack(0, 0, 0, ""), NONCE)
+    for now_ns, repeated in ((MS, [1, 2, 3]), (2 * MS, []), (MS + session_module.FAST_RETRY_NS, [1, 2, 3])):
+        deliver(session, nothing_done, now_ns)
+        assert ids(sent(session)) == repeated, now_ns
+
+
 def test_a_probe_counts_once() -> None:
     session = opened()
     session.probe(2)

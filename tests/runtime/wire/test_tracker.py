@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock, Frame, FrameDecoder, Mark
+from pans.runtime.wire.schema import RECEIVE_WINDOW
 from pans.runtime.wire.tracker import Gap, StreamTracker
 
 
@@ -76,6 +77,23 @@ def test_an_end_that_cannot_be_is_no_gap() -> None:
     tracker.accept(clicks(0, 0, 4))
     assert tracker.finish(3, 0) is None
     assert (tracker.counters.unexplained_drops, tracker.next_exposure) == (1, 4)
+
+
+def test_drops_of_the_device_count_up_and_an_end_moves_the_stream_on() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 4, drops=0))
+    assert tracker.accept(clicks(1, 6, 4, drops=2))[1] == Gap(4, 2, 0, 2)
+    assert tracker.accept(clicks(2, 13, 4, drops=5))[1] == Gap(10, 3, 0, 3)
+    assert tracker.finish(20, drops=8) == Gap(17, 3, 0, 3)
+    assert (tracker.counters.device_drops, tracker.counters.unexplained_drops) == (8, 0)
+    assert tracker.position == (3, 20, 8)
+
+
+@pytest.mark.parametrize(("ahead", "malformed"), [(RECEIVE_WINDOW - 1, 0), (RECEIVE_WINDOW, 1)])
+def test_a_message_beyond_the_receive_window_is_malformed(ahead: int, malformed: int) -> None:
+    tracker = StreamTracker()
+    assert (tracker.accept(clicks(ahead, 0, 1))[0] is None) == bool(malformed)
+    assert tracker.counters.malformed == malformed
 
 
 def test_repeated_and_overtaken_messages_are_dropped() -> None:
