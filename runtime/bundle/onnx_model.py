@@ -183,6 +183,22 @@ def _varint(data: memoryview, position: int) -> tuple[int, int]:
     raise ValueError("not an ONNX model (a number never ends)")
 
 
+def protobuf(*fields: tuple[int, int | bytes | str]) -> bytes:
+    """Return a protobuf message of these fields, each its number and its value."""
+    out = b""
+    for number, value in fields:
+        if isinstance(value, int):
+            out += _varint_bytes(number << 3) + _varint_bytes(value)
+        else:
+            data = value.encode() if isinstance(value, str) else value
+            out += _varint_bytes(number << 3 | 2) + _varint_bytes(len(data)) + data
+    return out
+
+
+def _varint_bytes(value: int) -> bytes:
+    return bytes([value]) if value < 0x80 else bytes([value & 0x7F | 0x80]) + _varint_bytes(value >> 7)
+
+
 def _numbers(kind: str, data: memoryview) -> list[Any]:
     return list((np.frombuffer(data, "<f4") if kind == "float*" else _integers(data)).tolist())
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
+from pans.runtime.bundle.onnx_model import protobuf
 from pans.runtime.container import read_file
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.grey_png import levels_png, read_grey_png
@@ -70,25 +71,9 @@ def head_with_facts(bundle: Bundle) -> bytes:
         raise UsageError(f"{bundle.name} decides by {kind}, and has no ONNX head", remedy="use --format npy")
     if b"pans.about" in bundle.head_onnx:
         return bundle.head_onnx
-    return bundle.head_onnx + _metadata("pans.about", json.dumps(about(bundle), sort_keys=True))
-
-
-def _metadata(key: str, value: str) -> bytes:
-    """One entry of metadata, which may follow the rest of a serialised message (protobuf: fields come in any order)."""
-    entry = b"".join(_field(number, text.encode()) for number, text in ((1, key), (2, value)))
-    return _field(METADATA, entry)
-
-
-def _field(number: int, data: bytes) -> bytes:
-    return _varint(number << 3 | 2) + _varint(len(data)) + data
-
-
-def _varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*out, value])
+    # fields of a serialised message come in any order: one more may follow the rest
+    facts = protobuf((1, "pans.about"), (2, json.dumps(about(bundle), sort_keys=True)))
+    return bundle.head_onnx + protobuf((METADATA, facts))
 
 
 # ---- in ----

@@ -107,11 +107,15 @@ def evidence_of(
     shots: int = 1,
 ) -> Evidence:
     """Return the evidence with scores centred on each row's mean, in float64, and objects numbered without gaps."""
-    wide = np.asarray(scores, np.float64)
-    centred = wide - wide.mean(axis=1, keepdims=True)
     numbers = np.unique(object_id, return_inverse=True)[1]
-    wide_clicks = np.asarray(clicks, np.float64)
-    return Evidence(centred, wide_clicks, row.astype(np.int64), truth.astype(np.int64), numbers, shots)
+    wide = np.asarray(clicks, np.float64)
+    return Evidence(centred(scores), wide, row.astype(np.int64), truth.astype(np.int64), numbers, shots)
+
+
+def centred(scores: NDArray[Any]) -> F64:
+    """Return scores (n, classes) around the mean of each row."""
+    wide = np.asarray(scores, np.float64)
+    return np.asarray(wide - wide.mean(axis=1, keepdims=True))
 
 
 def log_softmax(scores: F64) -> F64:
