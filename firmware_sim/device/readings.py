@@ -61,15 +61,19 @@ def follow(limits, successors, adaptive, key, first, begin, stamps, readings):  
     return node
 
 
-@njit(cache=True, nogil=True)
-def expected_light(chances, light, successors):  # type: ignore[no-untyped-def]
+def expected_light(chances: F64, light: F64, successors: NDArray[np.int64]) -> float:
     """The light of a walk in expectation, the exposure before it read as 0.
 
     chances float64 (2, outcomes, states): of each reading, after a reading of 0 and after another; light float64 (states,) of an exposure;
     successors int64 (states, outcomes).
     """
+    return float(_add_light(chances, light, successors, np.zeros((2, len(successors)))))
+
+
+@njit(cache=True, nogil=True)
+def _add_light(chances, light, successors, reached):  # type: ignore[no-untyped-def]
+    """As `expected_light`; `reached` is zeros (2, states): a kernel that allocates takes long to load."""
     n_states = successors.shape[0]
-    reached = np.zeros((2, n_states))
     reached[0, 0] = 1.0
     total = 0.0
     for state in range(n_states):
@@ -261,7 +265,7 @@ class Clicks:
         for channel in range(light.shape[1]):
             of_channel = click[:, None, :, channel]
             chances = np.concatenate([chances * (1.0 - of_channel), chances * of_channel], axis=1)
-        return float(expected_light(chances, light.sum(axis=1), states.successors))
+        return expected_light(chances, light.sum(axis=1), states.successors)
 
     def _of_states(self, number: int, states: States) -> F64:
         """Photoelectrons of an exposure in each state, float64 (states, channels)."""
@@ -321,7 +325,7 @@ class Numbers:
             weight * count_chances(law, light * factor) for factor, weight in zip(factors, weights / weights.sum())
         ]
         chances = np.sum(found, axis=0)
-        return float(expected_light(np.stack([chances, chances]), light, states.successors))
+        return expected_light(np.stack([chances, chances]), light, states.successors)
 
     def _conditions(self, first: int, count: int) -> F64:
         """Gain of the light, photoelectrons beside it, whether the detector lives, and by how much readings are lower; float64.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pans.runtime.decide.verdict import Verdicts
     from pans.runtime.instrument.profile import Profile, load_profile
     from pans.runtime.record import read_recording as load_recording
-    from pans.runtime.record import replay
+    from pans.runtime.record.replaying import replay
     from pans.trainer.evaluate import evaluate
 
 __all__ = [

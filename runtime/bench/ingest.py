@@ -23,8 +23,9 @@ from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import DarkMonitor
 from pans.runtime.kernel.calls import StreamCore
-from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.recorder import repeated_setup
+from pans.runtime.record.replaying import replay
 from pans.runtime.watch.state_file import resources_used
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.framing import FrameDecoder, pack_body

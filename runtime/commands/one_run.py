@@ -257,25 +257,28 @@ def _prepare(options: RunOptions, profile: Profile) -> _Prepared:
     from pans.runtime.core.plan_codec import drive_words
     from pans.runtime.core.still import Core
     from pans.runtime.decide.backends import make_decider
-    from pans.runtime.flow.make import plan_flow
     from pans.runtime.instrument.calibration import now_utc
     from pans.runtime.live.dark_run import DarkRun
-    from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.live.gates import open_actuator
-    from pans.runtime.registration.file import in_use
 
     flow, shots = flow_of(options), options.shots
     bundle, bundle_sha256 = load_bundle(options.bundle)
     dose = dose_of(options, bundle, profile)
     decider = make_decider(bundle, shots=shots, backend=options.backend, confidence=options.confidence, dose=dose)
-    placed = in_use(options.registration, bundle, profile, now_utc(), options.calibration_max_age_h)
-    if placed is not None:
+    placed = None
+    if options.registration is not None:
+        from pans.runtime.registration.file import in_use
+
+        placed = in_use(options.registration, bundle, profile, now_utc(), options.calibration_max_age_h)
         say(f"pans: {placed.words()}")
         bundle = placed.shown
     dark = DarkRun.of(options, placed.profile if placed and not options.calibration else profile)
     n_objects, flow_run, seconds = -(-options.decisions // options.trials), None, options.seconds
     core: Follower
     if flow is not None:
+        from pans.runtime.flow.make import plan_flow
+        from pans.runtime.live.flow_run import FlowRun
+
         plan, flow_core, n_cycles = plan_flow(dark.profile, bundle, decider, flow, shots, seconds)
         seconds = 0.0  # the end of a flow is in its plan
         flow_core.guard = dark.guard(plan, bundle, shots, flow=True)

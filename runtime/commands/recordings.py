@@ -20,12 +20,12 @@ from pans.runtime.errors import UsageError
 from pans.runtime.operate.parquet import need_pyarrow, write_decisions
 from pans.runtime.operate.pattern_files import about, array_parts, head_with_facts, pattern_pngs
 from pans.runtime.outputs import check_outputs, make_folder, write_file
-from pans.runtime.record import Recording, read_recording, replay
+from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.part_names import is_of_parts, parts_in
 from pans.runtime.record.parts import open_recording
 from pans.runtime.record.pictures import PictureLog
-from pans.runtime.record.replaying import Replayed
+from pans.runtime.record.replaying import Replayed, replay
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.csv_files import FILES, write_csv
 from pans.runtime.report.verify import file_kind

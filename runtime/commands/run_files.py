@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
@@ -188,7 +189,6 @@ def recording_header(
     """What a recording must say to be understood alone; units are in the keys."""
     import numba
     import numpy
-    import onnxruntime
 
     from pans.runtime.decide.verdict import choice_of
 
@@ -223,7 +223,7 @@ def recording_header(
             "python": platform.python_version(),
             "numpy": numpy.__version__,
             "numba": numba.__version__,
-            "onnxruntime": onnxruntime.__version__,
+            "onnxruntime": version("onnxruntime"),
             "platform": platform.platform(),
         },
     }

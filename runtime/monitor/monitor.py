@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Self
 
 from pans.runtime.cli import say
 from pans.runtime.errors import UsageError
-from pans.runtime.watch.metrics import parse_address
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
@@ -72,6 +71,8 @@ class Monitor:
             raise UsageError(
                 f"--serve {self._address}: cannot listen there: {said['error']}", remedy="choose another port"
             )
+        from pans.runtime.watch.metrics import parse_address  # the server's modules load slowly
+
         host = parse_address(self._address, "--serve")[0]
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{said['port']}/"
 

@@ -22,9 +22,9 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.container import MIB, open_regular, read_file
 from pans.runtime.core.decision import Decision, DecisionFlag
 from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
-from pans.runtime.record import Recording, read_recording, replay
+from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.part_names import is_of_parts, parts_in
-from pans.runtime.record.replaying import ASKED, ClickLog
+from pans.runtime.record.replaying import ASKED, ClickLog, replay
 from pans.runtime.wire.messages import MalformedMessage, MessageType, decode_welcome, unpack_body
 
 HEADS = (("object", "label"), ("recording", "object", "label"))

@@ -223,10 +223,8 @@ class InUse:
         check_made_for(one.path, one.values, self.profile, serial, "pans calibrate --registration")
 
 
-def in_use(path: Path | None, bundle: Bundle, profile: Profile, now: datetime, max_age_h: float) -> InUse | None:
+def in_use(path: Path, bundle: Bundle, profile: Profile, now: datetime, max_age_h: float) -> InUse:
     """Return what `bundle` shows on the table that `path` measured; ConfigError or UsageError for what must not be used."""
-    if path is None:
-        return None
     if bundle.analyser is not None:
         raise UsageError(
             f"{bundle.name} looks through passive optics and shows nothing: a registration has no effect",

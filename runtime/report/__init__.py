@@ -4,12 +4,11 @@ What comes in are a run's result, recordings, bundles, profiles and calibrations
 tools. The verdict of a run (PASS or FAIL, a sentence for each fault) is made in summary.py; words.py has the closing lines, verify.py what
 a file may claim. Start with `summarise` and `verify_file`.
 
->>> from pans.runtime.report import verify_file
+>>> from pans.runtime.report.verify import verify_file
 >>> verify_file("oled-qcmos").ok
 True
 """
 
 from .summary import Summary, summarise
-from .verify import FileVerdict, verify_file
 
-__all__ = ["FileVerdict", "Summary", "summarise", "verify_file"]
+__all__ = ["Summary", "summarise"]

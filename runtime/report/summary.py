@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
@@ -15,8 +15,10 @@ from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.live import RunResult
 from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED
 from pans.runtime.live.dark_run import DarkFigures
-from pans.runtime.live.flow_run import FlowFigures
 from pans.runtime.live.tally import TallyFigures
+
+if TYPE_CHECKING:
+    from pans.runtime.live.flow_run import FlowFigures
 
 MAX_VERDICTS = 20  # of a summary; the recording has them all
 

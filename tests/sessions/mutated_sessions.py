@@ -28,7 +28,8 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError
 from pans.runtime.live import RunOptions, run_live
-from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.record import Recorder, read_recording
+from pans.runtime.record.replaying import replay
 from pans.runtime.report.summary import Summary, summarise
 from pans.runtime.wire import messages
 from pans.runtime.wire.framing import Frame, FrameDecoder, encode_frame

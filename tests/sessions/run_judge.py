@@ -20,7 +20,8 @@ from run_books import STOPPED, DeviceLog, Emitted, Heard, ObservedLink
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.live import RunResult
-from pans.runtime.record import Recording, replay
+from pans.runtime.record import Recording
+from pans.runtime.record.replaying import replay
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
     ClickBlock,

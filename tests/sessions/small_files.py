@@ -31,9 +31,10 @@ from pans.runtime.errors import DamagedFileError, PlanError, UsageError
 from pans.runtime.flow.settings import flow_limits, read_flow
 from pans.runtime.instrument.calibration import load_calibration, now_utc, save_calibration
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.record import read_recording, replay
+from pans.runtime.record import read_recording
 from pans.runtime.record.format import FORMAT_VERSION, MAGIC, Kind
 from pans.runtime.record.log import LogReader
+from pans.runtime.record.replaying import replay
 from pans.runtime.record.sent_plan import never_armed, recorded_plan
 from pans.runtime.report.file_facts import file_facts
 

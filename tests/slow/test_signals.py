@@ -14,7 +14,8 @@ import pytest
 from host_process import STAGES, Host, Lit, lit_instrument, start_host, until
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING
-from pans.runtime.record import read_recording, replay
+from pans.runtime.record import read_recording
+from pans.runtime.record.replaying import replay
 from pans.runtime.report.verify import verify_file
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forkserver and signals")

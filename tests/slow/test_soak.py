@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 
 from pans.runtime import SHIPPED
-from pans.runtime.record import read_recording, replay
+from pans.runtime.record import read_recording
 from pans.runtime.record.part_names import parts_in
+from pans.runtime.record.replaying import replay
 from pans.runtime.report.verify import verify_parts
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")]

@@ -44,7 +44,8 @@ from pans.runtime.link.connection import Connection
 from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.live.loop import NO_OBSERVERS
-from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.record import Recorder, read_recording
+from pans.runtime.record.replaying import replay
 from pans.runtime.wire.commands import unpack_show
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, Ack, Opcode, decode_command, encode_ack, pack_body

@@ -25,7 +25,8 @@ from pans.runtime.link.base import open_link
 from pans.runtime.live import Observers, Recovery, RunOptions, run_live
 from pans.runtime.live.dark_run import DarkRun
 from pans.runtime.live.flow_run import FlowRun
-from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.record import Recorder, read_recording
+from pans.runtime.record.replaying import replay
 
 PROFILE = load_profile("flow-snspd")
 SETTINGS = FlowSettings("cells", fields_per_s=20_000.0, onset_frames=4, gate_classes=("a", "b"))

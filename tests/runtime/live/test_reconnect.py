@@ -23,7 +23,8 @@ from pans.runtime.errors import LinkError
 from pans.runtime.link.base import open_link
 from pans.runtime.live import Observers, Recovery, RunOptions, run_live
 from pans.runtime.live.reconnect import MOST_FRUITLESS
-from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.record import Recorder, read_recording
+from pans.runtime.record.replaying import replay
 from pans.runtime.wire.messages import (
     AckStatus,
     CommandMessage,

@@ -20,7 +20,8 @@ from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime import SHIPPED
 from pans.runtime.link.base import open_link
 from pans.runtime.live import RunOptions, RunResult, run_live
-from pans.runtime.record import Recorder, Recording, read_recording, replay
+from pans.runtime.record import Recorder, Recording, read_recording
+from pans.runtime.record.replaying import replay
 from pans.runtime.report.summary import contradictions_of, find_faults
 from pans.runtime.wire.framing import FrameDecoder, encode_frame
 from pans.runtime.wire.messages import MessageType

@@ -15,8 +15,9 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DeviceError
 from pans.runtime.live import LiveRun, Observers, RunOptions, run_live
-from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.format import Kind
+from pans.runtime.record.replaying import replay
 from pans.runtime.wire.messages import MessageType, Opcode, unpack_body
 
 CYCLES = 40

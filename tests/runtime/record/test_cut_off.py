@@ -14,8 +14,9 @@ from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import Recovery, RunOptions, run_live
-from pans.runtime.record import Recorder, Recording, read_recording, replay
+from pans.runtime.record import Recorder, Recording, read_recording
 from pans.runtime.record.format import Kind
+from pans.runtime.record.replaying import replay
 
 CYCLES = 2400
 ALL_FAULTS = "loss:0.01,duplicate:0.01,flip:0.01,stall:300ms/700ms"

@@ -10,8 +10,8 @@ from pans.firmware_sim.scene.still import load_scene
 from pans.runtime import SHIPPED
 from pans.runtime.bundle import load_bundle
 from pans.runtime.cli import main
-from pans.runtime.record import read_recording, replay
-from pans.runtime.record.replaying import ClickLog
+from pans.runtime.record import read_recording
+from pans.runtime.record.replaying import ClickLog, replay
 from pans.runtime.refit.clicks import Labelled, labelled_clicks, read_labels
 from pans.runtime.refit.command import words_of
 

@@ -16,7 +16,8 @@ import pytest
 from host_process import HANGS, lit_instrument, start_host, until
 
 from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_TIMING
-from pans.runtime.record import read_recording, replay
+from pans.runtime.record import read_recording
+from pans.runtime.record.replaying import replay
 from pans.runtime.report.verify import verify_file
 from pans.runtime.watch import watchdog
 from pans.runtime.watch.state_file import is_stalled
