@@ -6,11 +6,15 @@ on outer folds. The old one stays unless the best kind is better by `CLEARLY` st
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pans.runtime.intervals import Z_95
 
 from .evidence import (
     F64,
@@ -22,7 +26,6 @@ from .evidence import (
     eigentasks,
     fit,
     log_softmax,
-    n_parameters,
     shrunk,
 )
 
@@ -69,16 +72,12 @@ KINDS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refitted:
-    """What was chosen: `scores` (rows, classes) of the evidence's rows, corrected; `correction` is None where the old one stays.
-
-    `kappa` is infinite where single rows are not drawn towards what was seen.
-    """
+    """What was chosen: `scores` (rows, classes) of the evidence's rows, corrected; `correction` is None where the old one stays."""
 
     name: str
     scores: F64
     correction: Correction | None
-    kappa: float
-    trials: dict[str, tuple[float, float]]  # of each kind: gain in log loss per object, and its standard error
+    trials: Mapping[str, Estimate]  # of each kind: gain in log loss per object
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,16 +93,25 @@ class Estimate:
         spread = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
         return cls(float(values.mean()), spread / float(np.sqrt(len(values))))
 
+    def as_json(self) -> dict[str, float | None]:
+        """Return it with its 95 % interval; None for what is not known."""
+        value, half = self.value, Z_95 * self.error
+        figures = {"value": value, "low": value - half, "high": value + half, "error": self.error}
+        return {name: figure if math.isfinite(figure) else None for name, figure in figures.items()}
+
+
+def compared(old: tuple[F64, F64], new: tuple[F64, F64]) -> dict[str, Estimate]:
+    """Return the estimates of accuracy and log loss, old, new and gain, of the losses and right decisions (objects,) of both."""
+    (old_loss, old_right), (new_loss, new_right) = old, new
+    columns = {"accuracy_old": old_right, "accuracy_new": new_right, "accuracy_gain": new_right - old_right}
+    columns |= {"log_loss_old": old_loss, "log_loss_new": new_loss, "log_loss_gain": old_loss - new_loss}
+    return {name: Estimate.of(values) for name, values in columns.items()}
+
 
 class Judged(NamedTuple):
     """Held-out figures of old and new, and the learning curve: at `sizes` objects the accuracies `curve`."""
 
-    accuracy_old: Estimate
-    accuracy_new: Estimate
-    accuracy_gain: Estimate
-    log_loss_old: Estimate
-    log_loss_new: Estimate
-    log_loss_gain: Estimate
+    figures: dict[str, Estimate]  # as of `compared`
     sizes: tuple[int, ...]
     curve: tuple[Estimate, ...]
     more_gain: Estimate  # in accuracy, from twice as many objects, by the upper half of the curve
@@ -115,14 +123,16 @@ def kinds_for(evidence: Evidence, *, rows: bool) -> tuple[Kind, ...]:
     n_clicks = evidence.clicks.shape[1]
     known = eigentasks(evidence) is not None
     numbers = {min(1 << power, n_clicks) for power in range(1, n_clicks.bit_length() + 1)} if known else set()
-    of_tasks = (Kind(("bias", "clicks"), False, n, alone) for alone in (False, True) for n in sorted(numbers))
-    return tuple(
-        kind
-        for kind in (*KINDS, *of_tasks)
-        if (rows or not kind.rows)
-        and (n_clicks or "clicks" not in kind.blocks)
-        and n_parameters(kind.blocks, evidence.n_classes, kind.tasks or n_clicks) <= PARAMETERS_MAX
-    )
+    found = []
+    for kind in (
+        *KINDS,
+        *(Kind(("bias", "clicks"), False, n, alone) for alone in (False, True) for n in sorted(numbers)),
+    ):
+        features = {"bias": 1, "scores": evidence.n_classes, "clicks": kind.tasks or n_clicks}
+        fits = evidence.n_classes * sum(features[block] for block in kind.blocks) <= PARAMETERS_MAX
+        if fits and (rows or not kind.rows) and (n_clicks or "clicks" not in kind.blocks):
+            found.append(kind)
+    return tuple(found)
 
 
 def choose(evidence: Evidence, kinds: tuple[Kind, ...], objects: Chosen | None = None) -> Refitted:
@@ -133,19 +143,18 @@ def choose(evidence: Evidence, kinds: tuple[Kind, ...], objects: Chosen | None =
     tasks = eigentasks(evidence, chosen) if any(kind.tasks for kind in kinds) else None
     tried = [kind for kind in kinds if not kind.tasks or tasks is not None]
     gains = {kind: Estimate.of((old - _held_out_loss(evidence, kind, fold, tasks))[chosen]) for kind in tried}
-    trials = {kind.name: (gain.value, gain.error) for kind, gain in gains.items()}
+    trials = {kind.name: gain for kind, gain in gains.items()}
     best = max(gains, key=lambda kind: gains[kind].value, default=None)
     if best is None or not gains[best].value > CLEARLY * gains[best].error:
-        return Refitted(OLD, evidence.scores, None, np.inf, trials)
-    return replace(fitted(evidence, best, chosen), trials=trials)
+        return Refitted(OLD, evidence.scores, None, trials)
+    return fitted(evidence, best, chosen, trials)
 
 
-def fitted(evidence: Evidence, kind: Kind, chosen: Chosen) -> Refitted:
+def fitted(evidence: Evidence, kind: Kind, chosen: Chosen, trials: Mapping[str, Estimate] = {}) -> Refitted:
     """Return the correction of this kind, fitted to the objects `chosen` (objects,)."""
     counts = evidence.counts(chosen)
     correction, _ = _fit(evidence, kind, counts, eigentasks(evidence, chosen) if kind.tasks else None)
-    scores, kappa = _with_rows(evidence, kind, correction, counts)
-    return Refitted(kind.name, scores, correction, kappa, {})
+    return Refitted(kind.name, _with_rows(evidence, kind, correction, counts), correction, trials)
 
 
 def _fit(
@@ -165,13 +174,12 @@ def _fit(
     return replace(found, blocks=("bias", "scores", "clicks"), gain=gain), prior
 
 
-def _with_rows(evidence: Evidence, kind: Kind, correction: Correction, counts: F64) -> tuple[F64, float]:
+def _with_rows(evidence: Evidence, kind: Kind, correction: Correction, counts: F64) -> F64:
     scores = correction.apply(evidence.scores, evidence.clicks)
     if not kind.rows:
-        return scores, np.inf
+        return scores
     believed = np.exp(log_softmax(scores))
-    kappa = best_kappa(believed, counts)
-    return np.log(shrunk(believed, counts, kappa)), kappa
+    return np.log(shrunk(believed, counts, best_kappa(believed, counts)))
 
 
 def _held_out_loss(evidence: Evidence, kind: Kind, fold: I64, tasks: F64 | None) -> F64:
@@ -184,17 +192,16 @@ def _held_out_loss(evidence: Evidence, kind: Kind, fold: I64, tasks: F64 | None)
     for held in range(FOLDS):
         others = evidence.counts((fold >= 0) & (fold != held))
         correction, _ = _fit(evidence, kind, others, tasks, prior)
-        found[fold == held] = evidence.losses(_with_rows(evidence, kind, correction, others)[0])[0][fold == held]
+        found[fold == held] = evidence.losses(_with_rows(evidence, kind, correction, others))[0][fold == held]
     return found
 
 
 def judge(evidence: Evidence, kinds: tuple[Kind, ...]) -> Judged:
     """Return held-out figures of the procedure `choose`: each outer fold is judged by what was chosen and fitted on the others."""
     n = evidence.n_objects
-    everything = np.ones(n, bool)
-    outer = evidence.folds(FOLDS, everything, np.random.default_rng(_SEED + 1))
-    old_loss, old_right = evidence.losses(evidence.scores)
-    loss, right = np.empty(n), np.empty((len(CURVE), n))
+    outer = evidence.folds(FOLDS, np.ones(n, bool), np.random.default_rng(_SEED + 1))
+    old = evidence.losses(evidence.scores)
+    loss, right = np.empty((2, len(CURVE), n))
     chosen = []
     for held in range(FOLDS):
         here = outer == held
@@ -202,29 +209,20 @@ def judge(evidence: Evidence, kinds: tuple[Kind, ...]) -> Judged:
         for step, share in enumerate(CURVE):
             part = np.zeros(n, bool)
             part[order[: max(1, round(share * len(order)))]] = True
-            found = choose(evidence, kinds, part) if _enough(evidence, part) else None
-            after, hit = evidence.losses(evidence.scores if found is None else found.scores)
-            right[step, here] = hit[here]
-            if share == 1.0 and found is not None:
-                loss[here] = after[here]
-                chosen.append(found.name)
+            found = None
+            # with less than one object of each class and fold the old back end stands for a fit in the curve
+            if min(count for count, known in zip(evidence.per_class(part), evidence.per_class()) if known) >= 2:
+                found = choose(evidence, kinds, part)
+                chosen += [found.name] if share == 1.0 else []
+            after, hit = old if found is None else evidence.losses(found.scores)
+            loss[step, here], right[step, here] = after[here], hit[here]
     sizes = tuple(round(share * n * (FOLDS - 1) / FOLDS) for share in CURVE)
     # the loss of a fitted model falls as its parameters over the objects: a straight line in 1 / objects
     inverse = 1 / np.array(sizes[1:], np.float64)
-    centred = inverse - inverse.mean()
-    slope = centred @ right[1:] / (centred**2).sum()
-    return Judged(
-        Estimate.of(old_right),
-        Estimate.of(right[-1]),
-        Estimate.of(right[-1] - old_right),
-        Estimate.of(old_loss),
-        Estimate.of(loss),
-        Estimate.of(old_loss - loss),
-        sizes,
-        tuple(Estimate.of(values) for values in right),
-        Estimate.of(-slope / (2 * n)),
-        tuple(chosen),
-    )
+    inverse -= inverse.mean()
+    more_gain = Estimate.of(-(inverse @ right[1:] / (inverse**2).sum()) / (2 * n))
+    curve = tuple(Estimate.of(values) for values in right)
+    return Judged(compared(old, (loss[-1], right[-1])), sizes, curve, more_gain, tuple(chosen))
 
 
 def _in_turn(evidence: Evidence, chosen: Chosen, rng: np.random.Generator) -> I64:
@@ -235,9 +233,3 @@ def _in_turn(evidence: Evidence, chosen: Chosen, rng: np.random.Generator) -> I6
         of_class = np.flatnonzero(evidence.classes[objects] == label)
         place[of_class] = (np.arange(len(of_class)) + 0.5) / max(1, len(of_class))
     return objects[np.argsort(place, kind="stable")]
-
-
-def _enough(evidence: Evidence, chosen: Chosen) -> bool:
-    """Whether a part is fitted at all: one object of each class and fold, or the old back end stands for it in the curve."""
-    seen = np.bincount(evidence.classes[chosen], minlength=evidence.n_classes)
-    return bool(seen[np.bincount(evidence.classes, minlength=evidence.n_classes) > 0].min() >= 2)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.container import MIB, open_regular, read_file
+from pans.runtime.container import read_file
 from pans.runtime.core.decision import Decision, DecisionFlag
 from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.part_names import is_of_parts, parts_in
 from pans.runtime.record.replaying import ASKED, ClickLog, replay
-from pans.runtime.wire.messages import MalformedMessage, MessageType, decode_welcome, unpack_body
+from pans.runtime.report.handshakes import handshakes
 
 HEADS = (("object", "label"), ("recording", "object", "label"))
 ROWS_MAX = 1 << 20
@@ -67,45 +68,37 @@ def _label_rows(path: Path, rows: Any, classes: tuple[str, ...]) -> dict[str, di
     head = tuple(word.strip() for word in next(rows, []))
     if head not in HEADS:
         allowed = " or ".join(",".join(names) for names in HEADS)
-        raise ConfigError(
-            f"{path}:1: the first line is {ascii(','.join(head))[:80]}, allowed: {allowed}", remedy=_LABELS_REMEDY
-        )
-    found: dict[str, dict[int, int | None]] = {}
+        found = ascii(",".join(head))[:80]
+        raise ConfigError(f"{path}:1: the first line is {found}, allowed: {allowed}", remedy=_LABELS_REMEDY)
+    labels: dict[str, dict[int, int | None]] = {}
     for count, row in enumerate(rows):
         where = f"{path}:{rows.line_num}"
         if not row:
             continue
         if len(row) != len(head) or count >= ROWS_MAX:
             raise ConfigError(f"{where}: {len(row)} values, allowed: {len(head)}, in at most {ROWS_MAX} lines")
-        recording = row[0].strip() if len(head) == 3 else ""
-        object_id = _number(row[-2].strip(), where)
-        mine = found.setdefault(recording, {})
+        recording, number, label = (word.strip() for word in (["", *row][-3:]))
+        object_id = _whole(number, OBJECT_MAX)
+        if object_id is None:
+            raise ConfigError(f"{where}: the object is {ascii(number)[:40]}, allowed: whole numbers 0 to {OBJECT_MAX}")
+        mine = labels.setdefault(recording, {})
         if object_id in mine:
             raise ConfigError(f"{where}: object {object_id} has a label already", remedy="name each object once")
-        mine[object_id] = _label(row[-1].strip(), classes, where)
-    if not any(label is not None for mine in found.values() for label in mine.values()):
+        mine[object_id] = classes.index(label) if label in classes else _whole(label, len(classes) - 1)
+        if mine[object_id] is None and label:
+            names = ", ".join(classes[:10]) + (", ..." if len(classes) > 10 else "")
+            raise ConfigError(
+                f"{where}: the label is {ascii(label)[:40]}, allowed: 0 to {len(classes) - 1}, or one of {names}",
+                remedy="name a class of the bundle (pans info BUNDLE lists them)",
+            )
+    if not any(label is not None for mine in labels.values() for label in mine.values()):
         raise ConfigError(f"{path}: no object has a label", remedy=_LABELS_REMEDY)
-    return found
+    return labels
 
 
-def _number(word: str, where: str) -> int:
-    if not (word.isascii() and word.isdigit() and len(word) <= 10 and int(word) <= OBJECT_MAX):
-        raise ConfigError(f"{where}: the object is {ascii(word)[:40]}, allowed: whole numbers 0 to {OBJECT_MAX}")
-    return int(word)
-
-
-def _label(word: str, classes: tuple[str, ...], where: str) -> int | None:
-    if not word:
-        return None
-    if word in classes:
-        return classes.index(word)
-    if word.isascii() and word.isdigit() and len(word) <= 6 and int(word) < len(classes):
-        return int(word)
-    names = ", ".join(classes[:10]) + (", ..." if len(classes) > 10 else "")
-    raise ConfigError(
-        f"{where}: the label is {ascii(word)[:40]}, allowed: 0 to {len(classes) - 1}, or one of {names}",
-        remedy="name a class of the bundle (pans info BUNDLE lists them)",
-    )
+def _whole(word: str, most: int) -> int | None:
+    """Return a whole number from 0 to `most`; None for any other text."""
+    return int(word) if word.isascii() and word.isdigit() and len(word) <= 10 and int(word) <= most else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,8 +112,8 @@ class Labelled:
     sources: tuple[dict[str, Any], ...]  # of the provenance: name, SHA-256 and decisions of each recording
     simulated: bool
     left_out: dict[str, int]
-    photons: float  # means per decision of the summaries, nan where they do not know
-    illumination: float
+    photons: float | None  # means per decision of the summaries, None where they do not know
+    illumination: float | None
 
 
 class _Read(NamedTuple):
@@ -147,40 +140,42 @@ def labelled_clicks(
     files = [part for path in paths for part in (parts_in(path) if is_of_parts(path) else [path])]
     read = [_read(path, bundle, bundle_sha256, cycle) for path in files]
     for place, one in enumerate(read):
-        before = next((other for other in read[:place] if other.sha256 == one.sha256), None)
-        if before is not None:
+        if (before := next((other for other in read[:place] if other.sha256 == one.sha256), None)) is not None:
             raise UsageError(f"{one.path}: the same recording as {before.path}", remedy="name each recording once")
     shots = {one.log.shots for one in read if one.log.counts}
     if len(shots) > 1:
         raise UsageError(f"recordings with {sorted(shots)} shots per decision", remedy="refit each --shots by itself")
-    if labels is not None:
-        _check_named(labels, read)
-    truths, object_ids, counts, sources = [], [], [], []
-    of_one_scene = labels is None or not labels.names_recordings
+    labels_of = {} if labels is None else _labels_of(labels, read)
+    truths, object_ids, counts, sources = list[int](), list[int](), [], []
     numbers: dict[tuple[str, int], int] = {}
+    truth_of: dict[int, int] = {}
     left_out = {"without a label": 0, "not trusted": 0}
     for one in read:
-        scene = one.scene if one.cycle and of_one_scene else one.sha256
-        known = _truths(one, labels, alone=len(read) == 1)
-        taken = 0
-        for words, decision, truth in zip(one.log.counts, one.log.decisions, known, strict=True):
+        scene = one.scene if one.cycle and not (labels and labels.names_recordings) else one.sha256
+        begin = len(truths)
+        for words, decision in zip(one.log.counts, one.log.decisions, strict=True):
+            place = one.place(decision)
+            truth = decision.truth if labels is None else labels_of[one.path].get(place)
             if decision.flags & ~int(_TRUSTED):
                 left_out["not trusted"] += 1
-            elif truth is None:
+            elif truth is None or truth < 0:
                 left_out["without a label"] += 1
             else:
-                taken += 1
+                number = numbers.setdefault((scene, place), len(numbers))
+                if truth_of.setdefault(number, truth) != truth:
+                    raise UsageError(
+                        f"object {place} is once of class {truth_of[number]}, once of class {truth}",
+                        remedy="correct the labels, or --cycle: after how many objects the scene starts over",
+                    )
                 counts.append(words)
                 truths.append(truth)
-                object_ids.append(numbers.setdefault((scene, one.place(decision)), len(numbers)))
-        sources.append({"name": one.path.name, "sha256": one.sha256, "decisions": taken})
+                object_ids.append(number)
+        sources.append({"name": one.path.name, "sha256": one.sha256, "decisions": len(truths) - begin})
     if not truths:
         raise UsageError(
             "no decision has a label" + "".join(f", {n} are {why}" for why, n in left_out.items() if n),
             remedy="name the objects' classes with --labels FILE.csv (a simulated scene with labels names them itself)",
         )
-    _demand_one_truth(truths, object_ids, [place for _, place in numbers])
-    summaries = [(one.recording.summary, len(one.log.counts)) for one in read]
     return Labelled(
         np.stack(counts),
         np.array(truths),
@@ -189,8 +184,8 @@ def labelled_clicks(
         tuple(sources),
         any(one.recording.simulated for one in read),
         left_out,
-        _mean(summaries, "photons_mean"),
-        _mean(summaries, "illumination_mean", "illumination"),
+        _mean(read, "photons_mean"),
+        _mean(read, "illumination_mean", "illumination"),
     )
 
 
@@ -208,93 +203,61 @@ def _read(path: Path, bundle: Bundle, bundle_sha256: str, cycle: int) -> _Read:
         remedy = "record objects that stand still, without --confidence and --dose-cap"
         raise UsageError(f"{path}: {what} in this run", remedy=remedy)
     log = ClickLog()
-    found_again = replay(recording, bundle, log)
-    if not found_again.as_recorded or len(log.counts) != len(log.decisions):
-        raise DamagedFileError(
-            f"{path}: its clicks do not give its decisions again", remedy="see `pans replay` and `pans verify`"
-        )
-    objects, scene = (cycle, "") if cycle else _scene_of(recording)
-    return _Read(path, _sha256(path), recording, log, objects, scene)
+    if not replay(recording, bundle, log).as_recorded or len(log.counts) != len(log.decisions):
+        remedy = "see `pans replay` and `pans verify`"
+        raise DamagedFileError(f"{path}: its clicks do not give its decisions again", remedy=remedy)
+    with path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    if cycle:
+        return _Read(path, sha256, recording, log, cycle, "")
+    facts: dict[str, Any] = next((row["device"] for row in handshakes(recording) if row["device"]), {})
+    objects = facts.get("objects", 0)
+    if not isinstance(objects, int) or objects < 1:
+        return _Read(path, sha256, recording, log, 0, "")
+    return _Read(path, sha256, recording, log, objects, str(facts.get("scene", "")))
 
 
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with open_regular(path) as file:
-        while part := file.read(MIB):
-            digest.update(part)
-    return digest.hexdigest()
-
-
-def _scene_of(recording: Recording) -> tuple[int, str]:
-    """Return how many objects a simulated scene says that it has, and its name; (0, "") where no device says so."""
-    for _, body in recording.answers():
-        try:
-            frame = unpack_body(body)
-            if frame.type == MessageType.WELCOME:
-                facts = decode_welcome(frame.payload).facts
-                objects = facts.get("objects", 0)
-                return (objects, str(facts.get("scene", ""))) if isinstance(objects, int) and objects > 0 else (0, "")
-        except MalformedMessage:
-            continue
-    return 0, ""
-
-
-def _check_named(labels: Labels, read: Sequence[_Read]) -> None:
-    """Every label belongs to an object that was recorded, and every recording has labels."""
-    if not labels.names_recordings:
+def _labels_of(labels: Labels, read: Sequence[_Read]) -> dict[Path, Mapping[int, int | None]]:
+    """Return the labels of each recording; UsageError unless each belongs to an object that was recorded, and they name all."""
+    if labels.names_recordings:
+        names = [one.path.name for one in read]
+        for name in labels.by_recording:
+            if names.count(name) != 1:
+                raise UsageError(
+                    f"labels of {ascii(name)[:60]}, which {names.count(name)} of the recordings are called"
+                )
+        for one in read:
+            if one.path.name not in labels.by_recording:
+                raise UsageError(f"{one.path}: no labels for this recording", remedy="label it, or leave it out")
+        groups = [(str(one.path), labels.by_recording[one.path.name], [one]) for one in read]
+    else:
         if len(read) > 1 and not all(one.cycle for one in read):
             raise UsageError(
                 f"labels by object alone for {len(read)} recordings",
                 remedy="add a column `recording` with the file's name, or say with --cycle after how many objects the scene starts over",
             )
-        recorded = {one.place(decision) for one in read for decision in one.log.decisions}
-        _demand_recorded(labels.by_recording[""], recorded, "the recordings")
-        return
-    names = [one.path.name for one in read]
-    for name in labels.by_recording:
-        if names.count(name) != 1:
-            raise UsageError(f"labels of {ascii(name)[:60]}, which {names.count(name)} of the recordings are called")
-    for one in read:
-        if one.path.name not in labels.by_recording:
-            raise UsageError(f"{one.path}: no labels for this recording", remedy="label it, or leave it out")
-        _demand_recorded(labels.by_recording[one.path.name], {one.place(d) for d in one.log.decisions}, str(one.path))
-
-
-def _demand_recorded(labelled: Iterable[int], recorded: set[int], where: str) -> None:
-    unknown = sorted(set(labelled) - recorded)
-    if unknown:
-        raise UsageError(
-            f"labels for {len(unknown)} objects that {where} do not have, object {unknown[0]} first",
-            remedy="number the objects from 0 in the order in which they passed",
-        )
-
-
-def _truths(one: _Read, labels: Labels | None, *, alone: bool) -> list[int | None]:
-    if labels is None:
-        return [decision.truth if decision.truth >= 0 else None for decision in one.log.decisions]
-    mine = labels.by_recording[one.path.name if labels.names_recordings else ""]
-    places = [one.place(decision) for decision in one.log.decisions]
-    missing = sorted({place for place in places if place not in mine})
-    if missing and (alone or labels.names_recordings):
-        raise UsageError(
-            f"{one.path}: {len(missing)} objects are not in the labels, object {missing[0]} first",
-            remedy="add their lines, with an empty label where it is unknown: those are left out",
-        )
-    return [mine.get(place) for place in places]
-
-
-def _demand_one_truth(truths: list[int], object_ids: list[int], places: list[int]) -> None:
-    known: dict[int, int] = {}
-    for truth, object_id in zip(truths, object_ids):
-        if known.setdefault(object_id, truth) != truth:
+        groups = [("the recordings", labels.by_recording[""], list(read))]
+    for where, mine, some in groups:
+        recorded = {one.place(decision) for one in some for decision in one.log.decisions}
+        if unknown := sorted(mine.keys() - recorded):
             raise UsageError(
-                f"object {places[object_id]} is once of class {known[object_id]}, once of class {truth}",
-                remedy="correct the labels, or --cycle: after how many objects the scene starts over",
+                f"labels for {len(unknown)} objects that {where} do not have, object {unknown[0]} first",
+                remedy="number the objects from 0 in the order in which they passed",
             )
+        if len(some) == 1 and (missing := sorted(recorded - mine.keys())):
+            raise UsageError(
+                f"{some[0].path}: {len(missing)} objects are not in the labels, object {missing[0]} first",
+                remedy="add their lines, with an empty label where it is unknown: those are left out",
+            )
+    return {one.path: mine for _, mine, some in groups for one in some}
 
 
-def _mean(summaries: Sequence[tuple[Mapping[str, Any], int]], *names: str) -> float:
-    """The mean over the decisions of the first of `names` that each summary has, nan where one has none."""
-    found = [next((s[name] for name in names if s.get(name) is not None), None) for s, _ in summaries]
-    values = [float(value) if isinstance(value, int | float) else np.nan for value in found]
-    return float(np.average(values, weights=[float(n) for _, n in summaries]))
+def _mean(read: Sequence[_Read], *names: str) -> float | None:
+    """The mean over the decisions of the first of `names` that each summary has, None where one has none."""
+    found = [
+        next((s[name] for name in names if s.get(name) is not None), None)
+        for s in (one.recording.summary for one in read)
+    ]
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in found):
+        return None
+    return float(np.average(np.array(found, np.float64), weights=[len(one.log.counts) for one in read]))

@@ -30,8 +30,7 @@ KAPPAS = np.exp(np.arange(0.0, 10.0, 0.5))  # objects; beyond, no row of a few t
 PRECISION_RANGE = (1e-2, 1e6)  # of a prior: a score moves by 10 at the one end and by a thousandth at the other
 _FIRST_PRECISION = 10.0
 _ROUNDS, _STEPS, _LAST_STEPS = 12, 4, 30  # of the prior's width; Newton steps in a round, and at the end
-_SETTLED = 0.05  # change of the logarithm of a precision that ends the search
-_ROWS_AT_ONCE = 4096  # of the Hessian: 50 MB at most
+_CONVERGED = 0.05  # change of the logarithm of a precision that ends the search
 _FLAT = 1e-9  # variance of a feature that says nothing
 _LEAST = 1e-12  # of a belief
 _RIDGE = 1e-6  # of the mean variance of the clicks: channels that never or always click have none of their own
@@ -71,6 +70,10 @@ class Evidence:
         found = np.zeros(self.n_objects, np.int64)
         found[self.object_id] = self.truth
         return found
+
+    def per_class(self, chosen: NDArray[np.bool_] | slice = slice(None)) -> list[int]:
+        """Return the number of objects of each class, of all or of those `chosen` (objects,)."""
+        return [int(count) for count in np.bincount(self.classes[chosen], minlength=self.n_classes)]
 
     def counts(self, chosen: NDArray[np.bool_]) -> F64:
         """Return how often each class came to each row, (rows, classes), over the objects `chosen` (objects,), each with weight 1."""
@@ -191,7 +194,6 @@ class Correction:
     blocks: tuple[str, ...]
     gain: F64
     offset: F64
-    precision: F64  # of the prior of each block, for standardised features
 
     def apply(self, scores: F64, clicks: F64) -> F64:
         """Return the corrected scores of centred `scores` (n, classes) and `clicks` (n, d_f)."""
@@ -223,13 +225,7 @@ def fit(
         prior = _widest_likelihood(standard, scores, counts)
     weights, _ = _maximised(standard, scores, counts, prior, _LAST_STEPS)
     gain = weights[1:] / standard.scale[:, None]
-    return Correction(blocks, gain, weights[0] - standard.mean @ gain, prior.precision), Prior(prior.precision, weights)
-
-
-def n_parameters(blocks: tuple[str, ...], n_classes: int, n_clicks: int) -> int:
-    """Return how many numbers a correction has."""
-    sizes = {"bias": 1, "scores": n_classes, "clicks": n_clicks}
-    return n_classes * sum(sizes[block] for block in blocks)
+    return Correction(blocks, gain, weights[0] - standard.mean @ gain), Prior(prior.precision, weights)
 
 
 def _raw_features(blocks: tuple[str, ...], scores: F64, clicks: F64) -> F64:
@@ -263,9 +259,9 @@ def _widest_likelihood(standard: _Standard, scores: F64, counts: F64) -> Prior:
             measured = of_block.sum() * n_classes - found.precision[block] * variance[of_block].sum()
             precision[block] = max(measured, _FLAT) / max((weights[of_block] ** 2).sum(), _FLAT)
         precision = precision.clip(*PRECISION_RANGE)
-        settled = np.abs(np.log(precision / found.precision)).max() < _SETTLED
+        converged = np.abs(np.log(precision / found.precision)).max() < _CONVERGED
         found = Prior(precision, weights)
-        if settled:
+        if converged:
             break
     return found
 
@@ -303,14 +299,11 @@ def _maximised(standard: _Standard, scores: F64, counts: F64, prior: Prior, step
 def _hessian(features: F64, total: F64, chance: F64, precision: F64) -> F64:
     """Second derivatives by all weights, (size, size): the sum over rows of n (diag(p) - p p^T), taken with the features."""
     n_features, n_classes = features.shape[1], chance.shape[1]
-    flat: NDArray[np.float64] = np.zeros((n_features * n_classes, n_features * n_classes))
-    found = flat.reshape(n_features, n_classes, n_features, n_classes)
-    for start in range(0, len(features), _ROWS_AT_ONCE):
-        part = slice(start, start + _ROWS_AT_ONCE)
-        x, p, n = features[part], chance[part], total[part]
-        both = (x[:, :, None] * p[:, None, :]).reshape(len(x), -1)
-        flat -= (both * n[:, None]).T @ both
-        for label in range(n_classes):
-            found[:, label, :, label] += (x * (n * p[:, label])[:, None]).T @ x
+    found = np.zeros((n_features, n_classes, n_features, n_classes))
+    for one in range(n_classes):
+        for other in range(one + 1):
+            weight = total * chance[:, one] * ((one == other) - chance[:, other])
+            found[:, one, :, other] = found[:, other, :, one] = (features * weight[:, None]).T @ features
+    flat = found.reshape(n_features * n_classes, -1)
     flat[np.diag_indices(len(flat))] += np.repeat(precision, n_classes)
     return flat

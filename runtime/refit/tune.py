@@ -12,7 +12,8 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +25,7 @@ from pans.runtime.bundle.facts import check_bundle, frozen
 from pans.runtime.bundle.format import bundle_bytes
 from pans.runtime.cli import say
 from pans.runtime.container import parse_json_object, read_file
-from pans.runtime.core.decision import Output
-from pans.runtime.core.plan import Plan, build_plan
+from pans.runtime.core.plan import build_plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
@@ -33,13 +33,12 @@ from pans.runtime.errors import DamagedFileError, LinkError, PlanError, UsageErr
 from pans.runtime.imaging import Imaging, seen
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import open_link
-from pans.runtime.live import LiveRun, Observers, RunOptions, RunResult, run_live
+from pans.runtime.live import Observers, RunOptions, run_live
 from pans.runtime.live.continuous import Stop
 from pans.runtime.outputs import write_file
 from pans.runtime.record.replaying import ClickLog
 
-from .choosing import Estimate
-from .command import estimate_json
+from .choosing import Estimate, compared
 from .evidence import F64, log_softmax
 
 CLEARLY = 2.33  # standard errors: one step in a hundred that changes nothing is accepted
@@ -48,14 +47,12 @@ HELD_OUT_EVERY = 5  # objects: of each five, one is kept for the comparison at t
 TUNED_MIN, HELD_MIN = 80, 20
 FORMAT = "pans-tune 1"
 CHECKPOINT_MAX_BYTES = 1 << 28
-_SEED = re.compile(r"([?&]seed=)(\d+)")
 
 
 # ---- how patterns may be changed ----
 
 
-@dataclass(frozen=True, slots=True)
-class Move:
+class Move(NamedTuple):
     """How all patterns differ from the trained ones; nothing by default. `brightness` is of the light, by a longer exposure.
 
     The last four bend the grid smoothly, each by so many pixels at the edge of the patterns: with x and y from -1 to 1, stretch moves by
@@ -75,17 +72,16 @@ class Move:
     def by(self, name: str, step: float) -> Move:
         """Return the move with `name` changed by `step`; a factor is multiplied by 1 + step, or divided by 1 - step."""
         value = getattr(self, name)
-        if name in _FACTORS:
-            return replace(self, **{name: value * (1 + step) if step > 0 else value / (1 - step)})
-        return replace(self, **{name: value + step})
+        if name in ("scale", "brightness"):
+            return self._replace(**{name: value * (1 + step) if step > 0 else value / (1 - step)})
+        return self._replace(**{name: value + step})
 
     def words(self) -> str:
         """Return what differs, in words."""
-        said = [f"{name} {value:.3g}" for name, value in asdict(self).items() if value != getattr(STILL, name)]
+        said = [f"{name} {value:.3g}" for name, value in self._asdict().items() if value != getattr(STILL, name)]
         return ", ".join(said) or "nothing"
 
 
-_FACTORS = ("scale", "brightness")
 BENDS = ("stretch_px", "shear_px", "keystone_right_px", "keystone_down_px")
 STILL = Move()
 # The first step is what an adjusted table is off by; the last one costs less than a thousand objects can tell.
@@ -97,11 +93,14 @@ LAST_STEP = {name: step / (2 if name in BENDS else 4) for name, step in FIRST_ST
 def moved(bundle: Bundle, move: Move) -> Bundle:
     """Return `bundle` with its patterns changed, on the projector's levels; golden vectors and back end as they are."""
     levels = bundle.pattern_levels
-    if replace(move, brightness=1.0) != STILL:
+    if move._replace(brightness=1.0) != STILL:
         imaging = Imaging(move.right_px, move.down_px, move.rotation_deg, move.scale)
         wide = _bent(seen(imaging, levels.astype(np.float64), bundle.image_shape), move, bundle.image_shape)
-        whole = np.rint(wide).clip(0, bundle.levels - 1).astype(np.uint16)
-        levels = _binary(wide) if bundle.levels == 2 else whole
+        if bundle.levels == 2:  # the brightest pixels of each pattern, as many as keep its light
+            rank = np.argsort(np.argsort(-wide, axis=1, kind="stable"), axis=1, kind="stable")
+            levels = ((rank < np.rint(wide.sum(axis=1, keepdims=True))) & (wide > 0)).astype(np.uint16)
+        else:
+            levels = np.rint(wide).clip(0, bundle.levels - 1).astype(np.uint16)
     return replace(
         bundle,
         pattern_levels=frozen(levels),
@@ -110,10 +109,8 @@ def moved(bundle: Bundle, move: Move) -> Bundle:
     )
 
 
-def _bent(wide: NDArray[np.float64], move: Move, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _bent(wide: F64, move: Move, shape: tuple[int, int]) -> F64:
     """The patterns (n, pixels) moved by the four bends, between pixels by bilinear interpolation; nothing comes from outside."""
-    if not any(getattr(move, name) for name in BENDS):
-        return wide
     rows, columns = shape
     down, right = np.mgrid[0:rows, 0:columns].astype(np.float64)
     y, x = 2 * down / max(1, rows - 1) - 1, 2 * right / max(1, columns - 1) - 1
@@ -128,49 +125,37 @@ def _bent(wide: NDArray[np.float64], move: Move, shape: tuple[int, int]) -> NDAr
     return np.asarray(upper * (1 - below) + lower * below).reshape(len(wide), -1)
 
 
-def _binary(wide: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """The brightest pixels of each pattern, as many as keep its light."""
-    lit = np.rint(wide.sum(axis=1)).astype(np.int64)
-    rank = np.argsort(np.argsort(-wide, axis=1, kind="stable"), axis=1, kind="stable")
-    return ((rank < lit[:, None]) & (wide > 0)).astype(np.uint16)
-
-
 # ---- which change is tried next ----
 
 
 class Cost(NamedTuple):
-    """What trials have taken: photons (clicks where the instrument does not count photons), seconds of the instrument."""
+    """What trials have taken, or may take: photons (clicks where the instrument does not count photons), seconds of the instrument."""
 
     photons: float = 0.0
     seconds: float = 0.0
 
-    def plus(self, other: Cost) -> Cost:
-        """Return the sum."""
-        return Cost(self.photons + other.photons, self.seconds + other.seconds)
+    def plus(self, other: Cost, times: int = 1) -> Cost:
+        """Return the sum with `other`, taken so many times."""
+        return Cost(self.photons + times * other.photons, self.seconds + times * other.seconds)
+
+    def within(self, budget: Cost) -> bool:
+        """Whether it does not exceed `budget`."""
+        return self.photons <= budget.photons and self.seconds <= budget.seconds
 
 
-class Budget(NamedTuple):
-    """The most that all trials together may take; infinite by default."""
-
-    photons: float = math.inf
-    seconds: float = math.inf
-
-    def allows(self, spent: Cost, more: Cost, times: int) -> bool:
-        """Whether `times` trials that cost as `more` did fit beside what is `spent`."""
-        return all(used + times * each <= most for used, each, most in zip(spent, more, self))
+UNLIMITED = Cost(math.inf, math.inf)
 
 
 class Step(NamedTuple):
-    """One trial of the journal: the move, what it cost, each object's loss (None: unknown), and whether the device could show it."""
+    """One trial of the journal: the move, what it cost, and each object's loss (None: unknown; of all where the device cannot show it)."""
 
     move: Move
     cost: Cost
     loss: tuple[float | None, ...]
-    possible: bool = True
 
     def as_json(self) -> dict[str, Any]:
         """Return it for the checkpoint."""
-        return self._asdict() | {"move": asdict(self.move), "cost": self.cost._asdict()}
+        return {"move": self.move._asdict(), "cost": self.cost._asdict(), "loss": self.loss}
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Step:
@@ -178,37 +163,37 @@ class Step(NamedTuple):
         try:
             move = Move(**{name: float(value) for name, value in facts["move"].items()})
             cost = Cost(**{name: float(value) for name, value in facts["cost"].items()})
-            loss = tuple(None if value is None else float(value) for value in facts["loss"])
-            return cls(move, cost, loss, bool(facts["possible"]))
+            return cls(move, cost, tuple(None if value is None else float(value) for value in facts["loss"]))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise DamagedFileError(f"a trial of the checkpoint cannot be read: {error}") from error
-
-    def losses(self, n: int) -> F64:
-        """Return each object's loss, (n,), nan where it is not known."""
-        return np.array(self.loss if self.possible else [None] * n, np.float64)
-
-
-Measure = Callable[[Move, int], tuple[F64, Cost]]
-Keep = Callable[[list[Step]], None]
 
 
 class OutOfBudget(Exception):
     """The next trial, and the comparison at the end, would take more than is allowed."""
 
 
+@dataclass(slots=True)
 class Search:
-    """A search that goes on from its journal; `best` is what has been reached, at any time."""
+    """A search that continues from its journal; `best` is what has been reached, at any time."""
 
-    def __init__(self, names: tuple[str, ...], n_objects: int, budget: Budget, measure: Measure, keep: Keep) -> None:
-        self.names, self.budget = names, budget
-        self.best, self.accepted, self.ended = STILL, 0, ""
-        self.steps: dict[str, float] = {name: FIRST_STEP[name] for name in names}
-        self.journal: list[Step] = []
-        self.held_out = held_out_of(n_objects)
-        self._measure, self._keep = measure, keep
-        self._n, self._followed, self._times = n_objects, 0, 0
-        self._here: F64 = np.full(n_objects, np.nan)
-        self._errors: list[float] = []  # of the differences between trials
+    names: tuple[str, ...]
+    n_objects: int
+    budget: Cost
+    measure: Callable[[Move, int], tuple[F64, Cost]]  # the move and the number of the trial
+    keep: Callable[[list[Step]], None]  # called with the journal after each trial
+    journal: list[Step] = field(default_factory=list)
+    best: Move = STILL
+    accepted: int = 0
+    ended: str = ""
+    steps: dict[str, float] = field(init=False)
+    held_out: NDArray[np.bool_] = field(init=False)
+    _followed: int = 0  # trials so far
+    _here: F64 = field(init=False)  # mean losses at `best`
+    _errors: list[float] = field(default_factory=list)  # of the differences between trials
+
+    def __post_init__(self) -> None:
+        self.steps = {name: FIRST_STEP[name] for name in self.names}
+        self.held_out = held_out_of(self.n_objects)
 
     @property
     def spent(self) -> Cost:
@@ -222,51 +207,42 @@ class Search:
 
     def run(self) -> None:
         """Search until the steps are too small to tell, or the budget is spent (`ended` says which)."""
+        times = 1  # trials of the best move
         try:
-            self._reach(STILL, self._try(STILL))
-            while self._round() or self._halve():
-                self._times += 1
-                self._here = self._here + (self._try(self.best) - self._here) / self._times
+            self._here = self._try(STILL)
+            while (accepted := self._round()) or self._halve():
+                times = 2 if accepted else times + 1
+                self._here = self._here + (self._try(self.best) - self._here) / times
             self.ended = "the smallest steps change nothing more"
         except OutOfBudget:
             self.ended = "the budget is spent"
 
-    def _reach(self, move: Move, loss: F64) -> None:
-        self.best, self._here, self._times = move, loss, 1
-
     def _halve(self) -> bool:
         """Halve all steps; False where they are the last ones already."""
-        if all(self.steps[name] / 2 < LAST_STEP[name] - 1e-12 for name in self.names):
-            return False
-        self.steps = {name: max(step / 2, LAST_STEP[name]) for name, step in self.steps.items()}
-        return True
+        before = self.steps
+        self.steps = {name: max(step / 2, LAST_STEP[name]) for name, step in before.items()}
+        return self.steps != before
 
     def _round(self) -> bool:
         """Try each parameter once, up and down, then what was promising together; return whether a step was accepted."""
         accepted, promising = self.accepted, dict[str, float]()
         for name in self.names:
-            moved, step = self._both_ways(name)
-            if not moved and step:
-                promising[name] = step
+            tried = []
+            for step in (self.steps[name], -self.steps[name]):
+                gain, loss = self._accepts({name: step})
+                if gain > CLEARLY:
+                    while self._accepts({name: step})[0] > CLEARLY:
+                        pass
+                    break
+                tried.append((gain, step, loss))
+            else:
+                (_, _, other), (gain, step, loss) = tried if tried[1][0] > tried[0][0] else tried[::-1]
+                against = _in_errors(*paired(other, loss, ~self.held_out))
+                if gain > PERHAPS or (gain > 0 and against > CLEARLY):
+                    promising[name] = step
         if promising:
             self._accepts(promising)
         return self.accepted > accepted
-
-    def _both_ways(self, name: str) -> tuple[bool, float]:
-        """Try a step up and a step down; return whether one was accepted, else the one that is promising, 0 for none."""
-        gains, losses = [], []
-        for step in (self.steps[name], -self.steps[name]):
-            gain, loss = self._accepts({name: step})
-            if gain > CLEARLY:
-                while self._accepts({name: step})[0] > CLEARLY:
-                    pass
-                return True, 0.0
-            gains.append(gain)
-            losses.append(loss)
-        better = int(gains[1] > gains[0])
-        step = (self.steps[name], -self.steps[name])[better]
-        against = _in_errors(*paired(losses[1 - better], losses[better], ~self.held_out))
-        return False, step if gains[better] > PERHAPS or (gains[better] > 0 and against > CLEARLY) else 0.0
 
     def _accepts(self, steps: Mapping[str, float]) -> tuple[float, F64]:
         """Try `steps` from the best move, and go there if that is clearly better; return by how many standard errors, and the losses."""
@@ -279,33 +255,32 @@ class Search:
             self._errors.append(error)
         clear = _in_errors(gain, error)
         if clear > CLEARLY:
-            self._reach(candidate, loss)
+            self.best, self._here = candidate, loss
             self.accepted += 1
         return clear, loss
 
     def _try(self, move: Move) -> F64:
-        """Return each object's loss under `move`: from the journal as far as it goes, then measured."""
+        """Return each object's loss under `move`, nan where it is not known: from the journal as far as it goes, then measured."""
         place = self._followed
         self._followed += 1
         if place < len(self.journal):
             step = self.journal[place]
-            if step.move != move or len(step.loss) != self._n:
+            if step.move != move or len(step.loss) != self.n_objects:
                 raise DamagedFileError(f"trial {place} of the checkpoint is {step.move.words()}, here {move.words()}")
-            return step.losses(self._n)
+            return np.array(step.loss, np.float64)
         if self.journal:
             dearest = max(step.cost for step in self.journal)
-            if not self.budget.allows(self.spent, dearest, 3):  # this one, and two for the comparison at the end
+            if not self.spent.plus(dearest, 3).within(self.budget):  # this one, and two for the comparison at the end
                 raise OutOfBudget
         try:
-            loss, cost = self._measure(move, place)
-            step = Step(move, cost, tuple(float(value) if math.isfinite(value) else None for value in loss))
+            loss, cost = self.measure(move, place)
         except PlanError:
             if move == STILL:
                 raise
-            step = Step(move, Cost(), (None,) * self._n, possible=False)
-        self.journal.append(step)
-        self._keep(self.journal)
-        return step.losses(self._n)
+            loss, cost = np.full(self.n_objects, np.nan), Cost()
+        self.journal.append(Step(move, cost, tuple(float(one) if math.isfinite(one) else None for one in loss)))
+        self.keep(self.journal)
+        return loss
 
 
 def held_out_of(n_objects: int) -> NDArray[np.bool_]:
@@ -327,7 +302,7 @@ def _in_errors(gain: float, error: float) -> float:
     return gain / error if error > 0 else math.copysign(math.inf, gain) if gain else 0.0
 
 
-# ---- a trial on the device ----
+# ---- trials on the device ----
 
 
 class Trial(NamedTuple):
@@ -335,104 +310,24 @@ class Trial(NamedTuple):
 
     loss: F64  # (objects,)
     right: F64  # (objects,)
-    clicks: float  # mean per decision
-    photons: float  # mean per decision, nan where the instrument does not know
-    illumination: float  # mean per decision
-    decisions: int
-    seconds: float  # of the instrument
+    light: dict[
+        str, float | None
+    ]  # means per decision: clicks, photons (None: the instrument does not know), illumination
+    cost: Cost  # clicks stand for photons where the instrument does not know them
     simulated: bool
-
-    @property
-    def cost(self) -> Cost:
-        """What the trial took; clicks stand for photons where the instrument does not know them."""
-        each = self.photons if math.isfinite(self.photons) else self.clicks
-        return Cost(each * self.decisions, self.seconds)
-
-
-@dataclass(slots=True)
-class Bench:
-    """The device, as trials need it; `labels` are truths by object, where they do not come from its marks."""
-
-    device: str
-    profile: Profile
-    bundle: Bundle
-    n_objects: int  # 0: as many as a simulated scene says
-    labels: Mapping[int, int | None] | None
-    stop: Stop
-    drive: str = "auto"
-    decider: Decider = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.decider = make_decider(self.bundle)
-
-    def run(self, bundle: Bundle, number: int) -> Trial:
-        """Show `bundle`'s patterns, which the old back end decides on, to every object once; `number` of the trial seeds a simulation.
-
-        PlanError where the device cannot show them, LinkError where it is lost, KeyboardInterrupt when the run was asked to stop.
-        """
-        link = open_link(seeded(self.device, number))
-        try:
-            plan = build_plan(self.profile, bundle, drive=self.drive)
-            log = ClickLog()
-            n_cycles = self.n_objects * plan.cycles_per_object
-            core = Core(plan, log.over(self.decider), 1, n_cycles)
-
-            def look(_: LiveRun, output: Output) -> None:
-                log.note(output.decisions)
-
-            timing = self.profile.timing
-            deadline, lease = timing.decision_deadline_us, timing.lease_ms
-            config = RunOptions(n_cycles=n_cycles, deadline_us=deadline, lease_ms=lease, realtime=False)
-            watching = Observers(look, stop=self.stop, acts=False)
-            result = run_live(link, self.profile, bundle, plan, core, config, None, None, watching)
-        finally:
-            link.close()
-        if self.stop.word:
-            raise KeyboardInterrupt(self.stop.word)
-        if result.link_lost:
-            raise LinkError(f"{self.device}: lost during trial {number}: {result.ended}")
-        return self._scored(log, plan, result, bundle)
-
-    def _scored(self, log: ClickLog, plan: Plan, result: RunResult, bundle: Bundle) -> Trial:
-        if len(log.counts) != len(log.decisions) or not log.counts:
-            raise LinkError(f"{self.device}: no decision in a trial ({result.ended})")
-        logs = log_softmax(self.decider.scores_batch(np.stack(log.counts), 1).astype(np.float64))
-        loss, right = np.full(self.n_objects, np.nan), np.full(self.n_objects, np.nan)
-        for row, decision in zip(logs, log.decisions, strict=True):
-            truth = decision.truth if self.labels is None else self.labels.get(decision.object)
-            if truth is not None and 0 <= truth < len(row) and decision.object < self.n_objects:
-                loss[decision.object], right[decision.object] = -row[truth], float(decision.label == truth)
-        figures = result.tally.figures()
-        decisions = max(1, figures.decisions)
-        light = bundle.illumination()
-        if plan.automaton is not None:
-            light = float(result.states_shown @ bundle.light_of(plan.automaton)) / decisions
-        return Trial(
-            loss,
-            right,
-            figures.clicks_mean or 0.0,
-            math.nan if figures.photons_mean is None else figures.photons_mean,
-            light,
-            figures.decisions,
-            result.seconds,
-            bool(result.device.get("simulated")),
-        )
 
 
 def scene_size(device: str) -> int:
     """Return how many objects the scene of a simulated instrument has, 0 where the device does not say."""
     from pans.runtime.link.connection import Connection
 
-    link = open_link(device)
-    connection: Any = None
-    try:
+    with closing(open_link(device)) as link:
         connection = Connection(link)
-        objects = connection.handshake().facts.get("objects", 0)
-        return objects if isinstance(objects, int) and objects > 0 else 0
-    finally:
-        if connection is not None:
+        try:
+            objects = connection.handshake().facts.get("objects", 0)
+        finally:
             connection.detach()
-        link.close()
+    return objects if isinstance(objects, int) and objects > 0 else 0
 
 
 def seeded(device: str, number: int) -> str:
@@ -445,57 +340,117 @@ def seeded(device: str, number: int) -> str:
     """
     if not device.startswith("sim:"):
         return device
-    if _SEED.search(device):
-        return _SEED.sub(lambda found: f"{found[1]}{int(found[2]) + number}", device)
-    return f"{device}{'&' if '?' in device else '?'}seed={number}"
-
-
-def demand_labelled(trial: Trial, held_out: NDArray[np.bool_]) -> None:
-    """Raise UsageError unless enough objects have a label, of those to tune on and of those held out."""
-    known = np.isfinite(trial.loss)
-    tuned, kept = int((known & ~held_out).sum()), int((known & held_out).sum())
-    if tuned < TUNED_MIN or kept < HELD_MIN:
-        raise UsageError(
-            f"{tuned} labelled objects to tune on and {kept} held out, allowed: {TUNED_MIN} and {HELD_MIN} or more",
-            remedy="label more objects with --labels, or let more pass with --objects",
-        )
-
-
-# ---- a whole tuning ----
+    found, n = re.subn(r"([?&]seed=)(\d+)", lambda seed: f"{seed[1]}{int(seed[2]) + number}", device)
+    return found if n else f"{device}{'&' if '?' in device else '?'}seed={number}"
 
 
 @dataclass(slots=True)
 class Tuning:
-    """One tuning on one device; `facts` are those that a checkpoint must share to be gone on from."""
+    """One tuning on one device; `facts` are those that a checkpoint must share to be continued from."""
 
-    bench: Bench
+    device: str
+    profile: Profile
+    bundle: Bundle
+    n_objects: int
+    labels: Mapping[int, int | None] | None  # truths by object, where they do not come from the device's marks
+    drive: str
+    stop: Stop
     names: tuple[str, ...]
-    budget: Budget
+    budget: Cost
     checkpoint: Path
     facts: dict[str, Any]
     simulated: bool = False
+    decider: Decider = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.decider = make_decider(self.bundle)
 
     def run(self, *, resume: bool) -> tuple[Bundle, dict[str, Any]]:
         """Search and compare; return the bundle to write and the report. An interrupt ends the search only (`interrupted`)."""
-        search = Search(self.names, self.bench.n_objects, self.budget, self._measure, self._keep)
+        search = Search(self.names, self.n_objects, self.budget, self._measure, self._keep)
         if resume:
             search.journal = self._read()
             say(f"pans: {len(search.journal)} trials from {self.checkpoint}")
-        interrupted, compared = False, None
+        interrupted, comparison = False, None
         try:
             search.run()
-            compared = self._compared(search)
+            comparison = self._compared(search)
         except KeyboardInterrupt:
             interrupted = True
         best = search.best
-        if compared is not None and compared["all_objects"]["log_loss_gain"]["value"] <= 0:
+        if comparison is not None and comparison["all_objects"]["log_loss_gain"]["value"] <= 0:
             best = STILL
-        return self._tuned(search, best, compared, interrupted=interrupted)
+        spent = search.spent if comparison is None else search.spent.plus(Cost(**comparison["cost"]))
+        report = {
+            "changed": best != STILL,
+            "move": best._asdict(),
+            "steps": search.steps,
+            "accepted": search.accepted,
+            "test": f"paired difference of log loss above {CLEARLY} standard errors",
+            "resolution": search.resolution if math.isfinite(search.resolution) else None,
+            "trials": len(search.journal),
+            "ended": "interrupted" if interrupted else search.ended,
+            "interrupted": interrupted,
+            "objects": self.n_objects,
+            "comparison": comparison,
+            "spent": {"photons_or_clicks": spent.photons, "instrument_minutes": spent.seconds / 60},
+            "simulated": self.simulated,
+        }
+        return self._tuned(best, report), report
+
+    def _tuned(self, best: Move, report: Mapping[str, Any]) -> Bundle:
+        old = self.bundle
+        facts = {**report, "from_bundle_sha256": self.facts["bundle_sha256"], "device": self.device}
+        if best != STILL and old.expected is not None:
+            facts["expected_of_the_old_patterns"] = dict(old.expected)
+        made = replace(moved(old, best), provenance={**old.provenance, "tune": facts})
+        check_bundle(made)
+        return parse_bundle(bundle_bytes(made), "the tuned bundle")
+
+    def _trial(self, bundle: Bundle, number: int) -> Trial:
+        """Show `bundle`'s patterns, which the old back end decides on, to every object once; `number` of the trial seeds a simulation.
+
+        PlanError where the device cannot show them, LinkError where it is lost, KeyboardInterrupt when the run was asked to stop.
+        """
+        timing, log = self.profile.timing, ClickLog()
+        with closing(open_link(seeded(self.device, number))) as link:
+            plan = build_plan(self.profile, bundle, drive=self.drive)
+            n_cycles = self.n_objects * plan.cycles_per_object
+            core = Core(plan, log.over(self.decider), 1, n_cycles)
+            config = RunOptions(
+                n_cycles=n_cycles, deadline_us=timing.decision_deadline_us, lease_ms=timing.lease_ms, realtime=False
+            )
+            watching = Observers(lambda _, output: log.note(output.decisions), stop=self.stop, acts=False)
+            result = run_live(link, self.profile, bundle, plan, core, config, None, None, watching)
+        if self.stop.word:
+            raise KeyboardInterrupt(self.stop.word)
+        if result.link_lost or len(log.counts) != len(log.decisions) or not log.counts:
+            what = "lost during" if result.link_lost else "no decision in"
+            raise LinkError(f"{self.device}: {what} trial {number}: {result.ended}")
+        logs = log_softmax(self.decider.scores_batch(np.stack(log.counts), 1).astype(np.float64))
+        loss, right = np.full((2, self.n_objects), np.nan)
+        for row, decision in zip(logs, log.decisions, strict=True):
+            truth = decision.truth if self.labels is None else self.labels.get(decision.object)
+            if truth is not None and 0 <= truth < len(row) and decision.object < self.n_objects:
+                loss[decision.object], right[decision.object] = -row[truth], float(decision.label == truth)
+        figures = result.tally.figures()
+        clicks, photons, light = figures.clicks_mean or 0.0, figures.photons_mean, bundle.illumination()
+        if plan.automaton is not None:
+            light = float(result.states_shown @ bundle.light_of(plan.automaton)) / max(1, figures.decisions)
+        means = {"clicks_mean": clicks, "photons_mean": photons, "illumination": light}
+        cost = Cost((clicks if photons is None else photons) * figures.decisions, result.seconds)
+        return Trial(loss, right, means, cost, bool(result.device.get("simulated")))
 
     def _measure(self, move: Move, number: int) -> tuple[F64, Cost]:
-        trial, held_out = self.bench.run(moved(self.bench.bundle, move), number), held_out_of(self.bench.n_objects)
+        trial, held_out = self._trial(moved(self.bundle, move), number), held_out_of(self.n_objects)
         self.simulated = trial.simulated
-        demand_labelled(trial, held_out)
+        known = np.isfinite(trial.loss)
+        tuned, kept = int((known & ~held_out).sum()), int((known & held_out).sum())
+        if tuned < TUNED_MIN or kept < HELD_MIN:
+            raise UsageError(
+                f"{tuned} labelled objects to tune on and {kept} held out, allowed: {TUNED_MIN} and {HELD_MIN} or more",
+                remedy="label more objects with --labels, or let more pass with --objects",
+            )
         mean, right = float(np.nanmean(trial.loss[~held_out])), 100 * np.nanmean(trial.right)
         say(f"pans: trial {number}: {move.words()}: log loss {mean:.4f}, accuracy {right:.1f} %")
         return trial.loss, trial.cost
@@ -523,53 +478,19 @@ class Tuning:
         if search.best == STILL:
             return None
         number = len(search.journal)
-        old = self.bench.run(self.bench.bundle, number)
-        new = self.bench.run(moved(self.bench.bundle, search.best), number + 1)
+        old = self._trial(self.bundle, number)
+        new = self._trial(moved(self.bundle, search.best), number + 1)
         held = search.held_out
         return {
             "held_out": _comparison(old, new, held),
             "all_objects": _comparison(old, new, np.ones_like(held)),
-            "old": _light(old),
-            "new": _light(new),
+            "old": old.light,
+            "new": new.light,
             "cost": old.cost.plus(new.cost)._asdict(),
         }
-
-    def _tuned(
-        self, search: Search, best: Move, compared: dict[str, Any] | None, *, interrupted: bool
-    ) -> tuple[Bundle, dict[str, Any]]:
-        spent = search.spent if compared is None else search.spent.plus(Cost(**compared["cost"]))
-        report = {
-            "changed": best != STILL,
-            "move": asdict(best),
-            "steps": search.steps,
-            "accepted": search.accepted,
-            "test": f"paired difference of log loss above {CLEARLY} standard errors",
-            "resolution": search.resolution if math.isfinite(search.resolution) else None,
-            "trials": len(search.journal),
-            "ended": "interrupted" if interrupted else search.ended,
-            "interrupted": interrupted,
-            "objects": self.bench.n_objects,
-            "comparison": compared,
-            "spent": {"photons_or_clicks": spent.photons, "instrument_minutes": spent.seconds / 60},
-            "simulated": self.simulated,
-        }
-        old = self.bench.bundle
-        told = {**report, "from_bundle_sha256": self.facts["bundle_sha256"], "device": self.facts["device"]}
-        if best != STILL and old.expected is not None:
-            told["expected_of_the_old_patterns"] = dict(old.expected)
-        made = replace(moved(old, best), provenance={**old.provenance, "tune": told})
-        check_bundle(made)
-        return parse_bundle(bundle_bytes(made), "the tuned bundle"), report
 
 
 def _comparison(old: Trial, new: Trial, chosen: NDArray[np.bool_]) -> dict[str, Any]:
     both = chosen & np.isfinite(old.loss) & np.isfinite(new.loss)
-    columns = {"accuracy_old": old.right, "accuracy_new": new.right, "accuracy_gain": new.right - old.right}
-    columns |= {"log_loss_old": old.loss, "log_loss_new": new.loss, "log_loss_gain": old.loss - new.loss}
-    figures = {name: estimate_json(Estimate.of(values[both])) for name, values in columns.items()}
-    return {"objects": int(both.sum()), **figures}
-
-
-def _light(trial: Trial) -> dict[str, Any]:
-    photons = trial.photons if math.isfinite(trial.photons) else None
-    return {"clicks_mean": trial.clicks, "photons_mean": photons, "illumination": trial.illumination}
+    figures = compared((old.loss[both], old.right[both]), (new.loss[both], new.right[both]))
+    return {"objects": int(both.sum()), **{name: found.as_json() for name, found in figures.items()}}

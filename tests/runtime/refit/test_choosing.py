@@ -49,7 +49,7 @@ def test_a_changed_instrument_is_followed_and_the_estimate_is_right() -> None:
     assert found.name != OLD
     gain = exact(scores, chance)[1] - exact(found.scores, chance)[1]
     assert gain > 0
-    assert abs(judged.log_loss_gain.value - gain) < 2 * judged.log_loss_gain.error
+    assert abs(judged.figures["log_loss_gain"].value - gain) < 2 * judged.figures["log_loss_gain"].error
     assert judged.sizes == (40, 80, 160, 320)
 
 
@@ -60,8 +60,10 @@ def test_labels_that_mean_nothing_are_not_learnt() -> None:
         np.zeros_like(scores), np.zeros((ROWS, 0)), rng.integers(0, ROWS, 300), rng.integers(0, 3, 300), np.arange(300)
     )
     judged = judge(evidence, kinds_for(evidence, rows=True))
-    assert judged.log_loss_gain.value < 2 * judged.log_loss_gain.error + 1e-9
-    assert judged.accuracy_gain.value == pytest.approx(0, abs=4 * judged.accuracy_gain.error + 1e-9)
+    assert judged.figures["log_loss_gain"].value < 2 * judged.figures["log_loss_gain"].error + 1e-9
+    assert judged.figures["accuracy_gain"].value == pytest.approx(
+        0, abs=4 * judged.figures["accuracy_gain"].error + 1e-9
+    )
 
 
 def test_an_object_counts_once_however_often_it_was_shown_and_is_never_in_two_folds() -> None:

@@ -74,11 +74,10 @@ def test_what_was_not_seen_to_differ_stays() -> None:
 
 def test_how_the_counts_lie_in_rows_makes_no_difference() -> None:
     scores, bits, counts = case(10)
-    whole, _ = fit(BLOCKS, scores, bits, counts)
-    many = [np.tile(part, (150, 1)) for part in (scores, bits, counts / 150)]  # more rows than are taken at once
-    spread, _ = fit(BLOCKS, *many)
+    whole, prior = fit(BLOCKS, scores, bits, counts)
+    spread, again = fit(BLOCKS, *(np.tile(part, (150, 1)) for part in (scores, bits, counts / 150)))
     assert np.allclose(spread.gain, whole.gain, atol=1e-6)
-    assert np.allclose(spread.precision, whole.precision, rtol=1e-6)
+    assert np.allclose(again.precision, prior.precision, rtol=1e-6)
 
 
 def test_a_feature_that_never_varies_has_no_gain() -> None:
