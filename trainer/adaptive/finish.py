@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.instrument.profile import Profile
 
+from .grow import sum_of
 from .machine import Bits, Machine, Sight, forward
 from .objects import Block
 from .tune import Price, figures
@@ -39,7 +40,7 @@ class Posteriors:
 
 def node_counts(machine: Machine, sight: Sight, blocks: list[Block]) -> list[F64]:
     """Return the expected class counts of the nodes before every exposure and at the end, T + 1 arrays (nodes, classes)."""
-    totals: list[torch.Tensor] = []
+    counted = []
     with torch.no_grad():
         for block in blocks:
             passed = forward(machine, sight, block.grey)
@@ -47,9 +48,8 @@ def node_counts(machine: Machine, sight: Sight, blocks: list[Block]) -> list[F64
             for number, leaves in enumerate(passed.leaves):
                 states = passed.steps[number + 1].alpha if number + 1 < len(passed.steps) else leaves[:0]
                 nodes.append(torch.cat([states, leaves]))
-            counted = [(part @ block.one_hot.T).double() for part in nodes]
-            totals = counted if not totals else [a + b for a, b in zip(totals, counted)]
-    return [total.cpu().numpy() for total in totals]
+            counted.append([(part @ block.one_hot.T).double() for part in nodes])
+    return [sum_of(parts).cpu().numpy() for parts in zip(*counted)]
 
 
 def smoothed(counts: F64, smoothing: float, sharpness: float = 1.0) -> F64:
@@ -119,14 +119,9 @@ class Grid:
 
 def bit_grid(top: float, profile: Profile) -> Grid:
     """Return the grid for one-bit patterns of which the brightest pixel gives `top` photoelectrons in a whole exposure."""
-    steps = dwell_steps(profile)
+    steps = profile.projector.dwell_steps
     by_level = steps == 1 and profile.projector.levels > 2
     return Grid(top, profile.projector.levels - 1 if by_level else steps, by_level)
-
-
-def dwell_steps(profile: Profile) -> int:
-    """Return in how many steps the projector of `profile` can shorten its light."""
-    return profile.projector.dwell_steps
 
 
 def set_top(machine: Machine, top: float, profile: Profile) -> None:

@@ -8,13 +8,14 @@ first whose merger loses least information on the class. Growing looks one expos
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
+
+from pans.trainer.options import AutomatonOptions
 
 from .machine import COUNT_FLOOR, Grey, Level, Machine, Sight, children
 from .objects import Block
@@ -23,26 +24,28 @@ from .outcomes import by_row, by_state, channels_of, clicks_of, mean_reading, re
 TRIED_BLOCKS = 6  # objects on which candidates are compared, in blocks
 LIGHT_TRIED = (0.4, 1.6)  # mean photoelectrons of a candidate
 REST_TRIED = (0.5, 1.5)  # how much of the mean of the other classes is taken away
+RATE = 0.03  # of Adam, at the start of a level
 GLOW = 1e-6  # least light of a pixel at the start: squares of 0 would never move
 F64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class GrowOptions:
-    """How a level is grown: at most `states` behind it, `epochs` of Adam at `rate`, the best of `candidates` class splits."""
-
-    states: int = 128
-    epochs: int = 2
-    rate: float = 0.03
-    candidates: int = 6
-    top: float = math.inf  # most photoelectrons of a pixel
-
-
 class Growth:
-    """An automaton that grows over fixed blocks of objects; `alphas` are the probabilities of its present states per block."""
+    """An automaton that grows over fixed blocks of objects; `alphas` are the probabilities of its present states per block.
 
-    def __init__(self, blocks: list[Block], sight: Sight, options: GrowOptions, random: torch.Generator) -> None:
-        self.blocks, self.sight, self.options, self.random = blocks, sight, options, random
+    A level has at most `states` behind it, and at most `top` photoelectrons in a pixel.
+    """
+
+    def __init__(
+        self,
+        blocks: list[Block],
+        sight: Sight,
+        random: torch.Generator,
+        options: AutomatonOptions,
+        states: int,
+        top: float = math.inf,
+    ) -> None:
+        self.blocks, self.sight, self.random = blocks, sight, random
+        self.options, self.states, self.top = options, states, top
         self.channels, self.clicks = channels_of(sight.law), clicks_of(sight.law)
         self.alphas = [torch.ones(1, len(block)) for block in blocks]
         self.levels: list[Level] = []
@@ -55,7 +58,7 @@ class Growth:
     def grow(self, price: float) -> None:
         """Add a level whose light costs `price` per photoelectron."""
         roots = self._best_candidates(price).clamp(min=GLOW).sqrt()
-        light = Grey(roots, self.options.top)
+        light = Grey(roots, self.top)
         light.settle()
         self._train(light, price)
         self._branch(light)
@@ -137,14 +140,14 @@ class Growth:
     def _train(self, light: Grey, price: float) -> None:
         """Adam on the children's expected cross-entropy under running class counts."""
         options = self.options
-        optimiser = torch.optim.Adam([light.root], lr=options.rate, fused=True)
+        optimiser = torch.optim.Adam([light.root], lr=RATE, fused=True)
         n = sum(len(block) for block in self.blocks)
         whole = (
             self.counts.double() + len(self.clicks) * COUNT_FLOOR
         )  # in float32 a child's count could vanish beside another's
         parts = [torch.minimum(p.double() + COUNT_FLOOR, whole - COUNT_FLOOR) for p in self._outcome_counts(light)]
-        steps, done = options.epochs * len(self.blocks), 0
-        for epoch in range(options.epochs):
+        steps, done = options.grow_epochs * len(self.blocks), 0
+        for epoch in range(options.grow_epochs):
             share = 0.05 if epoch == 0 else 0.03
             for index in torch.randperm(len(self.blocks), generator=self.random).tolist():
                 alpha, block = self.alphas[index], self.blocks[index]
@@ -154,7 +157,7 @@ class Growth:
                 slope = slope_of(falls, _told(parts, whole, block), self.sight.law)
                 slope.neg_().add_(price).mul_(by_row(alpha, self.channels)).mul_(1.0 / len(block))
                 light.set_gradients(self.sight.mask_slope(slope, block.grey, light), None)
-                optimiser.param_groups[0]["lr"] = options.rate * (1 - done / steps) + 1e-4
+                optimiser.param_groups[0]["lr"] = RATE * (1 - done / steps) + 1e-4
                 optimiser.step()
                 light.settle()
                 done += 1
@@ -165,19 +168,18 @@ class Growth:
     def _outcome_counts(self, light: Grey) -> list[Tensor]:
         """Class counts of all outcomes but the last, each (states, classes)."""
         mask, _ = light.displayed()
-        totals: list[Tensor] = []
+        counted = []
         for alpha, block in zip(self.alphas, self.blocks):
             chances, _ = readings(self.sight.light(mask, block.grey), self.sight.law)
-            counted = [(alpha * chance) @ block.one_hot.T for chance in chances]
-            totals = counted if not totals else [total + part for total, part in zip(totals, counted)]
-        return totals
+            counted.append([(alpha * chance) @ block.one_hot.T for chance in chances])
+        return [sum_of(parts) for parts in zip(*counted)]
 
     def _branch(self, light: Grey) -> None:
         """Carry the probabilities to the children and merge these."""
         states = len(self.counts)
         parts = self._outcome_counts(light)
         edges = torch.cat([*parts, remainder(self.counts, parts).clamp(min=0)])
-        groups = merged(edges.double().cpu().numpy(), min(self.options.states, len(edges)))
+        groups = merged(edges.double().cpu().numpy(), min(self.states, len(edges)))
         successors = torch.from_numpy(np.ascontiguousarray(groups)).to(edges.device).reshape(-1, states)
         n_nodes = int(groups.max()) + 1
         self._carry(light, successors, n_nodes)

@@ -288,7 +288,7 @@ class Sight:
 class Step:
     """One level of a pass: probability of the states, light by rows, chances of all outcomes but the last, and how fast these fall.
 
-    `whole` is the light of a state, all its channels together; `numbers` are the clicks of each outcome.
+    `whole` is the light of a state, all its channels together.
     """
 
     alpha: Tensor
@@ -296,22 +296,16 @@ class Step:
     whole: Tensor
     chances: tuple[Tensor, ...]
     falls: tuple[Tensor, ...]
-    numbers: tuple[int, ...]
-
-    @property
-    def dark(self) -> Tensor:
-        """Probability of no click: of the outcome 0."""
-        return self.chances[0]
-
-    def clicks(self) -> Tensor:
-        """Return the expected clicks of every object: photons counted, where they are."""
-        return (self.alpha * mean_reading(self.chances, self.numbers)).sum(dim=0)
 
 
 @dataclass(slots=True)
 class Pass:
-    """A forward pass of some objects: its steps and, behind every level, the probability of the leaves (leaves, objects)."""
+    """A forward pass of some objects: its steps and, behind every level, the probability of the leaves (leaves, objects).
 
+    `numbers` are the clicks of each outcome, or the photons counted.
+    """
+
+    numbers: tuple[int, ...]
     steps: list[Step] = field(default_factory=list)
     leaves: list[Tensor] = field(default_factory=list)
 
@@ -321,7 +315,8 @@ class Pass:
 
     def clicks(self) -> Tensor:
         """Return the expected clicks of every object: photons counted, where they are."""
-        return torch.stack([step.clicks() for step in self.steps]).sum(dim=0)
+        counted = [(step.alpha * mean_reading(step.chances, self.numbers)).sum(dim=0) for step in self.steps]
+        return torch.stack(counted).sum(dim=0)
 
 
 def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
@@ -349,7 +344,7 @@ def children(alpha: Tensor, chances: tuple[Tensor, ...], successors: Tensor, n_n
 
 def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
     """Return the pass of the objects `grey` (objects, pixels) through `machine`."""
-    result, numbers, channels = Pass(), clicks_of(sight.law), channels_of(sight.law)
+    result, channels = Pass(clicks_of(sight.law)), channels_of(sight.law)
     nodes = torch.ones(1, len(grey), dtype=sight.sums)
     memory = None if sight.afterpulses is None else MeanMemory(sight.afterpulses, nodes)
     for number, level in enumerate(machine.levels):
@@ -360,7 +355,7 @@ def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
         chances, falls = readings(light, sight.law)
         if memory is not None:
             chances, falls = memory.step(alpha, chances, falls, level.successors, machine.n_nodes(number))
-        result.steps.append(Step(alpha, light, by_state(light, channels), chances, falls, numbers))
+        result.steps.append(Step(alpha, light, by_state(light, channels), chances, falls))
         nodes = children(alpha, chances, level.successors, machine.n_nodes(number))
     result.leaves.append(nodes)
     return result

@@ -15,10 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pans.runtime.imaging import Tolerance
+from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import here
 from pans.trainer.model.imaging import DrawnOptics
+from pans.trainer.options import AutomatonOptions
 from pans.trainer.tasks.changes import DISTORT_STREAM, distorted, shifted
 from pans.trainer.tasks.registry import Objects, Task
 
@@ -38,27 +39,14 @@ class Block:
         return len(self.grey)
 
 
-@dataclass(frozen=True, slots=True)
-class Augmentation:
-    """How training images change from epoch to epoch: moved by whole pixels along and across the rows; `copies` distorted versions.
-
-    Epochs take the images as they are and their distorted versions in turn; `strength` scales the distortions (distort.py).
-    """
-
-    shift_px: int = 0
-    offset_px: int = 0
-    copies: int = 0
-    strength: float = 1.0
-    optics: Tolerance | None = None  # seen through optics drawn within it, anew in every epoch
-
-
 class TrainingObjects:
     """The training objects of a task: `epoch` gives those to fit, `held_back` the others, in blocks.
 
-    `gain` and `floor` turn grey values into the transmission of the profile's modulator.
+    `gain` and `floor` turn grey values into the transmission of the profile's modulator. By `options` images move by whole pixels from
+    epoch to epoch, epochs take the images and their distorted copies in turn, and optics are drawn anew in every epoch.
     """
 
-    def __init__(self, task: Task, profile: Profile, seed: int, augmentation: Augmentation, held_back: int = 0) -> None:
+    def __init__(self, task: Task, profile: Profile, options: AutomatonOptions, held_back: int = 0) -> None:
         n_back = held_back or max(1, len(task.train) // HELD_BACK_PART)
         n_fit = len(task.train) - n_back
         if n_fit < 1:
@@ -71,9 +59,10 @@ class TrainingObjects:
         self._levels = 256 if modulator is None else min(256, modulator.levels)
         self._black = profile.min_transmission
         self.gain = (1.0 - self._black) / (self._levels - 1)
-        self._seed, self._augmentation = seed, augmentation
-        tolerance = augmentation.optics
-        self._optics = None if tolerance is None else DrawnOptics(tolerance, task.image_shape, seed)
+        self._seed, self._options = options.seed, options
+        self._optics = None
+        if options.optics is not None:
+            self._optics = DrawnOptics(tolerance_of(options.optics), task.image_shape, options.seed)
         self.floor = self._black if self._optics is None else 0.0  # which drawn optics show like all other light
         self._targets: NDArray[np.float32] | None = None
 
@@ -110,8 +99,8 @@ class TrainingObjects:
         return list(self._blocks(self._back, size, dtype, draw=HELD_BACK_DRAW))
 
     def _augmented(self, number: int) -> Objects:
-        objects, way = self._fit, self._augmentation
-        version = number % (way.copies + 1)
+        objects, way = self._fit, self._options
+        version = number % ((way.copies or 0) + 1)
         if version:
             objects = Objects(
                 distorted(objects.images, [DISTORT_STREAM, self._seed, version], way.strength), objects.labels

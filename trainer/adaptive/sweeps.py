@@ -34,16 +34,6 @@ GLARE_MIN = 1e-5  # nats, where detected light is cheap: at 40 photons 96 patter
 SURE_OF_PATTERN = 1e-4  # of a state's cost, by which another pattern must be better
 
 
-@dataclass(frozen=True, slots=True)
-class Rerouted:
-    """How many edges moved (`stopped`: to leaves of their own) and empty nodes were revived, and the loss saved per object, nats."""
-
-    moved: int
-    revived: int
-    saved: float
-    stopped: int = 0
-
-
 class Sweep:
     """What a sweep keeps of every block: probability and light of all states, and the expected loss behind the present level."""
 
@@ -61,31 +51,13 @@ class Sweep:
     def costs(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
         """Expected loss of every edge at every node, (outcomes, states, nodes), class counts of the edges, (outcomes, states, classes),
         and the standard error of a difference of losses, (outcomes, states)."""
-        costs: Tensor | None = None
-        arrived: Tensor | None = None
-        squares: Tensor | None = None
+        parts = []
         for kept, beta, block in zip(self.kept, self.betas, self.blocks):
             edges = self._edges(kept[number])
-            part, counted, square = edges @ beta.T, edges @ block.one_hot.T, edges.square().sum(dim=1)
-            costs = part if costs is None else costs + part
-            arrived = counted if arrived is None else arrived + counted
-            squares = square if squares is None else squares + square
-        assert costs is not None
-        assert arrived is not None
-        assert squares is not None
-        error = LOSS_SPREAD * squares.sqrt()
+            parts.append((edges @ beta.T, edges @ block.one_hot.T, edges.square().sum(dim=1)))
         by_outcome = len(self.machine.levels[number].successors), -1
-        return costs.unflatten(0, by_outcome), arrived.unflatten(0, by_outcome), error.unflatten(0, by_outcome)
-
-    def copy_node(self, source: int, target: int) -> None:
-        """Let the expected loss of `target` behind the present level be that of `source`."""
-        for beta in self.betas:
-            beta[target] = beta[source]
-
-    def add_leaves(self, counts: Tensor) -> None:
-        """Put leaves of these class counts (leaves, classes) behind the nodes behind the present level."""
-        for index, block in enumerate(self.blocks):
-            self.betas[index] = torch.cat([self.betas[index], leaf_losses(counts, block.one_hot)])
+        costs, arrived, squares = (sum_of(part).unflatten(0, by_outcome) for part in zip(*parts))
+        return costs, arrived, LOSS_SPREAD * squares.sqrt()
 
     def step_back(self, number: int, price: float, exposure_price: float) -> None:
         """Replace the expected losses behind level `number` by those before it, under its present successors."""
@@ -112,15 +84,14 @@ class Sweep:
         return torch.cat([*parts, rest])
 
 
-def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, exposure_price: float = 0.0) -> Rerouted:
-    """Move the edges of `machine` to better nodes, by the objects in `blocks`; `price` is that of a photoelectron.
+def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, exposure_price: float = 0.0) -> int:
+    """Move the edges of `machine` to better nodes, by the objects in `blocks`, and return how many; `price` is that of a photoelectron.
 
     With an `exposure_price` an edge may end the walk: it goes to a new leaf where to decide at once costs less than what follows.
     """
     with torch.no_grad():
         sweep = Sweep(machine, sight, blocks)
-        moved = revived = stopped = 0
-        saved = 0.0
+        moved = 0
         for number in range(len(machine.levels) - 1, -1, -1):
             level = machine.levels[number]
             costs, arrived, error = sweep.costs(number)
@@ -129,48 +100,40 @@ def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, e
             better = least < now - SURE * error
             level.successors = torch.where(better, best, level.successors)
             moved += int(better.sum())
-            saved += float((now - least)[better].sum())
             if exposure_price and number + 1 < len(machine.levels):
-                ended, gained = _stop(machine, number, sweep, torch.minimum(now, least), arrived, error)
-                stopped, saved = stopped + ended, saved + gained
-            for full, empty in _revive(machine, number, arrived):
-                sweep.copy_node(full, empty)
-                revived += 1
+                moved += _stop(sweep, number, torch.minimum(now, least), arrived, error)
+            _revive(sweep, number, arrived)
             sweep.step_back(number, price, exposure_price)
-    return Rerouted(moved + stopped, revived, saved / sum(len(block) for block in blocks), stopped)
+    return moved
 
 
-def _stop(
-    machine: Machine, number: int, sweep: Sweep, cost: Tensor, arrived: Tensor, error: Tensor
-) -> tuple[int, float]:
-    """Give edges leaves of their own where that costs less than `cost`; all (outcomes, states). Returns how many, and what is saved.
+def _stop(sweep: Sweep, number: int, cost: Tensor, arrived: Tensor, error: Tensor) -> int:
+    """Give edges leaves of their own where that costs less than `cost`; all (outcomes, states). Returns how many.
 
     A leaf states the posterior of the objects that arrive, with one more object spread over the classes, so that few of them
     promise little.
     """
     counts = arrived + 1.0 / arrived.shape[2]
     at_once = -(arrived * torch.log(counts / counts.sum(dim=2, keepdim=True))).sum(dim=2)
-    level, ends = machine.levels[number], at_once < cost - SURE * error
+    machine, ends = sweep.machine, at_once < cost - SURE * error
     n_leaves, n_nodes = int(ends.sum()), machine.n_nodes(number)
     if n_leaves:
-        level.successors[ends] = torch.arange(n_nodes, n_nodes + n_leaves)
+        machine.levels[number].successors[ends] = torch.arange(n_nodes, n_nodes + n_leaves)
         leaves = counts[ends] * sweep.scale
         machine.counts[number] = torch.cat([machine.counts[number], leaves])
-        sweep.add_leaves(leaves)
-    return n_leaves, float((cost - at_once)[ends].sum())
+        for index, block in enumerate(sweep.blocks):
+            sweep.betas[index] = torch.cat([sweep.betas[index], leaf_losses(leaves, block.one_hot)])
+    return n_leaves
 
 
-def _revive(machine: Machine, number: int, arrived: Tensor) -> list[tuple[int, int]]:
-    """Give every node behind level `number` an edge: an empty one becomes a copy of the fullest and takes half of its edges.
-
-    Returns the copies made, (full, empty).
-    """
+def _revive(sweep: Sweep, number: int, arrived: Tensor) -> None:
+    """Give every node behind level `number` an edge: an empty one becomes a copy of the fullest and takes half of its edges."""
+    machine = sweep.machine
     level, n_nodes = machine.levels[number], machine.n_nodes(number)
     n_states = n_nodes - len(machine.counts[number])
     targets, edges = level.successors.flatten(), arrived.flatten(0, 1)
     mass = edges.sum(dim=1)
     in_edges = torch.bincount(targets, minlength=n_nodes)
-    revived: list[tuple[int, int]] = []
     for empty in (in_edges == 0).nonzero().flatten().tolist():
         load = torch.zeros(n_nodes).index_add_(0, targets, mass)
         load[in_edges < 2] = -1.0
@@ -184,9 +147,9 @@ def _revive(machine: Machine, number: int, arrived: Tensor) -> list[tuple[int, i
         in_edges[full] -= int(half.sum())
         in_edges[empty] = int(half.sum())
         _copy_node(machine, number, full, empty, edges[own[half]].sum(dim=0))
-        revived.append((full, empty))
+        for beta in sweep.betas:
+            beta[empty] = beta[full]
     level.successors = targets.unflatten(0, (len(level.successors), -1))
-    return revived
 
 
 def _other_half(counts: Tensor) -> Tensor:

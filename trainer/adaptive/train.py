@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
 from pans.trainer.model.detection import trained_through
@@ -45,16 +44,15 @@ from .finish import (
     Posteriors,
     bit_grid,
     calibrated,
-    dwell_steps,
     finished,
     meet_budget,
     node_counts,
     set_top,
     to_grid,
 )
-from .grow import GrowOptions, Growth
+from .grow import Growth
 from .machine import COUNT_FLOOR, Bits, Grey, Machine, Sight, as_bits, forward, machine_from, machine_of, machine_state
-from .objects import Augmentation, Block, TrainingObjects
+from .objects import Block, TrainingObjects
 from .outcomes import by_row, law_of
 from .sweeps import choose_patterns, reroute, share_patterns
 from .tune import Figures, Price, Progress, Tuning, figures, masses, mean_objects
@@ -148,9 +146,7 @@ class _Run:
     ) -> None:
         self.profile, self.options, self.report = profile, for_task(options, task.name), report
         options = self.options
-        tolerance = None if options.optics is None else tolerance_of(options.optics)
-        changes = Augmentation(options.shift_px, options.offset_px, options.copies or 0, options.strength, tolerance)
-        self.objects = TrainingObjects(task, profile, options.seed, changes, held_back)
+        self.objects = TrainingObjects(task, profile, options, held_back)
         self.exposures, self.states = with_defaults(options, profile)
         self.stage, self.epoch = "grow", 0
         self.machine = Machine([], [])
@@ -219,11 +215,10 @@ class _Run:
         """Grow levels until there are as many as exposures."""
         if self.stage != "grow":
             return
-        asked = self.options
-        options = GrowOptions(self.states, asked.grow_epochs, candidates=asked.candidates, top=self._highest_top())
         blocks = self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)
         with torch.no_grad():
-            growth = Growth(blocks, self.sight(self.products), options, new_generator(self.options.seed))
+            sight, random = self.sight(self.products), new_generator(self.options.seed)
+            growth = Growth(blocks, sight, random, self.options, self.states, self._highest_top())
             growth.follow(self.machine.levels)
             while len(growth.levels) < self.exposures:
                 level = len(growth.levels)
@@ -276,7 +271,7 @@ class _Run:
         return high
 
     def _one_brightness(self) -> bool:
-        return self.profile.projector.levels == 2 and dwell_steps(self.profile) == 1
+        return self.profile.projector.levels == 2 and self.profile.projector.dwell_steps == 1
 
     def _start_bits(self, lights: list[torch.Tensor], low: float) -> None:
         shared, top = self._one_brightness(), self._highest_top()
@@ -319,11 +314,10 @@ class _Run:
             if stage == "shown" and 1 <= self.epoch <= epochs - 2:
                 self._choose_patterns()
             blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
-            found = self.tuning.epoch(blocks)
+            means = self.tuning.epoch(blocks)
             self.epoch += 1
             before = self.exposures + (tune_epochs_of(self.options) if stage == "shown" else 0)
-            means = found.loss, found.accuracy, found.clicks, found.photons, found.price
-            self.report(Progress(stage, before + self.epoch, self.steps, *means))
+            self.report(Progress(stage, before + self.epoch, self.steps, *means, self.price.value))
             keep()
 
     def _choose_top(self) -> None:

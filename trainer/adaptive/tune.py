@@ -114,44 +114,31 @@ class Price:
             self.value = min(PRICE_MAX, max(PRICE_MIN, wanted))
 
 
-@dataclass(frozen=True, slots=True)
-class TuneReport:
-    """Means over an epoch of the objects that were fitted."""
-
-    epoch: int
-    loss: float
-    accuracy: float
-    clicks: float
-    photons: float
-    price: float
-
-
 class Tuning:
     """A machine and its optimiser; `epoch` passes once over blocks of objects. The rate falls to 0 over `steps` steps."""
 
     def __init__(self, machine: Machine, sight: Sight, price: Price, rate: float, steps: int) -> None:
         self.machine, self.sight, self.price, self.rate, self.steps = machine, sight, price, rate, steps
         self.exposure_price = self.decide = self.spread = 0.0  # see Aim; they may change from epoch to epoch
-        self.done = self.epochs = 0
+        self.done = 0
         self.optimiser = torch.optim.Adam(machine.parameters(), lr=rate, fused=True)
 
-    def epoch(self, blocks: list[Block]) -> TuneReport:
-        """Pass over `blocks` once."""
+    def epoch(self, blocks: list[Block]) -> tuple[float, float, float, float]:
+        """Pass over `blocks` once; return the means over their objects of loss, accuracy, clicks and photons."""
         sums, n = torch.zeros(4, dtype=torch.float64), sum(len(block) for block in blocks)
         for block in blocks:
             sums += self.step(block, n)
-        self.epochs += 1
         loss, accuracy, clicks, photons = (sums / n).tolist()
-        return TuneReport(self.epochs, loss, accuracy, clicks, photons, self.price.value)
+        return loss, accuracy, clicks, photons
 
     def state(self) -> dict[str, Any]:
         """Return what `restore` needs to continue."""
-        return {"optimiser": self.optimiser.state_dict(), "done": self.done, "epochs": self.epochs}
+        return {"optimiser": self.optimiser.state_dict(), "done": self.done}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from `state`, of a tuning of the same machine."""
         self.optimiser.load_state_dict(state["optimiser"])
-        self.done, self.epochs = state["done"], state["epochs"]
+        self.done = state["done"]
 
     def step(self, block: Block, n: int) -> torch.Tensor:
         """One step of Adam; returns the sums over the block: loss, right decisions, clicks, photons."""

@@ -1,14 +1,22 @@
-"""Merging by the information bottleneck: against an oracle that recomputes every cost, and on cases with a known answer."""
+"""Merging by the information bottleneck, against an oracle that recomputes every cost and on known cases; growing of two channels."""
 
 import numpy as np
 import pytest
+import torch
 from naive_adaptive import merged as oracle
+from trainings import bars_task
 
-from pans.trainer.adaptive.grow import merged
+from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive.grow import Growth, merged
+from pans.trainer.adaptive.machine import Sight, forward
+from pans.trainer.adaptive.objects import TrainingObjects
+from pans.trainer.adaptive.outcomes import WordLaw
+from pans.trainer.options import AutomatonOptions
 
 
 @pytest.mark.uncompiled
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_merges_as_the_oracle(seed):
     rng = np.random.default_rng(seed)
     counts = rng.gamma(0.3, 10, (14, 4))
@@ -18,21 +26,30 @@ def test_merges_as_the_oracle(seed):
         assert sorted(groups, key=lambda group: group[0]) == oracle(counts.tolist(), wanted)
 
 
-def test_same_posteriors_are_merged_first_whatever_their_mass():
+def test_what_is_alike_or_empty_is_merged_first_and_nonsense_is_refused():
     counts = np.array([[90.0, 10.0], [1.0, 9.0], [9.0, 1.0], [50.0, 450.0], [5.0, 5.0]])
-    found = merged(counts, 3)
-    assert found[0] == found[2]
-    assert found[1] == found[3]
-    assert len(set(found.tolist())) == 3
-
-
-def test_empty_nodes_cost_nothing():
+    assert merged(counts, 3).tolist() == [0, 1, 0, 1, 2]
     found = merged(np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 3.0], [0.0, 0.0]]), 2)
     assert found[1] != found[2]
-
-
-def test_nothing_to_merge_and_nonsense():
     assert merged(np.ones((3, 2)), 5).tolist() == [0, 1, 2]
     for counts, wanted in ((np.ones((3, 2)), 0), (-np.ones((3, 2)), 2), (np.full((3, 2), np.nan), 2)):
         with pytest.raises(ValueError, match="groups"):
             merged(counts, wanted)
+
+
+def test_growing_counts_every_object_once_and_spends_what_a_pass_finds():
+    options, random = AutomatonOptions(grow_epochs=1), torch.Generator().manual_seed(1)
+    blocks = TrainingObjects(bars_task(60), load_profile("dmd-four-snspd"), options).epoch(0, 30, torch.float32)
+    sight = Sight(WordLaw(ClickLaw(0.01), 2), 1 / 255)
+    with torch.no_grad():
+        growth = Growth(blocks, sight, random, options, 6)
+        for _ in range(3):
+            growth.grow(0.02)
+        passes = [forward(growth.machine(), sight, block.grey) for block in blocks]
+    n = sum(len(block) for block in blocks)
+    assert [level.successors.shape[0] for level in growth.levels] == [4, 4, 4]
+    assert len(growth.levels[1].light.root) == 2 * growth.levels[1].n_states
+    assert float(growth.counts.sum()) == pytest.approx(n, rel=1e-5)
+    photons = sum(float(one.photons().sum()) for one in passes) / n
+    clicks = sum(float(one.clicks().sum()) for one in passes) / n
+    assert growth.spent == pytest.approx((photons, clicks), rel=1e-5)

@@ -1,45 +1,104 @@
-"""The exact forward pass and its gradient: against all click words one by one, and against differences of the loss."""
+"""The exact forward pass and its gradient: against all outcome words one by one, and against differences of the loss."""
 
 # ruff: noqa: E402  (what follows needs torch)
+from itertools import product
+
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from mpmath import mp, mpf
-from naive_adaptive import every_word
 from trainings import assert_slope, random_machine
 
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.trainer.adaptive.machine import WRONG, Aim, Sight, as_bits, backward, brought, forward
+from pans.runtime.instrument.click_law import ClickLaw, CountLaw, click_probability, count_chances
+from pans.trainer.adaptive.machine import WRONG, Aim, Bits, Sight, as_bits, backward, brought, forward
 from pans.trainer.adaptive.objects import Block
+from pans.trainer.adaptive.outcomes import WordLaw, channels_of, clicks_of, readings
 from pans.trainer.adaptive.tune import figures
 
 NOISY = ClickLaw(dark_per_exposure=0.02, read_noise_e=0.3, threshold_e=0.5)
-LAWS = (ClickLaw(), ClickLaw(0.05), NOISY)
+CLICKS = (ClickLaw(), ClickLaw(0.05), NOISY)
+COUNTS = (CountLaw(0.0, 0.0, (0.5, 1.5)), CountLaw(0.02, 0.3, (0.5, 1.5)), CountLaw(0.01, 0.0, (0.5, 1.5, 2.5)))
+WORDS = (WordLaw(ClickLaw(0.02, 0.3, 0.6), 2), WordLaw(ClickLaw(0.02, 0.3, 0.6), 3))
+LAWS = (*CLICKS, *COUNTS, *WORDS)
 GREY = torch.tensor([[0, 10, 255, 30, 7], [200, 0, 90, 255, 255], [0, 0, 0, 0, 0]], dtype=torch.float64)
 ONE_HOT = torch.tensor([[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, 0]], dtype=torch.float64)
 
 
-def wide(law, floor=0.0, gain=1 / 255):
-    return Sight(law, gain, floor, torch.float64)
+def wide(law, floor=0.0, gain=1 / 255, **more):
+    return Sight(law, gain, floor, torch.float64, **more)
 
 
-@pytest.mark.parametrize("dark", [0.0, 0.05])
+def machine_under(law, seed, bits=False, shared=False):
+    """The machine of `random_machine` with as many outcomes and channels as `law`, each outcome leading somewhere."""
+    channels = channels_of(law)
+    machine, random = random_machine(seed, bits or channels > 1, shared), torch.Generator().manual_seed(seed)
+    for number, level in enumerate(machine.levels):
+        further = range(1, len(clicks_of(law)) - 1)
+        more = [(level.successors[1] + k) % machine.n_nodes(number) for k in further]
+        level.successors = torch.stack([*level.successors, *more])
+        if channels > 1:
+            lean = torch.randn(level.n_states * channels, 5, generator=random, dtype=torch.float64)
+            level.light = Bits(lean, level.light.log_light, parts=channels)
+    return machine
+
+
+def chances_by_hand(law, light):
+    """The chance of every outcome of a state, from the light (channels,)."""
+    if isinstance(law, CountLaw):
+        return count_chances(law, light)[:, 0]
+    click = click_probability(law.click if isinstance(law, WordLaw) else law, light)
+    words = range(1 << len(light))
+    return [np.prod([p if word >> k & 1 else 1 - p for k, p in enumerate(click)]) for word in words]
+
+
+def walked(machine, sight, law, i):
+    """The chance of every leaf, and photons, clicks and exposures of object i, word by word."""
+    channels, levels = channels_of(law), machine.levels
+    light = [brought(level.light, sight, GREY)[:, i].numpy().reshape(-1, channels) for level in levels]
+    leaves, sums = {}, np.zeros(3)
+    for word in product(range(len(clicks_of(law))), repeat=len(levels)):
+        chance, state, met = 1.0, 0, np.zeros(3)
+        for number, (level, outcome) in enumerate(zip(levels, word)):
+            of_state = light[number][state]
+            chance *= chances_by_hand(law, of_state)[outcome]
+            met += of_state.sum(), clicks_of(law)[outcome], 1
+            node = int(level.successors[outcome, state])
+            n_states = levels[number + 1].n_states if number + 1 < len(levels) else 0
+            if node >= n_states:
+                break
+            state = node
+        chance /= len(clicks_of(law)) ** (len(levels) - number - 1)  # words that differ behind the leaf are one walk
+        leaves[number, node - n_states] = leaves.get((number, node - n_states), 0.0) + chance
+        sums += chance * met
+    return leaves, sums
+
+
 @pytest.mark.parametrize("bits", [False, True])
-def test_forward_is_the_sum_over_all_words(dark, bits):
-    machine, sight = random_machine(1, bits), wide(ClickLaw(dark), 0.01)
+@pytest.mark.parametrize("law", LAWS, ids=str)
+def test_forward_is_the_sum_over_all_words(law, bits):
+    machine, sight, rel = machine_under(law, 1, bits), wide(law, 0.01), 1e-12 if law in (*CLICKS[:2], *WORDS) else 1e-7
     passed = forward(machine, sight, GREY)
-    successors = [level.successors.tolist() for level in machine.levels]
-    n_states = [level.n_states for level in machine.levels] + [0]
+    exposures = sum(step.alpha.sum(dim=0) for step in passed.steps)
+    np.testing.assert_allclose(torch.cat(passed.leaves).sum(dim=0), 1.0, atol=1e-14)
     for i in range(len(GREY)):
-        light = [brought(level.light, sight, GREY)[:, i].tolist() for level in machine.levels]
-        leaves, clicks, photons, exposures = every_word(successors, n_states, light, dark)
-        assert float(sum(leaves.values())) == pytest.approx(1.0, abs=1e-15)
-        for (level, leaf), chance in leaves.items():
-            assert float(passed.leaves[level - 1][leaf, i]) == pytest.approx(float(chance), rel=1e-12, abs=1e-300)
-        assert float(passed.clicks()[i]) == pytest.approx(float(clicks), rel=1e-12)
-        assert float(passed.photons()[i]) == pytest.approx(float(photons), rel=1e-12)
-        assert sum(float(step.alpha[:, i].sum()) for step in passed.steps) == pytest.approx(float(exposures), rel=1e-12)
+        leaves, sums = walked(machine, sight, law, i)
+        for (number, leaf), chance in leaves.items():
+            assert float(passed.leaves[number][leaf, i]) == pytest.approx(chance, rel=rel, abs=1e-300)
+        found = [float(each[i]) for each in (passed.photons(), passed.clicks(), exposures)]
+        np.testing.assert_allclose(found, sums, rtol=rel)
+
+
+@pytest.mark.parametrize("law", COUNTS, ids=str)
+def test_chances_and_falls_are_the_runtimes(law):
+    light = np.array([0.0, 1e-7, 0.01, 0.5, 1.0, 3.0, 10.0, 40.0])
+    chances, falls = readings(torch.from_numpy(light), law)
+    np.testing.assert_allclose(torch.stack(chances).numpy(), count_chances(law, light)[:-1], rtol=1e-6, atol=1e-8)
+    step = np.minimum(light, 1e-4) / 2
+    lit = light > 1e-3
+    slopes = (count_chances(law, light + step) - count_chances(law, light - step))[:-1, lit] / (2 * step[lit])
+    np.testing.assert_allclose(torch.stack(falls).numpy()[:, lit], -slopes, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("light", [1e-30, 1e-7, 3.0, 50.0, 1e4])
@@ -50,55 +109,69 @@ def test_forward_keeps_tiny_and_nearly_certain_chances(light):
     passed = forward(machine, sight, torch.ones(1, 5, dtype=torch.float64))
     mp.dps = 60
     exact = float(mpf(1) - mp.exp(-mpf(light)))
-    got = float((passed.steps[0].alpha * (1 - passed.steps[0].dark)).sum())
+    got = float((passed.steps[0].alpha * (1 - passed.steps[0].chances[0])).sum())
     assert got == pytest.approx(exact, rel=1e-12, abs=2e-16)
     assert torch.cat(passed.leaves).sum().item() == pytest.approx(1.0, abs=1e-15)
     assert all(bool((leaves >= 0).all()) for leaves in passed.leaves)
 
 
-def loss_of(machine, sight, aim):
-    passed = forward(machine, sight, GREY)
+def loss_of(machine, sight, aim, grey=GREY):
+    passed = forward(machine, sight, grey)
     total = aim.price * float(passed.photons().mean())
-    total += aim.exposure_price * sum(float(step.alpha.sum()) for step in passed.steps) / len(GREY)
+    total += aim.exposure_price * sum(float(step.alpha.sum()) for step in passed.steps) / len(grey)
     for counts, leaves in zip(machine.counts, passed.leaves):
         log = torch.log(counts / counts.sum(dim=1, keepdim=True))
         arrived = leaves @ ONE_HOT.T
-        total -= (1 - aim.decide) * float((arrived * log).sum()) / len(GREY)
+        total -= (1 - aim.decide) * float((arrived * log).sum()) / len(grey)
         wrong = arrived.sum() - arrived[torch.arange(len(counts)), counts.argmax(dim=1)].sum()
-        total += aim.decide * WRONG * float(wrong) / len(GREY)
+        total += aim.decide * WRONG * float(wrong) / len(grey)
     return total
+
+
+def assert_gradients(machine, sight, aim, grey=GREY):
+    """The gradient of grey patterns, or of the brightness of bits, is that of the loss."""
+    backward(machine, sight, grey, ONE_HOT, forward(machine, sight, grey), aim)
+    lights = [level.light for level in machine.levels]
+    tensors = [light.log_light if isinstance(light, Bits) else light.root for light in lights]
+    for tensor in {id(tensor): tensor for tensor in tensors}.values():
+        assert_slope(tensor, lambda: loss_of(machine, sight, aim, grey))
 
 
 AIMS = [Aim(0.07), Aim(0.07, decide=1.0), Aim(0.05, 0.03, 0.6)]
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", LAWS, ids=str)
 @pytest.mark.parametrize("floor", [0.0, 0.02])
 @pytest.mark.parametrize("aim", AIMS)
-def test_gradient_of_grey_patterns_is_that_of_the_loss(law, floor, aim):
-    machine, sight = random_machine(3), wide(law, floor)
-    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), aim)
-    for level in machine.levels:
-        assert_slope(level.light.root, lambda: loss_of(machine, sight, aim))
+def test_the_gradient_is_that_of_the_loss(law, floor, aim):
+    assert_gradients(machine_under(law, 3), wide(law, floor), aim)
 
 
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("aim", AIMS)
-def test_gradient_of_the_brightness_of_bits(shared, aim):
-    machine, sight = random_machine(4, bits=True, shared=shared), wide(ClickLaw(0.01), 0.01)
-    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), aim)
-    tensors = {id(level.light.log_light): level.light.log_light for level in machine.levels}
-    assert len(tensors) == (1 if shared else 3)
-    for tensor in tensors.values():
-        assert_slope(tensor, lambda: loss_of(machine, sight, aim))
+def test_the_gradient_of_the_brightness_of_bits(shared, aim):
+    machine = random_machine(4, bits=True, shared=shared)
+    assert len({id(level.light.log_light) for level in machine.levels}) == (1 if shared else 3)
+    assert_gradients(machine, wide(ClickLaw(0.01), 0.01), aim)
+
+
+@pytest.mark.parametrize("bits", [False, True])
+def test_the_gradient_through_optics_holds_the_light_of_dark_pixels(bits):
+    """One more column of grey values: what a pattern's full pixel brings through its dark ones."""
+    machine, sight = random_machine(7, bits), wide(ClickLaw(0.01), dark_pixels=True)
+    leak = torch.tensor([40.0, 90.0, 10.0], dtype=torch.float64)
+    grey = torch.cat([GREY, leak.unsqueeze(1)], dim=1)
+    light = machine.levels[1].light
+    mask, scale = light.displayed()
+    scale = torch.ones(len(mask), 1) if scale is None else scale
+    torch.testing.assert_close(brought(light, sight, grey), scale * (mask @ GREY.T + light.full(mask) * leak) / 255)
+    assert_gradients(machine, sight, Aim(0.07), grey)
 
 
 def test_figures_are_means_over_the_objects():
     machine, sight = random_machine(6), wide(ClickLaw(0.02), 0.01)
     found = figures(machine, sight, [Block(GREY[:2], ONE_HOT[:, :2]), Block(GREY[2:], ONE_HOT[:, 2:])])
     passed = forward(machine, sight, GREY)
-    assert found.clicks == pytest.approx(float(passed.clicks().mean()))
-    assert found.photons == pytest.approx(float(passed.photons().mean()))
     right = sum(
         float(leaves[leaf, i])
         for counts, leaves in zip(machine.counts, passed.leaves)
@@ -106,11 +179,11 @@ def test_figures_are_means_over_the_objects():
         for i in range(3)
         if int(counts[leaf].argmax()) == int(ONE_HOT[:, i].argmax())
     )
-    assert found.accuracy == pytest.approx(right / 3)
-    clear = forward(machine, Sight(ClickLaw(0.02), 1.0, 0.0, torch.float64), torch.ones(1, 5, dtype=torch.float64))
+    clear = forward(machine, wide(ClickLaw(0.02), gain=1.0), torch.ones(1, 5, dtype=torch.float64))
     shown = [step.light[:, 0] for step in clear.steps]
     walked = sum(float(step.alpha.mean(dim=1) @ light) for step, light in zip(passed.steps, shown))
-    assert found.illumination == pytest.approx(walked)
+    wanted = [right / 3, float(passed.clicks().mean()), float(passed.photons().mean()), walked]
+    assert [found.accuracy, found.clicks, found.photons, found.illumination] == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize("top", [1e6, 0.5, 0.3])
@@ -118,39 +191,22 @@ def test_bits_made_from_grey_patterns_keep_their_light_within_the_top(top):
     random = torch.Generator().manual_seed(1)
     grey = torch.rand(20, 60, generator=random, dtype=torch.float64) ** 6
     mean = torch.rand(20, 60, generator=random, dtype=torch.float64)
-    bits = as_bits(grey, mean, top)
-    mask, scale = bits.displayed()
+    mask, scale = as_bits(grey, mean, top).displayed()
     torch.testing.assert_close(scale.squeeze(1) * (mask * mean).sum(dim=1), (grey * mean).sum(dim=1))
     assert float(scale.max()) <= top * (1 + 1e-9)
-    lit = mask.sum(dim=1)
-    assert bool((lit >= (grey > 0.2 * grey.amax(dim=1, keepdim=True)).sum(dim=1)).all())
+    assert bool((mask.sum(dim=1) >= (grey > 0.2 * grey.amax(dim=1, keepdim=True)).sum(dim=1)).all())
     darkest_lit = torch.where(mask > 0, grey, torch.inf).amin(dim=1)
     brightest_dark = torch.where(mask > 0, 0.0, grey).amax(dim=1)
     assert bool((darkest_lit >= brightest_dark).all())
 
 
-@pytest.mark.parametrize("bits", [False, True])
-def test_the_gradient_through_optics_holds_the_light_of_dark_pixels(bits):
-    """One more column of grey values: what a pattern's full pixel brings through its dark ones."""
-    machine = random_machine(7, bits)
-    sight = Sight(ClickLaw(0.01), 1 / 255, 0.0, torch.float64, dark_pixels=True)
-    grey = torch.cat([GREY, torch.tensor([[40.0], [90.0], [10.0]], dtype=torch.float64)], dim=1)
-
-    def loss():
-        passed = forward(machine, sight, grey)
-        total = 0.07 * float(passed.photons().mean())
-        for counts, leaves in zip(machine.counts, passed.leaves):
-            total -= float(((leaves @ ONE_HOT.T) * torch.log(counts / counts.sum(dim=1, keepdim=True))).sum()) / len(
-                grey
-            )
-        return total
-
-    light = machine.levels[1].light
-    mask, scale = light.displayed()
-    scale = torch.ones(len(mask), 1) if scale is None else scale
-    wanted = scale * (mask @ GREY.T + light.full(mask) * torch.tensor([40.0, 90.0, 10.0])) / 255
-    torch.testing.assert_close(brought(light, sight, grey), wanted)
-    backward(machine, sight, grey, ONE_HOT, forward(machine, sight, grey), Aim(0.07))
-    for level in machine.levels:
-        tensor = level.light.log_light if bits else level.light.root
-        assert_slope(tensor, loss)
+def test_parts_of_a_state_keep_their_light_under_one_brightness():
+    random = torch.Generator().manual_seed(3)
+    grey, own = torch.rand(8, 200, generator=random), torch.rand(8, 200, generator=random)
+    grey = (grey - 0.6).clamp(min=0)  # patterns that are dark in places, as trained ones are
+    grey[::2] *= 0.3
+    bits = as_bits(grey, own, parts=2)
+    mask, scale = bits.displayed()
+    assert (len(bits.log_light), len(scale)) == (4, 8)
+    brought, wanted = ((mask * own).sum(dim=1) * scale.flatten()), (grey * own).sum(dim=1)
+    assert float(((brought - wanted).abs() / scale.flatten()).max()) <= 1.0  # within one pixel

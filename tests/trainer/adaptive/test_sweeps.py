@@ -11,25 +11,44 @@ from trainings import bars_task, random_machine
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import sweeps as module
-from pans.trainer.adaptive.grow import GrowOptions, Growth
+from pans.trainer.adaptive.grow import Growth
 from pans.trainer.adaptive.machine import Bits, Sight, as_bits, brought, forward, leaf_losses
-from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
+from pans.trainer.adaptive.objects import TrainingObjects
 from pans.trainer.adaptive.sweeps import choose_patterns, reroute, share_patterns
 from pans.trainer.adaptive.tune import figures, masses, mean_objects
+from pans.trainer.options import AutomatonOptions
 
 PRICE = 0.02
+DEAR = 0.03  # nats per exposure
+
+
+def grow(levels):
+    options = AutomatonOptions()
+    objects = TrainingObjects(bars_task(), load_profile("ideal"), options)
+    blocks = objects.epoch(0, 200, torch.float32)
+    sight = Sight(ClickLaw(), objects.gain)
+    with torch.no_grad():
+        growth = Growth(blocks, sight, torch.Generator().manual_seed(0), options, 8)
+        for _ in range(levels):
+            growth.grow(PRICE)
+    return growth.machine(), sight, blocks
 
 
 @pytest.fixture
 def grown():
-    objects = TrainingObjects(bars_task(), load_profile("ideal"), 0, Augmentation())
-    blocks = objects.epoch(0, 200, torch.float32)
-    sight = Sight(ClickLaw(), objects.gain)
+    return grow(6)
+
+
+@pytest.fixture
+def shared():
+    """A machine whose states share six patterns, before they have chosen."""
+    machine, sight, blocks = grow(5)
     with torch.no_grad():
-        growth = Growth(blocks, sight, GrowOptions(states=8), torch.Generator().manual_seed(0))
-        for _ in range(6):
-            growth.grow(PRICE)
-    return growth.machine(), sight, blocks
+        means = list(mean_objects(machine, sight, blocks))
+        for level, mean in zip(machine.levels, means):
+            level.light = as_bits(level.light.displayed()[0], mean)
+        share_patterns(machine, 6, masses(machine, sight, blocks), means, torch.Generator().manual_seed(0))
+    return machine, sight, blocks
 
 
 def cost(machine, sight, blocks):
@@ -47,12 +66,10 @@ def test_edges_spoiled_are_put_right(grown, monkeypatch):
     monkeypatch.setattr(module, "SURE", 0.0)
     for _ in range(3):
         before = cost(machine, sight, blocks)
-        found = reroute(machine, sight, blocks, PRICE)
+        assert reroute(machine, sight, blocks, PRICE) > 0
         after = cost(machine, sight, blocks)
-        assert found.moved > 0
-        assert (
-            after <= before + 2e-3
-        )  # the light is kept in bfloat16, and revived leaves are counted anew by the caller
+        # the light is kept in bfloat16, and revived leaves are counted anew by the caller
+        assert after <= before + 2e-3
     assert after < good + 0.3 * (spoiled - good)
 
 
@@ -60,12 +77,9 @@ def test_nodes_without_an_edge_are_revived(grown, monkeypatch):
     machine, sight, blocks = grown
     monkeypatch.setattr(module, "SURE", 1e9)  # so that no other edge moves
     machine.levels[3].successors[:] = 0
-    assert reroute(machine, sight, blocks, PRICE).revived >= 7
+    assert reroute(machine, sight, blocks, PRICE) == 0
     used = torch.bincount(machine.levels[3].successors.flatten(), minlength=8)
     assert bool((used > 0).all())
-
-
-DEAR = 0.03  # nats per exposure
 
 
 def test_walks_end_where_exposures_cost_more_than_they_bring(grown, monkeypatch):
@@ -76,25 +90,15 @@ def test_walks_end_where_exposures_cost_more_than_they_bring(grown, monkeypatch)
         return cost(machine, sight, blocks) + DEAR * figures(machine, sight, blocks).exposures
 
     before, all_of_them = dear(), figures(machine, sight, blocks).exposures
-    found = reroute(machine, sight, blocks, PRICE, DEAR)
-    after, walked = dear(), figures(machine, sight, blocks)
+    reroute(machine, sight, blocks, PRICE, DEAR)
     assert all_of_them == pytest.approx(6.0, abs=1e-4)
-    assert found.stopped > 0
-    assert walked.exposures < 5.5
-    assert sum(len(counts) for counts in machine.counts[:-1]) == found.stopped
-    assert before - after > 0.9 * found.saved > 0.01  # what the sweep promised; revived leaves are counted anew later
+    assert figures(machine, sight, blocks).exposures < 5.5
+    assert before - dear() > 0.01
     first = next(number for number, counts in enumerate(machine.counts) if len(counts))
     early = sum(float(forward(machine, sight, block.grey).leaves[first].sum()) for block in blocks)
     counted = float(machine.counts[first].sum()) - len(machine.counts[first])  # and an object per leaf, for its doubts
-    assert counted == pytest.approx(
-        early, rel=0.05
-    )  # nothing before it moved after it; the sweep sees light in bfloat16
-
-
-def test_only_sure_gains_move_edges(grown, monkeypatch):
-    machine, sight, blocks = grown
-    monkeypatch.setattr(module, "SURE", 1e9)
-    assert reroute(machine, sight, blocks, PRICE).moved == 0
+    # nothing before it moved after it; the sweep sees light in bfloat16
+    assert counted == pytest.approx(early, rel=0.05)
 
 
 def test_states_of_a_group_show_one_pattern_and_keep_their_light():
@@ -125,43 +129,21 @@ def test_the_gradient_of_a_pool_is_the_sum_over_its_states():
     light = torch.zeros(3, 1, dtype=torch.float64)
     shared = Bits(pool, light.clone(), rows=torch.tensor([1, 0, 1]))
     single = Bits(own, light.clone())
-    shared.set_gradients(slope.clone(), light.clone())
-    single.set_gradients(slope.clone(), light.clone())
+    for bits in (shared, single):
+        bits.set_gradients(slope.clone(), light.clone())
     torch.testing.assert_close(shared.lean.grad[0], single.lean.grad[1])
     torch.testing.assert_close(shared.lean.grad[1], single.lean.grad[0] + single.lean.grad[2])
     torch.testing.assert_close(shared.displayed()[0], single.displayed()[0])
 
 
-@pytest.fixture
-def shared():
-    objects = TrainingObjects(bars_task(), load_profile("ideal"), 0, Augmentation())
-    blocks, sight = objects.epoch(0, 200, torch.float32), Sight(ClickLaw(), objects.gain)
-    return *grown_and_shared(blocks, sight), blocks
-
-
-def grown_and_shared(blocks, sight):
-    """A machine whose states share six patterns, before they have chosen."""
-    with torch.no_grad():
-        growth = Growth(blocks, sight, GrowOptions(states=8), torch.Generator().manual_seed(0))
-        for _ in range(5):
-            growth.grow(PRICE)
-        machine = growth.machine()
-        means = list(mean_objects(machine, sight, blocks))
-        for level, mean in zip(machine.levels, means):
-            level.light = as_bits(level.light.displayed()[0], mean)
-        share_patterns(machine, 6, masses(machine, sight, blocks), means, torch.Generator().manual_seed(0))
-    return machine, sight
-
-
 def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
     machine, sight, blocks = shared
     monkeypatch.setattr(module, "_use_all", lambda *_: None)  # it changes no figure, but would hide what was chosen
-
     for level in machine.levels:
         level.light.rows = torch.zeros_like(level.light.rows)
     spoiled = cost(machine, sight, blocks)
-    told = [choose_patterns(machine, sight, blocks, PRICE) for _ in range(3)]
-    assert told[0] > 0
+    for _ in range(3):
+        choose_patterns(machine, sight, blocks, PRICE)
     assert cost(machine, sight, blocks) < spoiled - 0.05
     before = cost(machine, sight, blocks)
     choose_patterns(machine, sight, blocks, PRICE)

@@ -12,16 +12,15 @@ import numpy as np
 from trainings import bars_task
 
 from pans.runtime.bundle.model import load_bundle
+from pans.runtime.core.plan import build_plan
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import PansError, PlanError, UsageError
-from pans.runtime.instrument.profile import load_profile, parse_profile
-from pans.trainer.adaptive.budget import (
-    check_automaton_options,
-    started_from,
-)
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive.budget import check_automaton_options, started_from
 from pans.trainer.adaptive.machine import machine_of
 from pans.trainer.adaptive.train import train_automaton
 from pans.trainer.evaluate.accuracy import outcome_law_of
+from pans.trainer.evaluate.walks import measured_walks, walks_of
 from pans.trainer.export.automaton import bundle_of, compare_walks, export_automaton, measure_walks
 from pans.trainer.options import AutomatonOptions
 
@@ -39,13 +38,18 @@ def trained(task):
     return train_automaton(task, IDEAL, SMALL)
 
 
-def profile_of(name, **changes):
-    """A shipped profile with other values."""
-    text = load_profile(name).text
-    for old, new in changes.values():
-        assert old in text
-        text = text.replace(old, new)
-    return parse_profile(text, f"{name}.toml")
+def interrupted(at, task, profile, options, **more):
+    """A training that is interrupted at the step `at`; what it reported until then."""
+    told = []
+
+    def stop(progress):
+        told.append(progress)
+        if at in (progress.done, progress.stage):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_automaton(task, profile, options, report=stop, **more)
+    return told
 
 
 def test_learns_the_bars_within_its_budget(task, trained):
@@ -57,8 +61,6 @@ def test_learns_the_bars_within_its_budget(task, trained):
 
 
 def export_bundle(trained, task, profile=IDEAL):
-    from pans.trainer.export.automaton import bundle_of
-
     return bundle_of(trained, task, profile, "bars", {})
 
 
@@ -73,13 +75,7 @@ def test_the_same_seed_gives_the_same_automaton_and_another_seed_another(task, t
 @pytest.mark.parametrize("stop_at", [7, 8, 11])
 def test_an_interrupted_training_ends_at_the_same_automaton(task, trained, tmp_path, stop_at):
     path = tmp_path / "bars.checkpoint"
-
-    def stop(told):
-        if told.done == stop_at:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_automaton(task, IDEAL, SMALL, checkpoint=path, report=stop)
+    interrupted(stop_at, task, IDEAL, SMALL, checkpoint=path)
     resumed = path.is_file()
     went_on = train_automaton(task, IDEAL, SMALL, checkpoint=path, resume=resumed)
     assert resumed == (stop_at > 7)  # the first state is kept after the first whole epoch of tuning
@@ -101,16 +97,8 @@ def test_a_price_per_exposure_ends_walks_early(task, trained):
 
 def test_soft_targets_are_kept_and_go_on_from_a_checkpoint(task, tmp_path):
     options, file, path = replace(SMALL, soft=1.0, teacher_epochs=3), tmp_path / "answers.npz", tmp_path / "checkpoint"
-    told = []
-
-    def stop(progress):
-        told.append(progress.stage)
-        if progress.stage == "grow":
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_automaton(task, IDEAL, options, checkpoint=path, report=stop, teacher=file)
-    assert told == ["network"] * 3 + ["grow"]
+    told = interrupted("grow", task, IDEAL, options, checkpoint=path, teacher=file)
+    assert [progress.stage for progress in told] == ["network"] * 3 + ["grow"]
     stages = []
     went_on = train_automaton(
         task, IDEAL, options, checkpoint=path, resume=True, report=lambda p: stages.append(p.stage)
@@ -124,23 +112,16 @@ def test_soft_targets_are_kept_and_go_on_from_a_checkpoint(task, tmp_path):
         train_automaton(task, IDEAL, replace(options, teacher_epochs=4), teacher=file)
 
 
-def test_one_bit_projector_without_dwell_shows_one_brightness(task):
-    profile = profile_of("dmd-spad", rate=("pattern_memory = 43_690", "pattern_memory = 43_690"))
-    profile = replace(profile, projector=replace(profile.projector, dwell_steps=1))
+@pytest.mark.parametrize("steps", [1, 20])
+def test_dwell_is_in_whole_steps_of_the_profile(task, steps):
+    """Without steps a one-bit projector shows one brightness."""
+    profile = load_profile("dmd-spad")
+    profile = replace(profile, projector=replace(profile.projector, dwell_steps=steps))
     arrays = train_automaton(task, profile, SMALL).arrays
     assert set(np.unique(arrays.pattern_levels)) <= {0, 1}
-    assert arrays.dwell_steps == 1
-    assert set(arrays.dwell) == {1}
-
-
-def test_dwell_is_in_whole_steps_of_the_profile(task):
-    profile = load_profile("dmd-spad")
-    profile = replace(profile, projector=replace(profile.projector, dwell_steps=20))
-    arrays = train_automaton(task, profile, SMALL).arrays
-    assert arrays.dwell_steps == 20
-    assert arrays.dwell.min() >= 1
-    assert arrays.dwell.max() <= 20
-    assert len(set(arrays.dwell)) > 3
+    assert arrays.dwell_steps == steps
+    assert 1 <= arrays.dwell.min() <= arrays.dwell.max() <= steps
+    assert len(set(arrays.dwell)) > 3 or steps == 1
     low = profile.projector.peak_photoelectrons_hz * profile.exposure.min_us * 1e-6
     assert arrays.photons_per_level >= low * (1 - 1e-9)
 
@@ -165,28 +146,42 @@ def test_export_refuses_an_automaton_that_is_not_the_models(task, trained, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-def test_options_that_cannot_be(task):
-    with pytest.raises(PlanError, match="sequential"):
-        check_automaton_options(SMALL, task, load_profile("wdm-snspd"))
-    for changes, error in (
-        ({"photons": None}, "one budget"),
-        ({"clicks": 2.0}, "one budget"),
-        ({"photons": float("nan")}, "--photons is nan"),
-        ({"exposures": 2000}, "--exposures is 2000"),
-        ({"batch": 1}, "--batch is 1"),
-        ({"photons": None, "clicks": 6.5}, "--clicks is 6.5"),
-        ({"dark": -1.0}, "--dark is -1.0"),
-    ):
-        with pytest.raises(UsageError, match=error):
-            check_automaton_options(replace(SMALL, **changes), task, IDEAL)
-    with pytest.raises(PlanError, match="states cannot share one"):
-        check_automaton_options(replace(SMALL, patterns=3), task, load_profile("dmd-8bit-spad"))
-    with pytest.raises(PlanError, match="65533"):
-        check_automaton_options(replace(SMALL, exposures=200, states=500), task, IDEAL)
-    with pytest.raises(UsageError, match="the light is the scene's own"):
-        check_automaton_options(SMALL, replace(task, light="field"), IDEAL)
-    with pytest.raises(UsageError, match="asks for a picture"):
-        check_automaton_options(SMALL, replace(task, target="image"), IDEAL)
+TWO = {"channels": 2}
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "error", "words"),
+    [
+        ({}, "wdm-snspd", PlanError, "sequential"),
+        ({"photons": None}, "ideal", UsageError, "one budget"),
+        ({"clicks": 2.0}, "ideal", UsageError, "one budget"),
+        ({"photons": float("nan")}, "ideal", UsageError, "--photons is nan"),
+        ({"exposures": 2000}, "ideal", UsageError, "--exposures is 2000"),
+        ({"batch": 1}, "ideal", UsageError, "--batch is 1"),
+        ({"photons": None, "clicks": 6.5}, "ideal", UsageError, "--clicks is 6.5"),
+        ({"dark": -1.0}, "ideal", UsageError, "--dark is -1.0"),
+        ({"patterns": 3}, "dmd-8bit-spad", PlanError, "states cannot share one"),
+        ({"exposures": 200, "states": 500}, "ideal", PlanError, "65533"),
+        ({"channels": 5}, "dmd-four-snspd", UsageError, "--channels is 5"),
+        ({"channels": 0}, "dmd-four-snspd", UsageError, "--channels is 0"),
+        (TWO, "dmd-spad", PlanError, r"2 channels per exposure, dmd-spad has 1 \(detector.channels\)"),
+        (TWO | {"outcomes": 3}, "ideal", UsageError, "--channels 2 with --outcomes 3: .*they do not count"),
+        (TWO | {"patterns": 30}, "dmd-four-snspd", PlanError, "show 2 patterns each, 30 patterns are allowed"),
+        (TWO | {"photons": None, "clicks": 12.0}, "dmd-four-snspd", UsageError, "--clicks is 12.0, allowed: below 12"),
+        (TWO, "wdm-snspd", PlanError, "wdm-snspd is a parallel profile"),
+    ],
+)
+def test_options_that_cannot_be(task, changes, name, error, words):
+    with pytest.raises(error, match=words):
+        check_automaton_options(replace(SMALL, **changes), task, load_profile(name))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"), [({"light": "field"}, "the scene's own"), ({"target": "image"}, "asks for a picture")]
+)
+def test_tasks_that_no_automaton_solves(task, changes, words):
+    with pytest.raises(UsageError, match=words):
+        check_automaton_options(SMALL, replace(task, **changes), IDEAL)
 
 
 def test_states_share_few_patterns_and_a_resumed_training_still_does(task, tmp_path):
@@ -196,13 +191,7 @@ def test_states_share_few_patterns_and_a_resumed_training_still_does(task, tmp_p
     assert len(whole.arrays.pattern) > 20
     compare_walks(export_bundle(whole, task, profile), whole, task, profile)
     assert whole.held_back.accuracy > 0.6
-
-    def stop(told):
-        if told.done == 12:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_automaton(task, profile, options, checkpoint=path, report=stop)
+    interrupted(12, task, profile, options, checkpoint=path)
     resumed = train_automaton(task, profile, options, checkpoint=path, resume=True)
     np.testing.assert_array_equal(resumed.arrays.pattern_levels, whole.arrays.pattern_levels)
     np.testing.assert_array_equal(resumed.arrays.dwell, whole.arrays.dwell)
@@ -217,9 +206,8 @@ def test_one_bright_state_does_not_set_the_exposure(task):
     level = run.machine.levels[-1]
     reached = [masses.clone() for masses in run._masses()][-1]
     with torch.no_grad():
-        level.light.log_light[int(reached.argmin())] = (
-            0.0  # a photoelectron per pixel, and more than 0.4 dark counts at 2 kHz
-        )
+        # a photoelectron per pixel, and more than 0.4 dark counts at 2 kHz
+        level.light.log_light[int(reached.argmin())] = 0.0
     run._choose_top()
     assert level.light.top < 0.9
     assert float(level.light.scale().max()) <= level.light.top * (1 + 1e-6)
@@ -283,3 +271,44 @@ def test_what_cannot_be_started_from_is_refused(task, first):
     bundle = replace(bundle, pattern_levels=bundle.pattern_levels * 0 + np.arange(bundle.pattern_levels.shape[1]) % 3)
     with pytest.raises(UsageError, match="grey patterns"):
         machine_of(bundle)
+
+
+SEVERAL = AutomatonOptions(
+    photons=4.0, exposures=4, states=8, batch=64, tune_epochs=1, epochs=3, first_price=0.1, reroutes=1
+)
+
+
+def test_a_training_on_photon_numbers_ends_in_a_bundle_that_is_evaluated(task, tmp_path):
+    profile = load_profile("oled-qcmos")
+    profile = replace(profile, detector=replace(profile.detector, photon_number_max=3))
+    trained = train_automaton(task, profile, replace(SEVERAL, outcomes=3))
+    made = export_automaton(tmp_path / "bars.pans", trained, task, profile, name="bars", provenance={})
+    automaton = load_bundle(tmp_path / "bars.pans")[0].automaton
+    assert (automaton.counts, automaton.n_outcomes, automaton.n_slots) == (True, 3, 4)
+    assert made.difference < 1e-5  # of class chances, between the float64 sums of the file and the machine's
+    assert made.measured.accuracy_mean > 0.5  # four classes: 0.25 by chance
+    assert made.measured.photons_mean == pytest.approx(4.0, rel=0.1)
+    clicks_only = replace(profile, detector=replace(profile.detector, photon_number_max=1))
+    with pytest.raises(PlanError, match=r"3 outcomes per exposure.*tells 2 apart"):
+        build_plan(clicks_only, made.bundle)
+
+
+def test_a_training_on_two_channels_ends_in_a_bundle_that_is_evaluated_and_trained_on(task, tmp_path):
+    options, profile = replace(SEVERAL, channels=2, exposures=3, states=12, epochs=4), load_profile("dmd-four-snspd")
+    trained = train_automaton(task, profile, replace(options, tune_epochs=2))
+    made = export_automaton(tmp_path / "bars.pans", trained, task, profile, name="bars", provenance={})
+    exact = made.measured
+    assert made.difference < 1e-6  # of class chances, between the float64 sums of the file and the machine's
+    assert exact.accuracy_mean > 0.65  # four classes: 0.25 by chance
+    assert exact.photons_mean == pytest.approx(4.0, rel=0.08)
+    bundle, digest = load_bundle(tmp_path / "bars.pans")
+    automaton = bundle.automaton
+    assert (automaton.channels, automaton.n_outcomes, automaton.n_slots) == (2, 4, 3)
+    assert set(automaton.rows.reshape(-1).tolist()) == set(range(bundle.n_patterns))
+    drawn = measured_walks(walks_of(bundle, profile, task.test.images, task.test.labels, trials=150))
+    assert abs(drawn.accuracy_mean - exact.accuracy_mean) < 4 * drawn.accuracy_std / np.sqrt(150)
+    assert (drawn.clicks_mean, drawn.illumination) == pytest.approx((exact.clicks_mean, exact.illumination), rel=0.03)
+    again = started_from(replace(options, exposures=0, states=0, epochs=2), bundle, digest, task, profile)
+    assert train_automaton(task, profile, again, start=bundle).held_back.accuracy > trained.held_back.accuracy - 0.03
+    with pytest.raises(UsageError, match="--channels is 3, the automaton of --start has 2"):
+        started_from(replace(options, channels=3), bundle, digest, task, profile)
