@@ -17,8 +17,8 @@ from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import RunOptions, run_live
-from pans.runtime.timing import evidence
-from pans.runtime.timing.evidence import IDLE, OVERSLEPT, Facts, Verdict
+from pans.runtime.timing import causes
+from pans.runtime.timing.causes import IDLE, OVERSLEPT, Facts, Verdict
 
 CASES = {
     "stall:60ms/400ms": "the link stalls",
@@ -32,7 +32,7 @@ MS = 1e6
 def witnessed(faults: str) -> tuple[Facts, Verdict]:
     """Return what was known about the first late decision of a run in virtual time, and the verdict."""
     heard: list[tuple[Facts, Verdict]] = []
-    judge = evidence.judge
+    judge = causes.judge
 
     def listen(facts: Facts) -> Verdict:
         verdict = judge(facts)
@@ -42,13 +42,13 @@ def witnessed(faults: str) -> tuple[Facts, Verdict]:
     profile, bundle, plan = small_setup("sequential")
     config = RunOptions(n_cycles=4000, deadline_us=10_000.0, realtime=False)
     core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
-    evidence.judge = listen
+    causes.judge = listen
     try:
         run_live(
             open_sim(f"sim:ideal?scene=uniform&pace=fast&seed=2&faults={faults}"), profile, bundle, plan, core, config
         )
     finally:
-        evidence.judge = judge
+        causes.judge = judge
     return heard[0]
 
 

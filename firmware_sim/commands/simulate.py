@@ -18,7 +18,7 @@ from pans.firmware_sim.ports.shell import open_port, serve
 from pans.runtime.cli import Command, emit, say
 from pans.runtime.cli.option_fields import add_options, options_from
 from pans.runtime.ranges import Range
-from pans.runtime.timing.cpu import check_core
+from pans.runtime.timing.realtime import check_core
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:

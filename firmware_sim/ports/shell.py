@@ -16,7 +16,7 @@ from typing import Protocol
 
 from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
 from pans.runtime.errors import LinkError, UsageError
-from pans.runtime.timing.cpu import busy_core
+from pans.runtime.timing.realtime import busy_core
 
 READ_BYTES = 1 << 16
 MAX_BACKLOG_BYTES = 1 << 20

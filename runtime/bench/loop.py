@@ -25,7 +25,7 @@ from pans.runtime.instrument.profile import Profile, load_profile, parse_profile
 from pans.runtime.link.base import open_link
 from pans.runtime.live import Recovery, RunOptions, run_live
 from pans.runtime.record import Recorder
-from pans.runtime.timing.cpu import steal_ms
+from pans.runtime.timing.realtime import steal_ms
 
 from .rows import BenchOptions, Row, table_text
 from .streams import made_automaton

@@ -193,9 +193,11 @@ try:
     print("onnxruntime=right", flush=True)
 except Exception as error:
     print(f"onnxruntime={error}".splitlines()[0], flush=True)
-from pans.runtime.timing.ledger import request_fifo, request_mlockall
-print("sched_fifo=" + request_fifo([0]), flush=True)
-print("mlockall=" + request_mlockall(), flush=True)
+from pans.runtime.timing.realtime import FIFO_PRIORITY, locked_memory, scheduled
+with scheduled("SCHED_FIFO", FIFO_PRIORITY) as answer:
+    print("sched_fifo=" + answer, flush=True)
+with locked_memory() as answer:
+    print("mlockall=" + answer, flush=True)
 """
 
 
@@ -314,7 +316,7 @@ def examine(checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
 
 
 def _first_line(path: str) -> str:
-    from pans.runtime.timing.cpu import first_line
+    from pans.runtime.timing.realtime import first_line
 
     return first_line(Path(path))
 
@@ -343,7 +345,7 @@ COMPARED: tuple[tuple[str, str, str, float, dict[str, str]], ...] = (
 
 def settings_of(found: Rehearsal) -> list[dict[str, Any]]:
     """Return a row for each setting: what is in force, what was measured without and with it, and what to do."""
-    from pans.runtime.timing.cpu import isolated_cores
+    from pans.runtime.timing.realtime import isolated_cores
 
     isolated, cores = isolated_cores(), ", ".join(str(row["core"]) for row in found.cores) or "unknown"
     in_force = {

@@ -36,7 +36,7 @@ from pans.runtime.live.continuous import (
 )
 from pans.runtime.live.run_options import FLOW, RunOptions
 from pans.runtime.operate.warm import load_ahead
-from pans.runtime.timing.cpu import check_core
+from pans.runtime.timing.realtime import check_core
 
 from .run_files import check_run_files, claimed, gone_if_refused, part_limits, recording_header, what_was_run
 

@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 from pans.runtime.core import stream_kernels as core
 from pans.runtime.core.stream_kernels import FrameWalkArrays, IdleArrays, WalkArrays
 from pans.runtime.flow.kernels import FlowWalk
-from pans.runtime.timing.evidence import OVERSLEPT_NS
+from pans.runtime.timing.causes import OVERSLEPT_NS
 from pans.runtime.wire import wire_kernels as stream
 from pans.runtime.wire import wire_kernels as wire
 from pans.runtime.wire.bare import bare, copy_span, load4
@@ -235,7 +235,7 @@ def _failed(control, found):  # type: ignore[no-untyped-def]
 
 @inner
 def _note_wait(notes, control, began, asked, ended):  # type: ignore[no-untyped-def]
-    """Keep a wait for bytes; one that follows at once on a wait that ended in time is the same one (timing/evidence.py)."""
+    """Keep a wait for bytes; one that follows at once on a wait that ended in time is the same one (timing/causes.py)."""
     n = control[ring.N_NOTES]
     if n:
         before = notes[n - 1]

@@ -13,8 +13,8 @@ from typing import NamedTuple
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import DeviceError, LinkError, PansError
+from pans.runtime.timing.causes import Evidence, Stamped
 from pans.runtime.timing.clock import ClockModel, ClockStep
-from pans.runtime.timing.evidence import Evidence, Stamped
 from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome, pack_body
 from pans.runtime.wire.schema import wrong_facts
 from pans.runtime.wire.session import ANSWER_TYPES, HostSession

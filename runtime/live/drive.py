@@ -84,7 +84,7 @@ class HostDriver:
             session, now_ns = connection.session, connection.link.now_ns
             session.poll(now_ns())
             connection.flush()
-            self.turns.add(now_ns() - arrival_ns)
+            self.turns.add_many(np.array([now_ns() - arrival_ns]))
 
     def arrays(self, session: int) -> Drive:
         """Return what the kernel drives by in `session`."""

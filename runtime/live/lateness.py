@@ -1,6 +1,6 @@
 """What a live run does about late work: wakes when a block is overdue, asks the device then, and closes incidents with a verdict.
 
-Evidence and judgement are timing/evidence.py's; late decisions are counted by timing/ledger.py.
+Evidence and judgement are in timing/causes.py; late decisions are counted by timing/ledger.py.
 `settled` returns the verdicts that are ready as events for the recording. Costs a block one comparison and one short call.
 """
 
@@ -10,7 +10,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.link.base import Link
 from pans.runtime.link.connection import Connection
 from pans.runtime.record import Recorder
-from pans.runtime.timing.evidence import (
+from pans.runtime.timing.causes import (
     DISK,
     INFERENCE,
     NS_PER_S,
@@ -46,7 +46,7 @@ class Lateness:
     def attach(self, connection: Connection, start_ns: int) -> None:
         """Take evidence from `connection` from here on; its exposures begin at `start_ns`."""
         connection.evidence = self.evidence
-        self.evidence.watch([connection.reader.thread_id])
+        self.evidence.watch(connection.reader.thread_id)
         self.block_ns, self._asked, self._damaged = start_ns, False, 0
 
     def close(self) -> None:
@@ -79,9 +79,9 @@ class Lateness:
         left_ns, _ = connection.known_clock().to_host_ns(status.tick)
         self.evidence.stamped(Stamped(None, None, left_ns, arrival_ns))
 
-    def late(self, number: int, begin_ns: int, arrival_ns: int, decided_ns: int, uncertainty_ns: int) -> None:
+    def late(self, number: int, begin_ns: int, arrival_ns: int, decided_ns: int) -> None:
         """Take a late decision with its times, as the ledger judged them."""
-        self.incidents.late(LateWork(number, begin_ns, arrival_ns, decided_ns, uncertainty_ns))
+        self.incidents.late(LateWork(number, begin_ns, arrival_ns, decided_ns))
 
     def lost(self, gap: Gap, connection: Connection, now_ns: int) -> Attribution:
         """Return the verdict on exposures that never came."""

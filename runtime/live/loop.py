@@ -32,9 +32,7 @@ from pans.runtime.link.base import Link, link_facts
 from pans.runtime.link.connection import Connection
 from pans.runtime.link.fit import check_device, check_scene
 from pans.runtime.record import Recorder
-from pans.runtime.timing.cpu import busy_core
-from pans.runtime.timing.ledger import arm_realtime
-from pans.runtime.timing.page_faults import ThreadCounts
+from pans.runtime.timing.realtime import ThreadCounts, arm_realtime, busy_core
 from pans.runtime.wire.session import ArmTooLate
 
 from .config import RunResult

@@ -27,8 +27,8 @@ from pans.runtime.link.base import Link, descriptor_of
 from pans.runtime.link.connection import Connection
 from pans.runtime.link.reader import count_delimiters
 from pans.runtime.record.format import Kind
+from pans.runtime.timing.causes import INFERENCE, NS_PER_S
 from pans.runtime.timing.clock import STEP_MARGIN_NS
-from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
 from pans.runtime.wire.messages import MessageType, Opcode, decode_ack, decode_frames
 from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES, Refusal

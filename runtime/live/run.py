@@ -24,7 +24,7 @@ from pans.runtime.link.connection import ARM_LEAD_NS, Connection
 from pans.runtime.record import Recorder
 from pans.runtime.record.format import TIMING_RUN_DTYPE
 from pans.runtime.record.recorder import repeated_setup
-from pans.runtime.timing.clock_check import future_tick
+from pans.runtime.timing.clock import future_tick
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.framing import Frame
@@ -413,7 +413,7 @@ class LiveRun(Reconciled):
             for number in range(int(numbers[at]), int(numbers[at] + counts[at])):
                 self.journal.note("late", decision=number, latency_us=float(marks_ns[at, 3] - marks_ns[at, 0]) / 1000)
                 begin_ns, arrival_ns, _, decided_ns, _ = marks_ns[at].tolist()
-                self.lateness.late(number, begin_ns, arrival_ns, decided_ns, int(unsure_ns[at]))
+                self.lateness.late(number, begin_ns, arrival_ns, decided_ns)
 
     def _turn_page(self, now_ns: int) -> None:
         """Go on in the recording's next part when this one is full and no window is open."""

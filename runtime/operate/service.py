@@ -32,7 +32,7 @@ from pans.runtime.container import read_file
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import RUNS, check_outputs, make_folder, write_file
 from pans.runtime.ranges import Range
-from pans.runtime.timing.ledger import FIFO_PRIORITY
+from pans.runtime.timing.realtime import FIFO_PRIORITY
 
 MARK = "# Written by `pans service install`; change the file of options, not this one."
 SYSTEM_UNITS, USER_UNITS = Path("/etc/systemd/system"), Path("~/.config/systemd/user")

@@ -73,7 +73,7 @@ class Durations:
         kept = np.sort(np.concatenate(self._kept))[::-1]
         if self._histogram is None:
             return np.asarray(kept[ranks - 1], np.float64)
-        beyond = np.cumsum(self._histogram.numbers[::-1])  # as long as a bucket, or longer
+        beyond = np.cumsum(self._histogram.counts[::-1])  # as long as a bucket, or longer
         buckets = len(beyond) - 1 - np.searchsorted(beyond, ranks)
         edges = np.array([upper_edge(bucket) / 1000 for bucket in buckets.tolist()])
         known = ranks <= LONGEST_KEPT  # of each part that came, as many are kept

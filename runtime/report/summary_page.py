@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown
-from pans.runtime.timing.page_faults import fault_words
+from pans.runtime.timing.realtime import fault_words
 
 from .summary import Summary
 from .words import flow_rows, is_unresolved, objects_words, repeat_words, walk_rows

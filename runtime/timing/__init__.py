@@ -1,6 +1,6 @@
-"""Time on the host: the device's clock, latency per stage, why work was late, and a processor that does not fall asleep.
+"""Time on the host: the device's clock, latencies and why work was late, and a process that runs on time.
 
-Device ticks and host times come in; host times with their uncertainty, latencies and causes go out. Begin with `clock.py`.
+Device ticks and host times come in; host times with their uncertainty, latencies and causes go out. Start with `clock.py`.
 
 >>> import numpy as np
 >>> from pans.runtime.timing import TimingLedger
@@ -13,20 +13,6 @@ Device ticks and host times come in; host times with their uncertainty, latencie
 """
 
 from .clock import ClockModel
-from .cpu import busy_core
-from .evidence import Attribution, Evidence, Incidents
-from .ledger import LatencyHistogram, TimingLedger, arm_realtime, frozen_heap
-from .page_faults import ThreadCounts
+from .ledger import LatencyHistogram, TimingLedger
 
-__all__ = [
-    "Attribution",
-    "ClockModel",
-    "Evidence",
-    "Incidents",
-    "LatencyHistogram",
-    "ThreadCounts",
-    "TimingLedger",
-    "arm_realtime",
-    "busy_core",
-    "frozen_heap",
-]
+__all__ = ["ClockModel", "LatencyHistogram", "TimingLedger"]

@@ -1,11 +1,9 @@
-"""Device tick <-> host time, with its uncertainty: the only place that converts.
+"""Device tick <-> host time, with its uncertainty, from two-way probes: the only place that converts.
 
-Owns the probe history, the fitted line and its epochs; never reads a clock. `to_host_ns` returns the host time of a tick and how
-far off it may be. Method: a two-way probe bounds the offset at its own tick to half its round trip, whatever the asymmetry of the
-two ways; the quickest probes are kept, a straight line is fitted through their midpoints (weighted least squares with a prior on
-the drift), and the published uncertainty is the tightest bound that any of the latest quick probes gives: half its round trip,
-plus its distance from the line, plus what the rate may have changed since. All in integers relative to a reference, so that nothing
-is lost past 2^53.
+A probe bounds the offset at its own tick to half its round trip, whatever the asymmetry of the two ways. The quickest probes are kept, a
+straight line is fitted through their midpoints (weighted least squares with a prior on the drift), and the published uncertainty is the
+tightest bound that any of the latest quick probes gives: half its round trip, plus its distance from the line, plus what the rate may have
+changed since. All in integers relative to a reference, so that nothing is lost past 2^53.
 """
 
 from __future__ import annotations
@@ -16,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pans.runtime.core.follower import Contradiction
 from pans.runtime.errors import LinkError
 
 NS_PER_S = 1_000_000_000
@@ -30,9 +29,8 @@ STEP_MARGIN_NS = 20_000  # a jump is larger than the published uncertainty by th
 # the scheduler's own jitter. What is slower waited in a queue and says nothing that the quick ones do not.
 QUICK_RATIO, QUICK_MARGIN_NS = 1.5, 20_000.0
 MAX_UNRECORDED = 4096
-MAX_RATE_ERROR = (
-    1e-3  # of a device's clock (docs/reference/protocol.md, section 9); what a fit says beyond it is no rate
-)
+# of a device's clock (docs/reference/protocol.md, section 9); what a fit says beyond it is no rate
+MAX_RATE_ERROR = 1e-3
 LARGEST_NS = 1 << 62  # 146 years: a tick that claims more is no time, and must still fit the recording's int64
 
 I64 = npt.NDArray[np.int64]
@@ -52,7 +50,6 @@ class ClockFit:
     uncertainty_ns: float
     rate_uncertainty: float
     drift_ppm: float
-    probes: int
     anchors: tuple[tuple[int, float], ...] = ()
 
 
@@ -63,6 +60,20 @@ class ClockStep:
     tick: int
     off_ns: int
     allowed_ns: int
+
+
+def future_tick(clock: ClockModel, tick: int, arrival_ns: int) -> Contradiction | None:
+    """Return what is wrong when `tick` is later than `arrival_ns` by more than the clock's uncertainty; the device's clock has moved.
+
+    What has arrived has happened, so that no tick may lie in the future.
+    """
+    fit = clock.fit
+    if fit is None or fit.reference_host_ns + (tick - fit.reference_tick) * fit.ns_per_tick <= arrival_ns:
+        return None
+    host_ns, uncertainty_ns = clock.to_host_ns(tick)
+    if host_ns - uncertainty_ns - STEP_MARGIN_NS <= arrival_ns:
+        return None
+    return Contradiction("future_tick", 0, tick, clock.to_tick(arrival_ns))
 
 
 def unwrap_tick(raw: int, latest: int, bits: int = 32) -> int:
@@ -87,7 +98,6 @@ class ClockModel:
         self.epoch = 0  # counts jumps within the session
         self.fit: ClockFit | None = None
         self._kept = 0  # since the last jump
-        self._strange = 0
         self._unrecorded: deque[tuple[int, int, int]] = deque(maxlen=MAX_UNRECORDED)
 
     def add_probe(self, sent_ns: int, rx_tick: int, tx_tick: int, received_ns: int) -> ClockStep | None:
@@ -190,6 +200,5 @@ def _fit(samples: npt.NDArray[np.void], tick_hz: int, newest: int) -> ClockFit:
         uncertainty_ns=float(bounds[-1]),
         rate_uncertainty=3.0 / precision**0.5 + WANDER,  # three sigma of the fitted rate
         drift_ppm=rate * 1e6,
-        probes=len(quick),
         anchors=tuple(zip(ticks[-ANCHORS:].tolist(), bounds[-ANCHORS:].tolist())),
     )

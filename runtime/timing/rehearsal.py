@@ -18,34 +18,38 @@ from typing import Any
 
 import numpy as np
 
-from .cpu import (
+from .realtime import (
+    FIFO_PRIORITY,
+    GRANTED,
     bound,
     busy_core,
     cores_of,
-    fifo,
     first_line,
     isolated_cores,
+    scheduled,
     shallow_idle,
     steal_ms,
     usable_cores,
 )
-from .ledger import FIFO_PRIORITY
 
 SECONDS, ROUNDS, MOST_CORES = 10.0, 4, 8
 CORE_SHARE = 0.1  # of the time: to look at the cores
 PAUSE_S = (0.0002, 0.0006)  # random: nothing on the machine has this period
 SPIN_GAP_NS = 20_000  # a reading of the clock takes 0.1 us: what is longer was spent elsewhere
-
-
-@dataclass(frozen=True, slots=True)
-class Arm:
-    """Conditions that hold together."""
-
-    name: str
-    fifo: bool = False
-    bound: bool = False
-    awake: bool = False
-    shallow: bool = False
+CONDITIONS: dict[str, Callable[[int], Any]] = {  # of the core; busy_core binds, too
+    "kept_awake": busy_core,
+    "core": bound,
+    "sched_fifo": lambda core: scheduled("SCHED_FIFO", FIFO_PRIORITY),
+    "cpu_dma_latency": lambda core: shallow_idle(),
+}
+ARMS = {  # conditions that hold together
+    "ordinary": (),
+    "bound": ("core",),
+    "SCHED_FIFO": ("sched_fifo",),
+    "bound, SCHED_FIFO": ("core", "sched_fifo"),
+    "kept awake": ("kept_awake", "sched_fifo"),
+    "shallow idle states": ("core", "sched_fifo", "cpu_dma_latency"),
+}
 
 
 @dataclass(slots=True)
@@ -74,36 +78,23 @@ class Rehearsal:
     seconds: float
 
 
-def arms_of(granted: bool) -> tuple[Arm, ...]:
-    """Return the arms to compare; without SCHED_FIFO those that need it are left out."""
-    fifo_arms = (Arm("SCHED_FIFO", fifo=True), Arm("bound, SCHED_FIFO", fifo=True, bound=True)) if granted else ()
-    return (
-        Arm("ordinary"),
-        Arm("bound", bound=True),
-        *fifo_arms,
-        Arm("kept awake", fifo=granted, bound=True, awake=True),
-        Arm("shallow idle states", fifo=granted, bound=True, shallow=True),
-    )
-
-
 def rehearse(seconds: float = SECONDS, report: Callable[[float], None] = lambda share: None) -> Rehearsal:
-    """Measure for about `seconds`, and `report` the share that is done."""
+    """Measure for about `seconds`, and `report` the share that is done; arms that need SCHED_FIFO alone are left out without it."""
     began, load, stolen, collecting = time.perf_counter(), _load(), steal_ms(), gc.isenabled()
     gc.collect()
     gc.disable()
     try:
-        with fifo(FIFO_PRIORITY) as answer:
-            granted = answer == "granted"
+        with scheduled("SCHED_FIFO", FIFO_PRIORITY) as answer:
+            granted = answer == GRANTED
         cores = look_at_cores(seconds * CORE_SHARE, granted)
         host, device = pair_of(cores, isolated_cores(), core_siblings())
         report(CORE_SHARE)
-        arms = arms_of(granted)
-        turns = {arm.name: Turns() for arm in arms}
-        steps = ROUNDS * len(arms)
-        for step in range(steps):
-            arm = arms[step % len(arms)]
-            _one_turn(arm, turns[arm.name], seconds * (1 - CORE_SHARE) / steps, host)
-            report(CORE_SHARE + (1 - CORE_SHARE) * (step + 1) / steps)
+        arms = {name: wanted for name, wanted in ARMS.items() if granted or "SCHED_FIFO" not in name}
+        turns, steps = {name: Turns() for name in arms}, ROUNDS * len(arms)
+        for step, name in enumerate([*arms] * ROUNDS, 1):
+            wanted = [one for one in arms[name] if granted or one != "sched_fifo"]
+            _one_turn(wanted, turns[name], seconds * (1 - CORE_SHARE) / steps, host)
+            report(CORE_SHARE + (1 - CORE_SHARE) * step / steps)
     finally:
         if collecting:
             gc.enable()
@@ -112,22 +103,16 @@ def rehearse(seconds: float = SECONDS, report: Callable[[float], None] = lambda 
     return Rehearsal(cores, host, device, granted, turns, steal, (load, _load()), time.perf_counter() - began)
 
 
-def _one_turn(arm: Arm, turns: Turns, seconds: float, host: int | None) -> None:
-    if arm.bound and host is None:
+def _one_turn(wanted: Sequence[str], turns: Turns, seconds: float, host: int | None) -> None:
+    if host is None and {"core", "kept_awake"} & set(wanted):
         turns.asked = {"core": "refused: this system does not bind threads to cores"}
         return
     with ExitStack() as stack:
-        asked: dict[str, Any] = {}
-        if arm.awake:
-            asked |= stack.enter_context(busy_core(host))  # binds, too
-        elif arm.bound and host is not None:
-            asked["core"] = stack.enter_context(bound(host))
-        if arm.fifo:
-            asked["sched_fifo"] = stack.enter_context(fifo(FIFO_PRIORITY))
-        if arm.shallow:
-            asked["cpu_dma_latency"] = stack.enter_context(shallow_idle())
-        turns.asked = asked
-        if not any(str(answer).startswith("refused") for answer in asked.values()):
+        turns.asked = {}
+        for name in wanted:
+            answer = stack.enter_context(CONDITIONS[name](host or 0))
+            turns.asked |= answer if isinstance(answer, dict) else {name: answer}
+        if not any(str(answer).startswith("refused") for answer in turns.asked.values()):
             turns.rounds_ns.append(sleeps(seconds))
 
 
@@ -176,7 +161,7 @@ def look_at_cores(seconds: float, granted: bool) -> list[dict[str, Any]]:
         with bound(core):
             row: dict[str, Any] = {"core": core, "sleep": figures(sleeps(each_s)), **_away("", each_s)}
             if granted:
-                with fifo(FIFO_PRIORITY):
+                with scheduled("SCHED_FIFO", FIFO_PRIORITY):
                     row |= _away("fifo_", each_s)
         found.append(row)
     return found

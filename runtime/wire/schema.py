@@ -2,7 +2,7 @@
 
 messages.py checks with them what a device sends, wire_kernels.py does so in compiled code, and tests/runtime/wire/test_fields.py compares
 them with the document. What a field must be beside the others, the plan or the clock is not here: core/follower.py and
-timing/clock_check.py judge that.
+timing/clock.py judge that.
 
 The largest numbers of the whole path:
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from pans.runtime.errors import LinkError
-from pans.runtime.timing.clock import CLOCK_DTYPE, WANDER, ClockModel, unwrap_tick
+from pans.runtime.timing.clock import (
+    CLOCK_DTYPE,
+    READING_NS,
+    STEP_MARGIN_NS,
+    WANDER,
+    ClockModel,
+    future_tick,
+    unwrap_tick,
+)
 
 TICK_HZ = 10_000_000
 NS_PER_TICK = 100
@@ -16,12 +24,19 @@ PROBE_EVERY_NS = 97_000_000
 REQUIRED = 0.999  # of the conversions are within their uncertainty
 
 
+def probed(
+    model: ClockModel, step: int, jump_ticks: int = 0, late_ns: int = 0, rate: float = 1.0, host_ns: int = 0
+) -> Any:
+    """Give the model the probe of a `step`: 100 us there and back, and `late_ns` on the way back."""
+    sent = host_ns + step * PROBE_EVERY_NS
+    tick = int((step * PROBE_EVERY_NS + 50_000) * rate) // NS_PER_TICK + jump_ticks
+    return model.add_probe(sent, tick, tick, sent + 100_000 + late_ns)
+
+
 def test_the_drift_is_found() -> None:
     model = ClockModel(TICK_HZ)
     for step in range(100):
-        sent = step * 97_000_000
-        tick = int((sent + 50_000) * (1 + 37e-6) / NS_PER_TICK)
-        model.add_probe(sent, tick, tick, sent + 100_000)
+        probed(model, step, rate=1 + 37e-6)
     assert model.fit is not None
     assert model.fit.drift_ppm == pytest.approx(-37.0, abs=0.5)  # host time per device time runs slow by as much
 
@@ -29,9 +44,7 @@ def test_the_drift_is_found() -> None:
 def test_ticks_and_times_convert_both_ways_without_losing_digits() -> None:
     model = ClockModel(TICK_HZ)
     for step in range(50):
-        sent = 2**60 + step * 97_000_000
-        tick = 2**61 + (sent + 50_000) // NS_PER_TICK
-        model.add_probe(sent, tick, tick, sent + 100_000)
+        probed(model, step, 2**61, host_ns=2**60)
     host_ns = 2**60 + 5_000_000_000
     assert abs(model.to_host_ns(model.to_tick(host_ns))[0] - host_ns) <= NS_PER_TICK
 
@@ -39,25 +52,23 @@ def test_ticks_and_times_convert_both_ways_without_losing_digits() -> None:
 def test_slow_probes_do_not_pull_the_line() -> None:
     model = ClockModel(TICK_HZ)
     for step in range(60):
-        sent = step * 97_000_000
-        late = 20_000_000 if step % 2 else 0  # every other answer waits 20 ms on the way back
-        tick = (sent + 50_000) // NS_PER_TICK
-        model.add_probe(sent, tick, tick, sent + 100_000 + late)
+        probed(model, step, late_ns=20_000_000 if step % 2 else 0)
     host_ns, bound = model.to_host_ns(5_000_000_000 // NS_PER_TICK)
     assert abs(host_ns - 5_000_000_000) < 60_000
     assert bound < 200_000
 
 
-def test_the_uncertainty_grows_away_from_the_probes() -> None:
-    """By three sigma of the fitted rate and what the crystal may wander, as docs/reference/links.md says."""
+@pytest.mark.parametrize("n", [1, 2, 5, 40])
+def test_the_uncertainty_grows_away_from_the_probes_by_three_sigma_of_the_rate(n: int) -> None:
+    """And by what the crystal may wander, as docs/reference/links.md says; of one probe, sigma is that of crystals, 100 ppm."""
     model = ClockModel(TICK_HZ)
-    for step in range(200):
-        sent = step * PROBE_EVERY_NS
-        tick = (sent + 50_000) // NS_PER_TICK
-        model.add_probe(sent, tick, tick, sent + 100_000)
-    assert model.fit is not None
-    near, far = (model.to_host_ns(tick + model.fit.reference_tick)[1] for tick in (0, 100 * TICK_HZ))
-    assert far - near >= WANDER * 100e9
+    for step in range(n):
+        probed(model, step)
+    at_s = np.arange(n) * PROBE_EVERY_NS / 1e9
+    error_s = (50_000 + READING_NS) / 1e9  # of a probe: half its round trip, and the readings
+    sigma = 1 / np.sqrt(np.sum((at_s - at_s.mean()) ** 2) / error_s**2 + 1 / 100e-6**2)
+    (near, far), ticks = (model.to_host_ns(tick)[1] for tick in (10**9, 2 * 10**9)), 10**9
+    assert far - near == pytest.approx((3 * sigma + WANDER) * ticks * NS_PER_TICK, rel=1e-3)
 
 
 def test_before_the_first_probe_nothing_is_converted() -> None:
@@ -143,23 +154,31 @@ def test_coverage_under_drift_wander_jitter_and_asymmetry(case: ClockCase) -> No
     assert row["error_us_median"] < row["uncertainty_us_median"]
 
 
-def probed(model: ClockModel, step: int, jump_ticks: int = 0) -> object:
-    sent = step * 97_000_000
-    tick = (sent + 50_000) // NS_PER_TICK + jump_ticks
-    return model.add_probe(sent, tick, tick, sent + 100_000)
-
-
 def test_a_counter_that_jumps_starts_a_new_epoch_and_is_told() -> None:
     model = ClockModel(TICK_HZ)
     assert all(probed(model, step) is None for step in range(30))
     step = probed(model, 30, 50_000)  # 5 ms ahead
     assert step is not None
-    assert step.off_ns == pytest.approx(-5_000_000, abs=200_000)  # type: ignore[attr-defined]
+    assert step.off_ns == pytest.approx(-5_000_000, abs=200_000)
     assert model.epoch == 1
     for later in range(31, 40):
         assert probed(model, later, 50_000) is None
     host_ns, bound = model.to_host_ns(39 * 970_000 + 50_000)
     assert abs(host_ns - 39 * 97_000_000) < bound < 500_000
+
+
+def test_a_tick_that_lies_in_the_future_beyond_the_uncertainty_is_a_contradiction() -> None:
+    model = ClockModel(TICK_HZ)
+    assert future_tick(model, 10**18, 0) is None  # nothing is known yet
+    for step in range(30):
+        probed(model, step)
+    tick = 10**8
+    host_ns, bound = model.to_host_ns(tick)
+    earliest_ns = host_ns - bound - STEP_MARGIN_NS
+    assert [future_tick(model, tick, earliest_ns + off) is None for off in (-1, 0, bound)] == [False, True, True]
+    found = future_tick(model, tick, earliest_ns - 1)
+    assert found is not None
+    assert (found.what, found.found, found.expected) == ("future_tick", tick, model.to_tick(earliest_ns - 1))
 
 
 def test_every_probe_is_kept_for_the_recording_once() -> None:

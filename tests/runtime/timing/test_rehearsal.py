@@ -1,4 +1,4 @@
-"""What is tried for real time: every condition is put back, refusals are told, cores are chosen by what was measured."""
+"""What is tried for real time: every condition is put back, and cores are chosen by what was measured."""
 
 from __future__ import annotations
 
@@ -9,21 +9,11 @@ from pathlib import Path
 import pytest
 
 from pans.runtime.commands.doctor import settings_of, table_text
-from pans.runtime.timing.cpu import (
-    GRANTED,
-    bound,
-    fifo,
-    isolated_cores,
-    shallow_idle,
-    steal_ms,
-    usable_cores,
-)
+from pans.runtime.timing.realtime import usable_cores
 from pans.runtime.timing.rehearsal import ROUNDS, core_siblings, pair_of, rehearse
 
-linux = pytest.mark.skipif(sys.platform != "linux", reason="conditions of Linux")
 
-
-@linux
+@pytest.mark.skipif(sys.platform != "linux", reason="conditions of Linux")
 def test_a_rehearsal_measures_every_arm_in_every_round_and_leaves_nothing_changed() -> None:
     before = os.sched_getscheduler(0), os.sched_getaffinity(0)
     shares: list[float] = []
@@ -42,34 +32,6 @@ def test_a_rehearsal_measures_every_arm_in_every_round_and_leaves_nothing_change
     assert all(row["setting"] in table_text(rows, found) for row in rows)
 
 
-@linux
-def test_conditions_hold_inside_and_are_undone() -> None:
-    core = max(os.sched_getaffinity(0))
-    before = os.sched_getaffinity(0)
-    with bound(core) as answer:
-        assert answer == GRANTED
-        assert os.sched_getaffinity(0) == {core}
-    assert (os.sched_getaffinity(0)) == before
-    with bound(4095) as answer:
-        assert answer.startswith("refused: ")
-    with fifo(10) as answer:
-        assert (answer == GRANTED) == (os.sched_getscheduler(0) == os.SCHED_FIFO)
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
-
-
-@linux
-def test_idle_states_are_asked_for_by_a_file_that_stays_open(tmp_path: Path) -> None:
-    with shallow_idle(tmp_path / "missing") as answer:
-        assert answer.startswith("refused: ")
-    device = tmp_path / "cpu_dma_latency"
-    device.touch()
-    with shallow_idle(device) as answer:
-        assert answer == GRANTED
-        held = [os.readlink(path) for path in Path("/proc/self/fd").iterdir() if path.exists()]
-        assert str(device) in held
-    assert device.read_bytes() == bytes(4)
-
-
 def core(number: int, away: float, p99: float = 50.0) -> dict[str, object]:
     return {"core": number, "sleep": {"p99_us": p99}, "away_ms_per_s": away}
 
@@ -83,16 +45,9 @@ def test_the_quietest_core_is_the_hosts_and_the_devices_is_no_sibling_of_it() ->
     assert pair_of([], (), []) == (None, None)
 
 
-def test_the_facts_of_a_machine_are_read(tmp_path: Path) -> None:
-    cpu = tmp_path / "sys/devices/system/cpu"
+def test_cores_that_share_a_physical_core_are_read(tmp_path: Path) -> None:
     for number, text in enumerate(("0,2", "1,3", "0,2")):
-        (cpu / f"cpu{number}/topology").mkdir(parents=True)
-        (cpu / f"cpu{number}/topology/thread_siblings_list").write_text(text + "\n")
-    (cpu / "isolated").write_text("2-3\n")
-    (tmp_path / "proc").mkdir()
-    (tmp_path / "proc/stat").write_text("cpu  1 2 3 4 5 6 7 200 9 10\n")
+        folder = tmp_path / f"sys/devices/system/cpu/cpu{number}/topology"
+        folder.mkdir(parents=True)
+        (folder / "thread_siblings_list").write_text(text + "\n")
     assert core_siblings(tmp_path) == [frozenset({0, 2}), frozenset({1, 3})]
-    assert isolated_cores(tmp_path) == {2, 3}
-    assert steal_ms(tmp_path) == 200_000 / os.sysconf("SC_CLK_TCK")
-    assert isolated_cores(tmp_path / "nothing") == frozenset()
-    assert steal_ms(tmp_path / "nothing") is None

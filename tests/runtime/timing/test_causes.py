@@ -26,7 +26,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording
-from pans.runtime.timing.evidence import (
+from pans.runtime.timing.causes import (
     CAUSES,
     DISK,
     GC,
@@ -63,8 +63,8 @@ def facts(
 ) -> Facts:
     """Late work whose exposure ended at 0; times in ms; a block every millisecond."""
     stamps = tuple(int(one * MS) for one in arrivals)
-    begin, came, decided = 0, int(arrival * MS), int(end * MS)
-    return Facts(begin, came, decided, 0, spans, stamps, MS, int(cpu * MS), int(run_delay * MS), 0, stamped)
+    came, decided, computed, delay = (int(one * MS) for one in (arrival, end, cpu, run_delay))
+    return Facts(0, came, decided, spans, stamps, MS, computed, delay, 0, stamped)
 
 
 def span(kind: str, begin: float, end: float) -> Span:
@@ -135,35 +135,26 @@ def test_no_cause_explains_more_than_the_delay(
         begin = reached + int(abs(gap) * total / 4)
         reached = begin + int(length * total / 2)
         pieces.append(Span(kind, begin, reached))
-    verdict = judge(
-        Facts(0, int(arrival * total), total, 0, tuple(pieces), (), 1, total // 3, int(delay * total), 0, ())
-    )
+    verdict = judge(Facts(0, int(arrival * total), total, tuple(pieces), (), 1, total // 3, int(delay * total), 0, ()))
     assert verdict.cause in CAUSES
     assert all(0 <= share <= total for share in verdict.shares_ns.values())
     assert verdict.share_ns == max(verdict.shares_ns.values())
     assert sum(verdict.shares_ns.values()) <= 2 * total + 5  # the scheduler's counters may overlap what was seen
 
 
-def gap(dropped: int, exposures: int = 10) -> Gap:
-    return Gap(5, exposures, 2, dropped)
-
-
 def test_no_time_in_the_words_is_longer_than_the_delay() -> None:
     """The system's counters are read around the delay."""
     why = judge(facts(arrival=1, end=41, run_delay=160, cpu=90)).why
-    assert why.startswith("the host did not run for")
     assert max(float(one) for one in re.findall(r"([\d.]+) ms", why)) == 41.0
 
 
 def test_what_never_came_is_the_links_fault_unless_the_device_dropped_it() -> None:
-    quiet = facts()
-    assert judge_gap(gap(0), quiet, 3).cause == "link"
-    assert "3 damaged frames" in judge_gap(gap(0), quiet, 3).why
-    held_up = facts(0.2, 400, (span(DISK, 0.1, 399),))
-    verdict = judge_gap(gap(10), held_up, 0)
-    assert verdict.cause == "disk"
-    assert verdict.why.startswith("the device dropped 10 exposures because its buffer was full; before that, writing")
-    assert judge_gap(gap(10), facts(0.1, 0.2), 0)[:3:2] == ("device", False)
+    lost, dropped = Gap(5, 10, 2, 0), Gap(5, 10, 2, 10)
+    verdict = judge_gap(lost, facts(), 3)
+    assert (verdict.cause, verdict.sure, "3 damaged frames" in verdict.why) == ("link", True, True)
+    verdict = judge_gap(dropped, facts(0.2, 400, (span(DISK, 0.1, 399),)), 0)
+    assert (verdict.cause, "dropped 10 exposures" in verdict.why) == ("disk", True)
+    assert judge_gap(dropped, facts(0.1, 0.2), 0)[:3:2] == ("device", False)
 
 
 def verdict_of(incidents: Incidents, now_ns: int) -> dict[str, Any] | None:
@@ -178,7 +169,7 @@ def test_an_incident_is_judged_once_from_its_worst_decision() -> None:
     incidents = Incidents(evidence)
     assert incidents.verdict(0) is None
     for number, begin in enumerate(range(101, 131, 10)):
-        incidents.late(LateWork(number, begin * MS, begin * MS + 1000, 151 * MS, 0))
+        incidents.late(LateWork(number, begin * MS, begin * MS + 1000, 151 * MS))
     assert incidents.verdict(152 * MS) is None  # not quiet yet
     event = verdict_of(incidents, 151 * MS + QUIET_NS)
     assert event is not None
@@ -193,8 +184,8 @@ def test_late_work_that_does_not_overlap_is_judged_apart() -> None:
     evidence.worked(DISK, 100 * MS, 120 * MS)
     evidence.worked(INFERENCE, 121 * MS, 161 * MS)
     incidents = Incidents(evidence)
-    incidents.late(LateWork(0, 101 * MS, 101 * MS, 120 * MS, 0))
-    incidents.late(LateWork(1, 121 * MS, 121 * MS, 161 * MS, 0))
+    incidents.late(LateWork(0, 101 * MS, 101 * MS, 120 * MS))
+    incidents.late(LateWork(1, 121 * MS, 121 * MS, 161 * MS))
     assert [verdict_of(incidents, 10**12)["cause"] for _ in range(2)] == ["disk", "inference"]  # type: ignore[index]
 
 
@@ -202,7 +193,7 @@ def test_a_run_that_is_always_late_gets_a_verdict_per_second() -> None:
     incidents = Incidents(Evidence(lambda: 0, MS, virtual=True))
     verdicts = []
     for number in range(5000):
-        incidents.late(LateWork(number, number * MS, number * MS + 1, (number + 20) * MS, 0))
+        incidents.late(LateWork(number, number * MS, number * MS + 1, (number + 20) * MS))
         verdicts.append(incidents.verdict((number + 20) * MS))
     found = [one for one in verdicts if one is not None]
     assert len(found) == 4
@@ -221,7 +212,7 @@ def test_a_real_collection_is_seen_with_its_length() -> None:
         evidence.close()
     assert evidence._on_gc not in gc.callbacks
     assert len(heap) == 400_000
-    known = evidence.facts(begin, begin, end, 0)
+    known = evidence.facts(begin, begin, end)
     assert {one.kind for one in known.spans} == {GC}
     assert judge(known).cause == "gc"
 
@@ -231,7 +222,7 @@ def test_waits_that_end_on_time_are_idle_and_others_overslept() -> None:
     evidence.waited(0, 0.02, 20 * MS)
     evidence.waited(20 * MS, 0.02, 90 * MS)
     evidence.waited(90 * MS, 0.02, 90 * MS + 10)
-    assert evidence.facts(0, 0, 100 * MS, 0).spans == (
+    assert evidence.facts(0, 0, 100 * MS).spans == (
         Span(IDLE, 0, 40 * MS),  # two waits with nothing of note between them
         Span(OVERSLEPT, 40 * MS, 90 * MS),
         Span(IDLE, 90 * MS, 90 * MS + 10),
@@ -243,7 +234,7 @@ def test_memory_is_bounded() -> None:
     for number in range(10_000):
         evidence.worked(DISK, number * MS, number * MS + MS)
         evidence.stamped(Stamped(None, None, number * MS, number * MS))
-    known = evidence.facts(0, 0, 10**13, 0)
+    known = evidence.facts(0, 0, 10**13)
     assert len(known.spans) == 1024
     assert len(known.stamped) == 64
 
@@ -297,7 +288,7 @@ def test_a_verdict_waits_for_a_reading_and_not_for_ever() -> None:
     evidence = Evidence(lambda: now[0], MS)  # nobody reads: it is not watched
     incidents = Incidents(evidence)
     now[0] = 100 * MS
-    incidents.late(LateWork(1, 90 * MS, 91 * MS, 92 * MS, 0))
+    incidents.late(LateWork(1, 90 * MS, 91 * MS, 92 * MS))
     assert incidents.verdict(150 * MS) is None
     now[0] = 300 * MS
     assert incidents.verdict(now[0]) is None  # gathered: the loop has read for itself
@@ -349,23 +340,22 @@ def test_whole_runs_in_virtual_time_blame_what_was_done_to_them(faults: str, cau
 def test_the_longest_pause_between_blocks(shots: int, dark: int, order: str) -> None:
     levels = np.zeros((4, 9), np.uint16)
     levels[:, 0] = 123
-    table = np.zeros((16, 2), np.float32)
     bundle = made_bundle(
-        name="p", task="p", classes=("a", "b"), image_shape=(3, 3), levels=124, pattern_levels=levels,
-        photons_per_level=8.0 / 123, table=table,
+        image_shape=(3, 3), levels=124, pattern_levels=levels, photons_per_level=8.0 / 123, table=np.zeros((16, 2), np.float32)
     )  # fmt: skip
     plan = build_plan(
         load_profile("oled-qcmos"), bundle, shots_per_object=shots, dark_slots_per_cycle=dark, order=order
     )
     ends, length = [], 0
-    for cycle in range(2):
-        for slot in range(plan.slots_per_cycle):
-            length += 1
-            here = int(plan.slot_offset_ticks[slot])
-            last = slot + 1 == plan.slots_per_cycle
-            step = 0 if last else int(plan.slot_offset_ticks[slot + 1]) - here
-            if last or length == plan.block_exposures or step != plan.slot_period_ticks:
-                ends.append(cycle * plan.cycle_ticks + here)
-                length = 0
+    for slot in range(2 * plan.slots_per_cycle):  # two cycles
+        length += 1
+        here, following = (
+            at // plan.slots_per_cycle * plan.cycle_ticks + int(plan.slot_offset_ticks[at % plan.slots_per_cycle])
+            for at in (slot, slot + 1)
+        )
+        is_last = (slot + 1) % plan.slots_per_cycle == 0
+        if is_last or length == plan.block_exposures or following - here != plan.slot_period_ticks:
+            ends.append(here)
+            length = 0
     naive = max(after - before for before, after in pairwise(ends))
     assert longest_pause_ns(plan) == pytest.approx(naive * plan.tick_us * 1000, abs=1)

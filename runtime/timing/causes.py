@@ -23,8 +23,8 @@ import os
 import threading
 import time
 from bisect import bisect_left, bisect_right
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -76,7 +76,6 @@ class Facts(NamedTuple):
     begin_ns: int
     arrival_ns: int
     end_ns: int
-    uncertainty_ns: int
     spans: tuple[Span, ...]
     arrivals_ns: tuple[int, ...]  # when the reader stamped bytes
     pause_ns: int  # the longest time between two blocks when everything is on time
@@ -95,11 +94,6 @@ class Verdict(NamedTuple):
     why: str
     shares_ns: dict[str, int]
 
-    def facts(self) -> dict[str, Any]:
-        """Return the fields of an event; shares in whole microseconds, those below one left out."""
-        shares = {name: share // 1000 for name, share in self.shares_ns.items() if share >= 1000}
-        return {"cause": self.cause, "sure": self.sure, "why": self.why, "shares_us": shares}
-
 
 # ---- judging ---------------------------------------------------------------------------------------------------------
 
@@ -114,8 +108,7 @@ def judge(facts: Facts) -> Verdict:
     share = shares.get(cause, 0)
     if cause == source and outside == share:
         return Verdict(cause, share, sure, why, shares)
-    total = max(facts.end_ns - facts.begin_ns, 1)
-    return Verdict(cause, share, 2 * share >= total, _words(cause, share, facts), shares)
+    return Verdict(cause, share, 2 * share >= facts.end_ns - facts.begin_ns, _words(cause, share, facts), shares)
 
 
 def judge_gap(gap: Gap, facts: Facts, damaged_frames: int) -> Verdict:
@@ -137,28 +130,32 @@ def judge_gap(gap: Gap, facts: Facts, damaged_frames: int) -> Verdict:
 def _shares(facts: Facts) -> dict[str, int]:
     """Return how many ns each cause on this side explains, and `outside`: awake, and no bytes."""
     begin, end = facts.begin_ns, facts.end_ns
-    collecting = _clipped(facts.spans, GC, begin, end)
+    pieces = [(one.kind, max(one.begin_ns, begin), min(one.end_ns, end)) for one in facts.spans]
+    pieces = [piece for piece in pieces if piece[1] < piece[2]]
+    collecting = [piece[1:] for piece in pieces if piece[0] == GC]
 
     def without_gc(kind: str) -> int:
-        spans = _clipped(facts.spans, kind, begin, end)
-        shared = sum(max(0, min(a[1], b[1]) - max(a[0], b[0])) for a in spans for b in collecting)
-        return _length(spans) - shared
+        spans = [piece[1:] for piece in pieces if piece[0] == kind]
+        shared = (max(0, min(a[1], b[1]) - max(a[0], b[0])) for a in spans for b in collecting)
+        return sum(last - first for first, last in spans) - sum(shared)
 
-    shares = {"gc": _length(collecting)}
-    shares |= {cause: without_gc(kind) for cause, kind in (("disk", DISK), ("inference", INFERENCE), ("outside", IDLE))}
-    asleep = without_gc(OVERSLEPT)
-    own = max(end - begin - _covered(facts.spans, begin, end), 0)
+    covered, reached = 0, begin  # what overlaps counts once
+    for _, first, last in sorted(pieces, key=lambda piece: piece[1]):
+        covered += max(last - max(first, reached), 0)
+        reached = max(reached, last)
+    shares = {"disk": without_gc(DISK), "inference": without_gc(INFERENCE), "decode": end - begin - covered}
+    shares["outside"], asleep = without_gc(IDLE), without_gc(OVERSLEPT)
     # What the hypervisor took explains work that took long; a loop that woke up on time lost nothing by it.
-    stolen = min(facts.steal_ns, own + shares["inference"] + shares["disk"])
+    stolen = min(facts.steal_ns, shares["decode"] + shares["inference"] + shares["disk"])
     starved = min(max(facts.run_delay_ns, asleep, stolen), end - begin)
     # A thread that waits for a processor does so in the middle of something: that time is the machine's, not the activity's.
     hidden = max(starved - asleep, 0)
-    shares["decode"] = own
-    for cause in sorted(("disk", "inference", "decode", "outside"), key=lambda name: -shares[name]):
+    for cause in sorted(shares, key=lambda name: -shares[name]):
         taken = min(shares[cause], hidden)
         shares[cause] -= taken
         hidden -= taken
-    return shares | {"host": min(starved + _stopped(facts, shares), end - begin)}
+    host = min(starved + _stopped(facts, shares), end - begin)
+    return shares | {"gc": sum(last - first for first, last in collecting), "host": host}
 
 
 def _stopped(facts: Facts, shares: dict[str, int]) -> int:
@@ -167,9 +164,8 @@ def _stopped(facts: Facts, shares: dict[str, int]) -> int:
     The loop's own work costs it processor time. A back end may sleep, as one that waits for other hardware does; but then the reader
     still stamps what comes.
     """
-    computed = min(shares["decode"], facts.cpu_ns)
-    still = shares["decode"] - computed
-    shares["decode"] = computed
+    still = max(shares["decode"] - facts.cpu_ns, 0)
+    shares["decode"] -= still
     margin = facts.pause_ns
     for span in facts.spans:
         length = min(span.end_ns, facts.end_ns) - max(span.begin_ns, facts.begin_ns)
@@ -188,85 +184,60 @@ def attribute_silence(facts: Facts) -> tuple[str, bool, str]:
     begin, end = facts.begin_ns, facts.arrival_ns
     delay = max(end - begin, 1)
     long_ns = max(LEG_NS, delay // 2)
-    for message in facts.stamped:
-        held = 0 if message.reached_ns is None else message.left_ns - message.reached_ns
-        if held > long_ns and message.left_ns > begin:
+    probes = [(one.sent_ns, one.reached_ns, one) for one in facts.stamped]
+    for _, reached_ns, one in probes:
+        held = 0 if reached_ns is None else one.left_ns - reached_ns
+        if held > long_ns and one.left_ns > begin:
             return "device", True, f"the device kept a clock probe for {_ms(held)} before it answered"
-    open_again = _latest_round_trip(facts.stamped, begin, end)
-    for message in facts.stamped:
-        way = message.arrival_ns - message.left_ns
-        if begin <= message.left_ns <= end and way > long_ns:
-            what = "a clock probe's answer" if message.sent_ns is not None else "a STATUS"
+    # a probe that was sent after the block should have come, and was back well before it came
+    back_ns = end - max(LEG_NS, (end - begin) // 8)
+    trips = [(one.arrival_ns, sent) for sent, _, one in probes if sent and sent >= begin and one.arrival_ns <= back_ns]
+    for sent_ns, reached_ns, one in probes:
+        way = one.arrival_ns - one.left_ns
+        if begin <= one.left_ns <= end and way > long_ns:
+            what = "a clock probe's answer" if sent_ns is not None else "a STATUS"
             why = f"{what} left the device on time and was {_ms(way)} on the way, while the host waited for bytes"
             return "link", True, why
-        if message.sent_ns is None or message.reached_ns is None or open_again is not None:
+        if sent_ns is None or reached_ns is None or trips:
             continue
-        way = message.reached_ns - message.sent_ns
-        if begin - delay <= message.sent_ns <= end and way > max(LEG_NS, (end - message.sent_ns) // 2):
+        way = reached_ns - sent_ns
+        if begin - delay <= sent_ns <= end and way > max(LEG_NS, (end - sent_ns) // 2):
             why = f"a clock probe needed {_ms(way)} to reach the device, while the host was awake and waited for bytes"
             return "link", True, why
-    if open_again is not None:
-        trip, overdue = open_again.arrival_ns - (open_again.sent_ns or 0), open_again.arrival_ns - begin
+    if trips:
+        arrival_ns, sent_ns = max(trips)
         why = (
-            f"a clock probe went to the device and back in {_ms(trip)} while the block was already {_ms(overdue)} late, "
-            "so the link was open and the block had not been sent"
+            f"a clock probe went to the device and back in {_ms(arrival_ns - sent_ns)} while the block was already "
+            f"{_ms(arrival_ns - begin)} late, so the link was open and the block had not been sent"
         )
         return "device", True, why
     why = f"the host was awake and waited for bytes for {_ms(delay)}; no message that says when it left fell into this time"
     return "link", False, why
 
 
-def _latest_round_trip(stamped: Iterable[Stamped], begin: int, end: int) -> Stamped | None:
-    """A probe that was sent after the block should have come, and was back well before it came."""
-    margin = max(LEG_NS, (end - begin) // 8)
-    inside = [one for one in stamped if (one.sent_ns or 0) >= begin and one.sent_ns and one.arrival_ns <= end - margin]
-    return max(inside, key=attrgetter("arrival_ns"), default=None)
+SENTENCES = {
+    "gc": "a garbage collection held the interpreter",
+    "disk": "writing the recording did not return",
+    "inference": "the decision back end computed",
+    "decode": "the loop was busy with its own work, reading messages,",
+    "link": "the host was awake and waited for bytes",
+    "device": "the device had not sent the block",
+    "host": "the host did not run",
+}
 
 
 def _words(cause: str, share: int, facts: Facts) -> str:
     total_ns = facts.end_ns - facts.begin_ns
-    if cause == "host":
-        # the system's counters are read around the delay, not at its ends: they hold time beyond it
-        waited, stolen, computed = (
-            _ms(min(one, total_ns)) for one in (facts.run_delay_ns, facts.steal_ns, facts.cpu_ns)
-        )
-        return (
-            f"the host did not run for {_ms(share)} of {_ms(total_ns)}: waiting for a processor {waited}, stolen from the "
-            f"machine {stolen}, computing at most {computed}"
-        )
-    sentence = {
-        "gc": "a garbage collection held the interpreter",
-        "disk": "writing the recording did not return",
-        "inference": "the decision back end computed",
-        "decode": "the loop was busy with its own work, reading messages,",
-        "link": "the host was awake and waited for bytes",
-        "device": "the device had not sent the block",
-    }[cause]
-    return f"{sentence} for {_ms(share)} of {_ms(total_ns)}"
+    why = f"{SENTENCES[cause]} for {_ms(share)} of {_ms(total_ns)}"
+    if cause != "host":
+        return why
+    # the system's counters are read around the delay, not at its ends: they hold time beyond it
+    waited, stolen, computed = (_ms(min(one, total_ns)) for one in (facts.run_delay_ns, facts.steal_ns, facts.cpu_ns))
+    return f"{why}: waiting for a processor {waited}, stolen from the machine {stolen}, computing at most {computed}"
 
 
 def _ms(nanoseconds: int) -> str:
     return f"{nanoseconds / NS_PER_MS:.2f} ms"
-
-
-def _clipped(spans: Iterable[Span], kind: str, begin: int, end: int) -> list[tuple[int, int]]:
-    cut = [(max(span.begin_ns, begin), min(span.end_ns, end)) for span in spans if span.kind == kind]
-    return [(first, last) for first, last in cut if last > first]
-
-
-def _length(pieces: Iterable[tuple[int, int]]) -> int:
-    return sum(last - first for first, last in pieces)
-
-
-def _covered(spans: Iterable[Span], begin: int, end: int) -> int:
-    """How much of the time from `begin` to `end` any of `spans` covers; what overlaps counts once."""
-    covered, reached = 0, begin
-    for span in sorted(spans, key=attrgetter("begin_ns")):
-        first, last = max(span.begin_ns, reached), min(span.end_ns, end)
-        if last > first:
-            covered += last - first
-            reached = last
-    return covered
 
 
 # ---- collecting ------------------------------------------------------------------------------------------------------
@@ -284,22 +255,16 @@ class Evidence:
         self._spans: deque[Span] = deque(maxlen=MAX_SPANS)
         self._stamped: deque[Stamped] = deque(maxlen=MAX_STAMPED)
         self._collecting_ns = self._cpu_mark_ns = 0
-        self._apart = False  # another thread than the one that reports waits and works
         self._counters = Counters(now_ns, [])
 
-    def watch(self, threads: Iterable[int | None] = (), loop: int | None = None) -> None:
-        """From here on watch collections and `threads`, by native id; a new link has a new reader.
-
-        `loop` is the thread that waits for bytes and decides, None: the calling one.
-        """
+    def watch(self, reader: int | None = None) -> None:
+        """From here on watch collections, the calling thread, and the link's reader by native id; a new link has a new one."""
         if self._virtual:
             return
         if self._on_gc not in gc.callbacks:
             gc.callbacks.append(self._on_gc)
         self._counters.close()
-        self._apart = loop is not None
-        own = threading.get_native_id() if loop is None else loop
-        self._counters = Counters(self._now, [own, *(thread for thread in threads if thread)])
+        self._counters = Counters(self._now, [threading.get_native_id(), *([reader] if reader else [])])
 
     def close(self) -> None:
         """End: leave the collector as it was found; idempotent."""
@@ -310,8 +275,7 @@ class Evidence:
     def worked(self, kind: str, begin_ns: int, end_ns: int) -> None:
         """Note that the loop was busy with `kind`."""
         if end_ns - begin_ns >= self.floor_ns:
-            known = not self._virtual and not self._apart
-            cpu_ns = time.thread_time_ns() - self._cpu_mark_ns if known else -1
+            cpu_ns = -1 if self._virtual else time.thread_time_ns() - self._cpu_mark_ns
             self._spans.append(Span(kind, begin_ns, end_ns, cpu_ns))
 
     def waited(self, begin_ns: int, asked_s: float, end_ns: int) -> None:
@@ -321,9 +285,9 @@ class Evidence:
         asked_ns = begin_ns + int(asked_s * NS_PER_S)
         last = self._spans[-1] if self._spans else None
         if last is not None and last.kind == IDLE and begin_ns - last.end_ns < self.floor_ns:
-            self._spans[-1] = Span(IDLE, last.begin_ns, min(end_ns, asked_ns))  # nothing of note was done in between
-        else:
-            self._spans.append(Span(IDLE, begin_ns, min(end_ns, asked_ns)))
+            self._spans.pop()  # nothing of note was done in between
+            begin_ns = last.begin_ns
+        self._spans.append(Span(IDLE, begin_ns, min(end_ns, asked_ns)))
         if end_ns - asked_ns >= OVERSLEPT_NS:
             self._spans.append(Span(OVERSLEPT, asked_ns, end_ns))
 
@@ -341,31 +305,27 @@ class Evidence:
 
     def read_if_stale(self, now_ns: int) -> None:
         """Read the counters here and now if nobody has done so for STALE_NS, as a loop that is never away makes it happen."""
-        if not self._virtual and now_ns - self._counters.heard_ns >= STALE_NS:
+        if not self.heard_since(now_ns - STALE_NS + 1):
             self._counters.read()
 
-    def facts(self, begin_ns: int, arrival_ns: int, end_ns: int, uncertainty_ns: int) -> Facts:
+    def facts(self, begin_ns: int, arrival_ns: int, end_ns: int) -> Facts:
         """Return what is known about the time from `begin_ns` to `end_ns`, both host times."""
         if not self.heard_since(end_ns):
             self._counters.read()
         first, last = self._counters.around(begin_ns, end_ns)
         cpu_ns = last.cpu_ns - first.cpu_ns
-        delays = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)]
-        own, *readers = delays or [0]
+        own, *readers = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)] or [0]
         spans, arrivals_ns = list(self._spans), list(self._arrivals)  # both in the order of their ends
         first_span = bisect_right(spans, begin_ns, key=attrgetter("end_ns"))
         return Facts(
             begin_ns,
             arrival_ns,
             end_ns,
-            uncertainty_ns,
             tuple(span for span in spans[first_span:] if span.begin_ns < end_ns),
             tuple(arrivals_ns[bisect_right(arrivals_ns, begin_ns) : bisect_left(arrivals_ns, end_ns)]),
             self._pause_ns,
             cpu_ns,
-            max(
-                [own, *(delay - cpu_ns for delay in readers)]
-            ),  # a reader that waits while the loop computes waits for it
+            max([own, *(delay - cpu_ns for delay in readers)]),  # a reader waits for the loop while that computes
             last.steal_ns - first.steal_ns,
             tuple(
                 one
@@ -405,14 +365,15 @@ class Counters:
         self._now = now_ns
         self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
         self._lock, self._stop = threading.Lock(), threading.Event()
-        tasks = [f"/proc/self/task/{thread}" for thread in threads]
-        paths = ["/proc/stat", *(f"{task}/schedstat" for task in tasks)] if tasks else []
-        self._files = [_open(path) for path in paths]
-        self._tick_ns = NS_PER_S // (os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100)
-        self._known = len(self._files) > 1 and self._files[1] is not None
+        self._files: list[int] = []
+        with suppress(OSError):  # in the order of `_sample`
+            for path in (
+                ("/proc/stat", *(f"/proc/self/task/{thread}/schedstat" for thread in threads)) if threads else ()
+            ):
+                self._files.append(os.open(path, os.O_RDONLY))
         self.read()
-        self._thread = threading.Thread(target=self._watch, name="pans-counters", daemon=True) if self._known else None
-        if self._thread is not None:
+        self._thread = threading.Thread(target=self._watch, name="pans-counters", daemon=True)
+        if len(self._files) > 1:
             self._thread.start()
 
     def read(self) -> None:
@@ -421,72 +382,49 @@ class Counters:
             return
         try:
             began_ns = self._now()
-            files = [_read(file) for file in self._files]
-            self._samples.append(self._sample(began_ns, self._now(), files))
+            numbers = [_numbers(file) for file in self._files]
+            if len(numbers) > 1:
+                (*_, steal), *tasks = [numbers[0][:8], *(one[:2] for one in numbers[1:])]
+                cpu_ns, delays_ns = tasks[0][0], tuple(task[1] for task in tasks)
+                steal_ns = steal * (NS_PER_S // os.sysconf("SC_CLK_TCK"))
+                sample = Sample(began_ns, self._now(), cpu_ns, delays_ns, steal_ns)
+            else:
+                sample = Sample(began_ns, self._now(), time.thread_time_ns(), (), 0)
+            self._samples.append(sample)
             self.heard_ns = began_ns
         finally:
             self._lock.release()
 
-    def _sample(self, began_ns: int, ended_ns: int, files: Sequence[bytes]) -> Sample:
-        if not self._known:
-            return Sample(began_ns, ended_ns, time.thread_time_ns(), (), 0)
-        stat, *threads = files
-        return Sample(
-            began_ns,
-            ended_ns,
-            _number(threads[0], 0),
-            tuple(_number(text, 1) for text in threads),
-            _number(stat.partition(b"\n")[0], 8) * self._tick_ns,
-        )
-
     def around(self, begin_ns: int, end_ns: int) -> tuple[Sample, Sample]:
         """Return the latest sample that was whole at `begin_ns` and the first one begun at `end_ns`; as near as there are."""
         samples = list(self._samples)
-        if not samples:
-            return Sample(0, 0, 0, (), 0), Sample(0, 0, 0, (), 0)
         before = next((one for one in reversed(samples) if one.ended_ns <= begin_ns), samples[0])
         return before, next((one for one in samples if one.began_ns >= end_ns), samples[-1])
 
     def close(self) -> None:
         """End the thread and close the files; idempotent."""
         self._stop.set()
-        if self._thread is not None and self._thread.is_alive():
+        if self._thread.is_alive():
             self._thread.join(JOIN_S)
         with self._lock:
-            for file in self._files:
-                if file is not None:
-                    os.close(file)
-            self._files = []
+            while self._files:
+                os.close(self._files.pop())
 
     def _watch(self) -> None:
-        if hasattr(os, "sched_setscheduler") and (priority := os.sched_getparam(0).sched_priority) > 1:
+        if (priority := os.sched_getparam(0).sched_priority) > 1:
             with suppress(OSError):  # a reading in time is worth little against a run
                 os.sched_setscheduler(0, os.sched_getscheduler(0), os.sched_param(priority - 1))
         while not self._stop.wait(READ_EVERY_S):
             self.read()
 
 
-def _open(path: str) -> int | None:
+def _numbers(file: int) -> list[int]:
+    """The first eight numbers of a file's first line, which the kernel makes afresh for each read from its start; else zeros."""
     try:
-        return os.open(path, os.O_RDONLY)
-    except OSError:
-        return None
-
-
-def _read(file: int | None) -> bytes:
-    """Return a file's first bytes, which the kernel makes afresh for each read from its start."""
-    try:
-        return b"" if file is None else os.pread(file, READ_BYTES, 0)
-    except OSError:
-        return b""
-
-
-def _number(text: bytes, index: int) -> int:
-    """Field `index` of a text, 0 where there is none."""
-    try:
-        return int(text.split(None, index + 1)[index])
-    except (ValueError, IndexError):
-        return 0
+        line = os.pread(file, READ_BYTES, 0).partition(b"\n")[0]
+    except OSError:  # the thread has ended
+        line = b""
+    return [*(int(word) for word in line.split() if word.isdigit()), *[0] * 8][:8]
 
 
 # ---- incidents -------------------------------------------------------------------------------------------------------
@@ -499,7 +437,6 @@ class LateWork(NamedTuple):
     begin_ns: int
     arrival_ns: int
     end_ns: int
-    uncertainty_ns: int
 
 
 class Attribution(NamedTuple):
@@ -509,8 +446,10 @@ class Attribution(NamedTuple):
     verdict: Verdict
 
     def event(self) -> dict[str, Any]:
-        """Return it as an event for the recording."""
-        return {"kind": "blame", **self.what, **self.verdict.facts()}
+        """Return it as an event for the recording; shares in whole microseconds, those below one left out."""
+        cause, _, sure, why, shares_ns = self.verdict
+        shares = {name: share // 1000 for name, share in shares_ns.items() if share >= 1000}
+        return {"kind": "blame", **self.what, "cause": cause, "sure": sure, "why": why, "shares_us": shares}
 
 
 @dataclass(slots=True)
@@ -526,8 +465,8 @@ class Incidents:
     """Late decisions in a row are one incident with one cause, judged from its worst decision once it is quiet again."""
 
     evidence: Evidence
-    causes: dict[str, int] = field(default_factory=dict)  # late decisions by cause
-    missing: dict[str, int] = field(default_factory=dict)  # lost exposures by cause
+    causes: Counter[str] = field(default_factory=Counter)  # late decisions by cause
+    missing: Counter[str] = field(default_factory=Counter)  # lost exposures by cause
     _waiting: deque[_Incident] = field(default_factory=deque)  # for their verdicts, the oldest first
     _known: tuple[_Incident, Facts] | None = None  # to be judged next
 
@@ -566,23 +505,22 @@ class Incidents:
     def _judged(self, incident: _Incident, facts: Facts) -> Attribution:
         self._known = None
         verdict = judge(facts)
-        self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + incident.decisions
-        worst = incident.worst
+        self.causes[verdict.cause] += incident.decisions
         what = {
             "what": "late",
             "first_decision": incident.first.number,
             "last_decision": incident.last.number,
             "decisions": incident.decisions,
-            "worst_us": (worst.end_ns - worst.begin_ns) / 1000,
-            "begin_ns": worst.begin_ns,
-            "end_ns": worst.end_ns,
+            "worst_us": (facts.end_ns - facts.begin_ns) / 1000,
+            "begin_ns": facts.begin_ns,
+            "end_ns": facts.end_ns,
         }
         return Attribution(what, verdict)
 
     def lost(self, gap: Gap, since_ns: int, now_ns: int, damaged_frames: int) -> Attribution:
         """Return the cause of exposures that never came; `since_ns` is when the latest block before came."""
-        verdict = judge_gap(gap, self.evidence.facts(since_ns, now_ns, now_ns, 0), damaged_frames)
-        self.missing[verdict.cause] = self.missing.get(verdict.cause, 0) + gap.exposures
+        verdict = judge_gap(gap, self.evidence.facts(since_ns, now_ns, now_ns), damaged_frames)
+        self.missing[verdict.cause] += gap.exposures
         what = {"what": "missing", "first_exposure": gap.first_exposure, "exposures": gap.exposures}
         return Attribution(what, verdict)
 
@@ -590,11 +528,11 @@ class Incidents:
 def longest_pause_ns(plan: Plan) -> int:
     """Return the longest time between the ends of two blocks that follow each other, when everything is on time."""
     offsets = plan.slot_offset_ticks.astype(np.int64)
+    breaks = np.append(np.diff(offsets) != plan.slot_period_ticks, True)  # a block ends there at the latest
     ends, length = [], 0
-    for slot, offset in enumerate(offsets.tolist()):
+    for offset, is_end in zip(offsets.tolist(), breaks.tolist()):
         length += 1
-        last = slot + 1 == len(offsets)
-        if last or length == plan.block_exposures or int(offsets[slot + 1]) - offset != plan.slot_period_ticks:
+        if is_end or length == plan.block_exposures:
             ends.append(offset)
             length = 0
     pauses = np.diff([*ends, ends[0] + plan.cycle_ticks])
