@@ -16,14 +16,10 @@ from pans.runtime.wire.commands import (
     Show,
     StateChunk,
     announced,
-    pack_arm,
-    pack_masks,
-    pack_plan,
-    pack_show,
-    pack_states,
+    pack_command,
+    state_dtype,
 )
 from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, ClickBlock, DeviceState, Opcode
-from pans.runtime.wire.schema import STATE_DTYPE
 
 from .bench import Bench
 from .rules import NotTried, need, rule
@@ -51,10 +47,10 @@ def following(bench: Bench) -> Extension:
 
 def four_states(steps: int) -> StateChunk:
     """State 0 leads to 1 or 2, 1 to 3 or a leaf, 2 and 3 to leaves: walks of two or three exposures."""
-    rows = np.zeros(4, STATE_DTYPE)
+    rows = np.zeros(4, state_dtype(2))
     rows["pattern"], rows["dwell"] = (0, 1, 1, 0), steps
-    rows["next_dark"], rows["next_click"] = (1, 3, 5, 6), (2, 4, 6, 7)
-    return StateChunk(4, 0, steps, 4, rows)
+    rows["next"] = (1, 2), (3, 4), (5, 6), (6, 7)
+    return StateChunk(4, 0, steps, 2, 4, rows)
 
 
 @rule("11.1", "A device without automata refuses their opcodes with 1 and an adaptive slot with 3.")
@@ -65,7 +61,7 @@ def older_device(bench: Bench) -> None:
         bench.refused(AckStatus.UNKNOWN_OPCODE, opcode, bytes(16), opcode.name)
     chunk = bench.layout().chunk()
     chunk.slots["pattern"][-1] = 0xFFFE
-    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(chunk), "a slot with the pattern 0xFFFE")
+    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(chunk), "a slot with the pattern 0xFFFE")
 
 
 @rule(
@@ -77,7 +73,7 @@ def masks(bench: Bench) -> None:
     pixels = min(9, bench.facts["pattern_pixels"])
     rows = np.zeros((2, -(-pixels // 8)), np.uint8)
     good = MaskChunk(0, 0, pixels, pixels, rows)
-    body = pack_masks(good)
+    body = pack_command(good)
     bench.done(Opcode.LOAD_MASKS, body)
     for wrong, what in (
         (body + b"\0", "a byte too many"),
@@ -85,12 +81,12 @@ def masks(bench: Bench) -> None:
         (body[:16], "no masks' bytes"),
     ):
         bench.refused(MALFORMED, Opcode.LOAD_MASKS, wrong, f"LOAD_MASKS with {what}")
-    none = pack_masks(good._replace(rows=rows[:0]))
+    none = pack_command(good._replace(rows=rows[:0]))
     bench.refused(MALFORMED, Opcode.LOAD_MASKS, none, "LOAD_MASKS of no masks")
     if pixels > 8:
-        piece = pack_masks(good._replace(n_pixels=pixels + 8))
+        piece = pack_command(good._replace(n_pixels=pixels + 8))
         bench.refused(MALFORMED, Opcode.LOAD_MASKS, piece, "LOAD_MASKS with pieces of two patterns")
-    beyond = pack_masks(good._replace(first_pattern=bench.facts["pattern_memory"] - 1))
+    beyond = pack_command(good._replace(first_pattern=bench.facts["pattern_memory"] - 1))
     bench.refused(RANGE, Opcode.LOAD_MASKS, beyond, "LOAD_MASKS beyond the memory")
 
 
@@ -101,10 +97,10 @@ def masks(bench: Bench) -> None:
 def states_need_a_plan(bench: Bench) -> None:
     steps = following(bench).dwell_steps
     bench.upload(bench.layout())
-    bench.refused(STATE, Opcode.LOAD_STATES, pack_states(four_states(steps)), "LOAD_STATES with fixed patterns")
+    bench.refused(STATE, Opcode.LOAD_STATES, pack_command(four_states(steps)), "LOAD_STATES with fixed patterns")
     mixed = bench.layout(adaptive=SLOTS).chunk()
     mixed.slots["pattern"][-1] = mixed.slots["shot"][-1] = 0
-    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(mixed), "adaptive slots beside a fixed pattern")
+    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(mixed), "adaptive slots beside a fixed pattern")
 
 
 @rule(
@@ -118,23 +114,23 @@ def state_ranges(bench: Bench) -> None:
 
     def refuse(what: str, status: int = RANGE, **fields: Any) -> None:
         rows = good.states.copy()
-        for name in ("pattern", "dwell", "next_dark", "next_click"):
+        for name in ("pattern", "dwell", "next"):
             if name in fields:
                 rows[name][1] = fields.pop(name)
-        bench.refused(status, Opcode.LOAD_STATES, pack_states(good._replace(states=rows, **fields)), what)
+        bench.refused(status, Opcode.LOAD_STATES, pack_command(good._replace(states=rows, **fields)), what)
 
     refuse("a pattern that the plan does not have", pattern=2)
     refuse("a dwell of 0", dwell=0)
     if found.dwell_steps < 0xFFFF:
         refuse("a dwell above the steps", dwell=found.dwell_steps + 1)
-    refuse("a successor that is its own state", next_dark=1)
-    refuse("a successor below its state", next_click=0)
-    refuse("a successor that is no node", next_click=8)
+    refuse("a successor that is its own state", next=(1, 4))
+    refuse("a successor below its state", next=(3, 0))
+    refuse("a successor that is no node", next=(3, 8))
     refuse("no leaves", n_leaves=0)
     refuse("states that continue nothing", n_states=8, first_state=4)
-    bench.refused(MALFORMED, Opcode.LOAD_STATES, pack_states(good)[:-3], "a part of a state")
+    bench.refused(MALFORMED, Opcode.LOAD_STATES, pack_command(good)[:-3], "a part of a state")
     bench.upload(bench.layout(adaptive=2))
-    bench.refused(RANGE, Opcode.LOAD_STATES, pack_states(good), "walks of three exposures in two adaptive slots")
+    bench.refused(RANGE, Opcode.LOAD_STATES, pack_command(good), "walks of three exposures in two adaptive slots")
 
 
 @rule("11.5", "ARM while some but not all states have come is refused with 4.")
@@ -142,9 +138,9 @@ def half_an_automaton(bench: Bench) -> None:
     steps = following(bench).dwell_steps
     bench.upload(bench.layout(adaptive=SLOTS))
     good = four_states(steps)
-    bench.done(Opcode.LOAD_STATES, pack_states(good._replace(states=good.states[:2])))
+    bench.done(Opcode.LOAD_STATES, pack_command(good._replace(states=good.states[:2])))
     start = bench.ping().tx_tick + bench.facts["tick_hz"]
-    bench.refused(STATE, Opcode.ARM, pack_arm(Arm(start, 1, 1000)), "ARM with two of four states")
+    bench.refused(STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM with two of four states")
 
 
 @rule(
@@ -155,7 +151,7 @@ def follows(bench: Bench) -> None:
     steps = following(bench).dwell_steps
     layout, automaton = bench.layout(adaptive=SLOTS), four_states(steps)
     bench.upload(layout)
-    bench.done(Opcode.LOAD_STATES, pack_states(automaton))
+    bench.done(Opcode.LOAD_STATES, pack_command(automaton))
     bench.grant()
     bench.arm(CYCLES)
     bench.closing(layout, CYCLES)
@@ -171,8 +167,7 @@ def follows(bench: Bench) -> None:
                 f"exposure {block.exposure_index + place} is stamped {stamp}, the walk stands in {wanted}",
             )
             if lit:
-                row = automaton.states[node]
-                node = int(row["next_click"] if click else row["next_dark"])
+                node = int(automaton.states["next"][node, click])
             seen += 1
     need(seen == CYCLES * layout.n_slots, f"{seen} exposures, the run has {CYCLES * layout.n_slots}")
 
@@ -186,8 +181,8 @@ def named(bench: Bench) -> None:
     bench.arm(CYCLES, ahead_s=0.5)
     wanted = {0: 5, 2: 9, layout.n_slots: 65532, layout.n_slots + 1: 3}
     for exposure, state in wanted.items():
-        bench.done(Opcode.SHOW, pack_show(Show(exposure, 1, 0, steps, steps)))
-        bench.done(Opcode.SHOW, pack_show(Show(exposure, state, 1, 1, steps)))  # takes the place of the first
+        bench.done(Opcode.SHOW, pack_command(Show(exposure, 1, 0, steps, steps)))
+        bench.done(Opcode.SHOW, pack_command(Show(exposure, state, 1, 1, steps)))  # takes the place of the first
     bench.closing(layout, CYCLES)
     for block in (one for one in bench.stream() if isinstance(one, ClickBlock)):
         stamp = wanted.get(block.exposure_index, DARK_PATTERN)
@@ -205,7 +200,7 @@ def show_refusals(bench: Bench) -> None:
     steps = extension(bench).dwell_steps
     layout = bench.layout(adaptive=SLOTS, block_exposures=1)
     bench.upload(layout)
-    bench.refused(STATE, Opcode.SHOW, pack_show(Show(0, 0, 0, 1, steps)), "SHOW in IDLE")
+    bench.refused(STATE, Opcode.SHOW, pack_command(Show(0, 0, 0, 1, steps)), "SHOW in IDLE")
     bench.grant()
     bench.arm(0)
     far = 1000 * layout.n_slots
@@ -215,10 +210,10 @@ def show_refusals(bench: Bench) -> None:
         (RANGE, Show(far, 0, 0, 0, steps), "SHOW with a dwell of 0"),
         (RANGE, Show(far, 65533, 0, 1, steps), "SHOW of state 65533"),
     ):
-        bench.refused(status, Opcode.SHOW, pack_show(show), what)
+        bench.refused(status, Opcode.SHOW, pack_command(show), what)
     bench.until_state(DeviceState.RUNNING)
     bench.listen(2 * layout.cycle_ticks / layout.tick_hz)
-    bench.refused(LATE, Opcode.SHOW, pack_show(Show(0, 0, 0, 1, steps)), "SHOW of an exposure that has begun")
+    bench.refused(LATE, Opcode.SHOW, pack_command(Show(0, 0, 0, 1, steps)), "SHOW of an exposure that has begun")
     bench.done(Opcode.STOP)
 
 
@@ -230,5 +225,5 @@ def many_names(bench: Bench) -> None:
     bench.arm(0, ahead_s=20.0, lease_ms=20_000)
     ahead = [cycle * layout.n_slots + slot for cycle in range(22) for slot in range(SLOTS)][:64]
     for exposure in ahead:
-        bench.done(Opcode.SHOW, pack_show(Show(exposure, 0, 0, 1, steps)))
+        bench.done(Opcode.SHOW, pack_command(Show(exposure, 0, 0, 1, steps)))
     bench.done(Opcode.STOP)

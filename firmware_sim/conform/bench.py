@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, announced_channels, announced_counts, pack_arm
-from pans.runtime.wire.messages import DeviceState, Frame, MalformedMessage, MessageType, Opcode, decode_counts
+from pans.runtime.wire.commands import Arm, announced_channels, announced_counts, pack_command
+from pans.runtime.wire.messages import DeviceState, Frame, MalformedMessage, MessageType, Opcode
 from pans.runtime.wire.session import STREAM_TYPES
 
 from .plans import Layout, layout_for
@@ -34,16 +34,7 @@ def _decode_pong(payload: bytes) -> wire.Pong:
     return wire.Pong(*wire.STRUCTS["PONG"].unpack(payload))
 
 
-DECODE: Mapping[int, Callable[[bytes], Any]] = {
-    MessageType.WELCOME: wire.decode_welcome,
-    MessageType.PONG: _decode_pong,
-    MessageType.ACK: wire.decode_ack,
-    MessageType.STATUS: wire.decode_status,
-    MessageType.CLICKS: wire.decode_clicks,
-    MessageType.FRAMES: wire.decode_frames,
-    MessageType.MARK: wire.decode_mark,
-    MessageType.COUNTS: decode_counts,
-}
+DECODE: Mapping[int, Callable[[bytes], Any]] = {**wire.DECODERS, MessageType.PONG: _decode_pong}
 
 
 class Piece(NamedTuple):
@@ -238,7 +229,7 @@ class Bench:
     def arm(self, cycles: int, *, lease_ms: int = LEASE_MS, ahead_s: float = 0.2) -> int:
         """Arm for a start so far ahead; return the start tick."""
         start = int(self.ping().tx_tick) + round(ahead_s * self.facts["tick_hz"])
-        self.done(Opcode.ARM, pack_arm(Arm(start, cycles, lease_ms)))
+        self.done(Opcode.ARM, pack_command(Arm(start, cycles, lease_ms)))
         return start
 
     def until_state(self, state: DeviceState, within_s: float = PATIENCE_S) -> Any:

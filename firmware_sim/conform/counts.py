@@ -11,15 +11,12 @@ import numpy as np
 
 from pans.runtime.wire.commands import (
     Arm,
-    CountStateChunk,
+    ReadCounts,
+    StateChunk,
     announced,
     announced_channels,
     announced_counts,
-    pack_arm,
-    pack_count_states,
-    pack_plan,
-    pack_read_counts,
-    pack_states,
+    pack_command,
     state_dtype,
 )
 from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, ClickBlock, Opcode
@@ -42,14 +39,14 @@ def counting(bench: Bench) -> int:
     return largest
 
 
-def four_counted(steps: int, largest: int) -> CountStateChunk:
+def four_counted(steps: int, largest: int) -> StateChunk:
     """State 0 leads to 1, 2 or 3, all of them to leaves: walks of two exposures."""
     rows = np.zeros(4, state_dtype(largest + 1))
     rows["pattern"], rows["dwell"] = (0, 1, 0, 1), steps
     numbers = np.arange(largest + 1)
     rows["next"][0] = 1 + np.minimum(numbers, 2)
     rows["next"][1:] = 4 + (np.arange(3)[:, None] + numbers) % LEAVES
-    return CountStateChunk(4, 0, steps, largest + 1, LEAVES, rows)
+    return StateChunk(4, 0, steps, largest + 1, LEAVES, rows)
 
 
 def clicks_of(bench: Bench) -> list[ClickBlock]:
@@ -88,15 +85,15 @@ def says_what_it_knows(bench: Bench) -> None:
 )
 def reading(bench: Bench) -> None:
     largest = counting(bench)
-    bench.refused(STATE, Opcode.READ_COUNTS, pack_read_counts(2), "READ_COUNTS without a plan")
+    bench.refused(STATE, Opcode.READ_COUNTS, pack_command(ReadCounts(2)), "READ_COUNTS without a plan")
     bench.upload(bench.layout())
     for wrong in (0, 1, largest + 1, 0xFFFF):
-        bench.refused(RANGE, Opcode.READ_COUNTS, pack_read_counts(wrong), f"READ_COUNTS of {wrong}")
+        bench.refused(RANGE, Opcode.READ_COUNTS, pack_command(ReadCounts(wrong)), f"READ_COUNTS of {wrong}")
     for body, what in ((b"", "no body"), (bytes(3), "three bytes"), (bytes(5), "five bytes")):
         bench.refused(MALFORMED, Opcode.READ_COUNTS, body, f"READ_COUNTS with {what}")
-    bench.done(Opcode.READ_COUNTS, pack_read_counts(largest))
+    bench.done(Opcode.READ_COUNTS, pack_command(ReadCounts(largest)))
     bench.arm(0, ahead_s=5.0)
-    bench.refused(STATE, Opcode.READ_COUNTS, pack_read_counts(2), "READ_COUNTS in ARMED")
+    bench.refused(STATE, Opcode.READ_COUNTS, pack_command(ReadCounts(2)), "READ_COUNTS in ARMED")
     bench.done(Opcode.STOP)
 
 
@@ -108,7 +105,7 @@ def blocks_of_numbers(bench: Bench) -> None:
     layout = bench.layout()
     for largest in sorted({2, most}):
         bench.upload(layout)
-        bench.done(Opcode.READ_COUNTS, pack_read_counts(largest))
+        bench.done(Opcode.READ_COUNTS, pack_command(ReadCounts(largest)))
         bench.grant()
         bench.arm(CYCLES)
         bench.closing(layout, CYCLES)
@@ -131,14 +128,14 @@ def count_state_ranges(bench: Bench) -> None:
     largest, found = min(counting(bench), 3), following(bench)
     bench.upload(bench.layout(adaptive=SLOTS))
     good = four_counted(found.dwell_steps, largest)
-    body = pack_count_states(good)
+    body = pack_command(good)
     bench.refused(STATE, Opcode.LOAD_COUNT_STATES, body, "LOAD_COUNT_STATES before READ_COUNTS")
-    bench.done(Opcode.READ_COUNTS, pack_read_counts(largest))
+    bench.done(Opcode.READ_COUNTS, pack_command(ReadCounts(largest)))
     bench.refused(
-        STATE, Opcode.LOAD_STATES, pack_states(four_states(found.dwell_steps)), "LOAD_STATES after READ_COUNTS"
+        STATE, Opcode.LOAD_STATES, pack_command(four_states(found.dwell_steps)), "LOAD_STATES after READ_COUNTS"
     )
     other = four_counted(found.dwell_steps, largest + 1)
-    bench.refused(STATE, Opcode.LOAD_COUNT_STATES, pack_count_states(other), "LOAD_COUNT_STATES of other outcomes")
+    bench.refused(STATE, Opcode.LOAD_COUNT_STATES, pack_command(other), "LOAD_COUNT_STATES of other outcomes")
     bench.refused(MALFORMED, Opcode.LOAD_COUNT_STATES, body[:-3], "a part of a state")
 
     def refuse(what: str, successor: int | None = None, **fields: Any) -> None:
@@ -148,7 +145,7 @@ def count_state_ranges(bench: Bench) -> None:
                 rows[name][1] = fields.pop(name)
         if successor is not None:
             rows["next"][1, largest] = successor
-        bench.refused(RANGE, Opcode.LOAD_COUNT_STATES, pack_count_states(good._replace(states=rows, **fields)), what)
+        bench.refused(RANGE, Opcode.LOAD_COUNT_STATES, pack_command(good._replace(states=rows, **fields)), what)
 
     refuse("a pattern that the plan does not have", pattern=2)
     refuse("a dwell of 0", dwell=0)
@@ -156,10 +153,10 @@ def count_state_ranges(bench: Bench) -> None:
     refuse("a successor that is no node", successor=4 + LEAVES)
     refuse("no leaves", n_leaves=0)
     refuse("states that continue nothing", n_states=8, first_state=4)
-    bench.done(Opcode.LOAD_COUNT_STATES, pack_count_states(good._replace(states=good.states[:2])))
+    bench.done(Opcode.LOAD_COUNT_STATES, pack_command(good._replace(states=good.states[:2])))
     start = bench.ping().tx_tick + bench.facts["tick_hz"]
-    bench.refused(STATE, Opcode.ARM, pack_arm(Arm(start, 1, 1000)), "ARM with two of four states")
-    bench.done(Opcode.LOAD_PLAN, pack_plan(bench.layout(adaptive=SLOTS).chunk()))
+    bench.refused(STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM with two of four states")
+    bench.done(Opcode.LOAD_PLAN, pack_command(bench.layout(adaptive=SLOTS).chunk()))
     bench.refused(STATE, Opcode.LOAD_COUNT_STATES, body, "LOAD_COUNT_STATES after another LOAD_PLAN")
 
 
@@ -171,15 +168,15 @@ def follows_numbers(bench: Bench) -> None:
     largest, found = min(counting(bench), 3), following(bench)
     layout, automaton = bench.layout(adaptive=SLOTS), four_counted(found.dwell_steps, largest)
     bench.upload(layout)
-    bench.done(Opcode.READ_COUNTS, pack_read_counts(largest))
-    bench.done(Opcode.LOAD_COUNT_STATES, pack_count_states(automaton))
+    bench.done(Opcode.READ_COUNTS, pack_command(ReadCounts(largest)))
+    bench.done(Opcode.LOAD_COUNT_STATES, pack_command(automaton))
     bench.grant()
     bench.arm(CYCLES)
     bench.closing(layout, CYCLES)
     follow(bench, layout, automaton)
 
 
-def follow(bench: Bench, layout: Layout, automaton: CountStateChunk) -> None:
+def follow(bench: Bench, layout: Layout, automaton: StateChunk) -> None:
     """Hold the stamps of a run of `CYCLES` against its numbers and the states."""
     node, seen, largest = 0, 0, automaton.outcomes - 1
     for block in clicks_of(bench):
@@ -217,7 +214,7 @@ def one_at_a_time(bench: Bench) -> None:
         raise NotTried("the device announces several detectors at once")
     bench.upload(bench.layout())
     status = RANGE if announced_counts(bench.facts) > 1 else AckStatus.UNKNOWN_OPCODE
-    bench.refused(status, Opcode.READ_COUNTS, pack_read_counts(3, 2), "READ_COUNTS of two detectors")
+    bench.refused(status, Opcode.READ_COUNTS, pack_command(ReadCounts(3, 2)), "READ_COUNTS of two detectors")
 
 
 @rule(
@@ -243,12 +240,12 @@ def says_how_many(bench: Bench) -> None:
 def reading_several(bench: Bench) -> None:
     channels = at_once(bench)
     bench.upload(bench.layout())
-    bench.refused(STATE, Opcode.READ_COUNTS, pack_read_counts(3, 2), "two detectors and fixed patterns")
+    bench.refused(STATE, Opcode.READ_COUNTS, pack_command(ReadCounts(3, 2)), "two detectors and fixed patterns")
     bench.upload(bench.layout(adaptive=SLOTS))
     for largest, several in ((2, 2), (7, 2), (1, 1), (3, channels + 1), ((2 << channels) - 1, channels + 1)):
         what = f"READ_COUNTS of {several} detectors up to {largest}"
-        bench.refused(RANGE, Opcode.READ_COUNTS, pack_read_counts(largest, several), what)
-    bench.done(Opcode.READ_COUNTS, pack_read_counts(3, 2))
+        bench.refused(RANGE, Opcode.READ_COUNTS, pack_command(ReadCounts(largest, several)), what)
+    bench.done(Opcode.READ_COUNTS, pack_command(ReadCounts(3, 2)))
 
 
 @rule(
@@ -261,10 +258,10 @@ def follows_words(bench: Bench) -> None:
     found, layout = following(bench), bench.layout(adaptive=SLOTS)
     automaton = four_counted(found.dwell_steps, 3)
     bench.upload(layout)
-    bench.done(Opcode.READ_COUNTS, pack_read_counts(3, 2))
-    bench.refused(RANGE, Opcode.LOAD_COUNT_STATES, pack_count_states(automaton), "a second pattern that is not there")
+    bench.done(Opcode.READ_COUNTS, pack_command(ReadCounts(3, 2)))
+    bench.refused(RANGE, Opcode.LOAD_COUNT_STATES, pack_command(automaton), "a second pattern that is not there")
     automaton.states["pattern"] = 0
-    bench.done(Opcode.LOAD_COUNT_STATES, pack_count_states(automaton))
+    bench.done(Opcode.LOAD_COUNT_STATES, pack_command(automaton))
     bench.grant()
     bench.arm(CYCLES)
     bench.closing(layout, CYCLES)

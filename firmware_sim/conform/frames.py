@@ -8,6 +8,7 @@ import zlib
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import cobs_encode, encode_frame
 from pans.runtime.wire.messages import MessageType
+from pans.runtime.wire.schema import HEADER
 
 from .bench import QUIET_S, Bench
 from .rules import need, rule
@@ -32,7 +33,7 @@ def golden_hello(bench: Bench) -> None:
 @rule("1.2", "Every frame but HELLO and WELCOME has a CRC that starts from the schema hash.")
 def seeded_crc(bench: Bench) -> None:
     bench.ping()
-    body = wire.HEADER.pack(MessageType.PING, 0, 0, bench.session) + b"\1" * 12
+    body = HEADER.pack(MessageType.PING, 0, bench.session) + b"\1" * 12
     bench.send(_framed(body, start=0))
     bench.silent(MessageType.PONG, "to a PING whose CRC starts from 0")
 
@@ -101,7 +102,8 @@ def last_group(bench: Bench) -> None:
 
 @rule("1.10", "Flags and reserved fields are ignored.")
 def flags(bench: Bench) -> None:
-    body = wire.HEADER.pack(MessageType.PING, 0xFF, 0xFFFF, bench.session) + bytes([77, 0, 0, 0]) + b"\2" * 8
+    head = bytes((MessageType.PING, 0xFF, 0xFF, 0xFF)) + bench.session.to_bytes(4, "little")
+    body = head + bytes([77, 0, 0, 0]) + b"\2" * 8
     bench.send(_framed(body, wire.SCHEMA))
     bench.wait(MessageType.PONG, lambda pong: pong.probe_id == 77, what="to a PING with flags")
 
@@ -132,8 +134,8 @@ def _framed(body: bytes, start: int) -> bytes:
 
 def _ends_in_a_full_group(session: int, number: int) -> bytes:
     """A command of an unknown opcode whose last 254 bytes, CRC included, hold no zero."""
-    head = wire.HEADER.pack(MessageType.COMMAND, 0, 0, session)
-    head += wire.STRUCTS["COMMAND"].pack(number, UNKNOWN_OPCODE, 0, 0)
+    head = HEADER.pack(MessageType.COMMAND, 0, session)
+    head += wire.STRUCTS["COMMAND"].pack(number, UNKNOWN_OPCODE)
     for filler in range(1, 256):
         body = head + bytes([filler]) * 250
         crc = zlib.crc32(body, wire.SCHEMA).to_bytes(4, "little")

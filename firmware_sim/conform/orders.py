@@ -12,10 +12,7 @@ from pans.runtime.wire.commands import (
     Arm,
     Gate,
     PatternChunk,
-    pack_arm,
-    pack_gate,
-    pack_pattern,
-    pack_plan,
+    pack_command,
 )
 from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode, encode_command
 
@@ -80,7 +77,7 @@ def unknown_opcode(bench: Bench) -> None:
 @rule("4.6", "A body that cannot be meant is refused with 2.")
 def malformed(bench: Bench) -> None:
     layout = bench.layout()
-    plan = pack_plan(layout.chunk())
+    plan = pack_command(layout.chunk())
     head = struct.pack("<HHII", 0, 0, 0, 4)
     for opcode, body, what in (
         (Opcode.STOP, b"x", "STOP with a body"),
@@ -134,27 +131,27 @@ def plan_ranges(bench: Bench) -> None:
     if bench.facts["slot_memory"] < 0xFFFFFFFF:
         wrong.append({"n_slots": bench.facts["slot_memory"] + 1})
     for fields in wrong:
-        bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(good._replace(**fields)), f"LOAD_PLAN with {fields}")
+        bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(good._replace(**fields)), f"LOAD_PLAN with {fields}")
     # All slots moved until the last one begins at the end of the cycle: their spacing is still right.
     moved = good.slots.copy()
     moved["offset_ticks"] += np.uint64(good.cycle_ticks) - moved["offset_ticks"][-1]
-    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(good._replace(slots=moved)), "a slot at the end of the cycle")
+    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(good._replace(slots=moved)), "a slot at the end of the cycle")
     for field, value in (("offset_ticks", good.cycle_ticks), ("pattern", good.n_patterns)):
         slots = good.slots.copy()
         slots[field][-1] = value
-        bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(good._replace(slots=slots)), f"a slot with {field} {value}")
+        bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(good._replace(slots=slots)), f"a slot with {field} {value}")
 
 
 @rule("4.9", "ARM without a complete plan, or with a pattern of it missing or incomplete, is refused with 4.")
 def arm_without_plan(bench: Bench) -> None:
     bench.open()
-    body = pack_arm(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
+    body = pack_command(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
     bench.refused(STATE, Opcode.ARM, body, "ARM in a new session")
     layout = bench.layout()
     bench.upload(layout)
     slots = layout.chunk()
-    bench.done(Opcode.LOAD_PLAN, pack_plan(slots._replace(slots=slots.slots[:1])))
-    body = pack_arm(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
+    bench.done(Opcode.LOAD_PLAN, pack_command(slots._replace(slots=slots.slots[:1])))
+    body = pack_command(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
     bench.refused(STATE, Opcode.ARM, body, "ARM after the first of several pieces of a plan")
     for number in range(layout.n_patterns):
         for kept in sorted({0, min(layout.pixels // 2, MAX_PIXELS_PER_CHUNK)}):
@@ -164,8 +161,8 @@ def arm_without_plan(bench: Bench) -> None:
                     bench.done(opcode, part)
             if kept:
                 levels = np.zeros(kept, np.uint16)
-                bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(number, 0, layout.pixels, levels)))
-            body = pack_arm(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
+                bench.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(number, 0, layout.pixels, levels)))
+            body = pack_command(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
             bench.refused(STATE, Opcode.ARM, body, f"ARM with {kept} of {layout.pixels} pixels of pattern {number}")
 
 
@@ -184,7 +181,7 @@ def arm_ranges(bench: Bench) -> None:
         (RANGE, Arm(now + 3601 * hz, 1, 1000), "ARM for more than an hour ahead"),
         (RANGE, Arm(now + hz, 1 << 62, 1000), "ARM for 2^62 cycles"),
     ):
-        bench.refused(status, Opcode.ARM, pack_arm(arm), what)
+        bench.refused(status, Opcode.ARM, pack_command(arm), what)
     bench.inbox.clear()
     status = bench.until_state(DeviceState.IDLE)
     need(status.state == DeviceState.IDLE, "a refused ARM changed the state")
@@ -195,7 +192,7 @@ def uploads_need_idle(bench: Bench) -> None:
     layout = bench.layout()
     bench.upload(layout)
     start = bench.arm(0, ahead_s=20.0, lease_ms=20_000)
-    for opcode, body in (*layout.commands(), (Opcode.ARM, pack_arm(Arm(start + 1, 1, 1000)))):
+    for opcode, body in (*layout.commands(), (Opcode.ARM, pack_command(Arm(start + 1, 1, 1000)))):
         bench.refused(STATE, opcode, body, f"{Opcode(opcode).name} while ARMED")
     bench.done(Opcode.STOP)
 
@@ -206,7 +203,7 @@ def uploads_need_idle(bench: Bench) -> None:
 )
 def gates(bench: Bench) -> None:
     now, hz = bench.ping().tx_tick, bench.facts["tick_hz"]
-    bench.refused(STATE, Opcode.GATE, pack_gate(Gate(now + hz, 1, 0)), "GATE in IDLE")
+    bench.refused(STATE, Opcode.GATE, pack_command(Gate(now + hz, 1, 0)), "GATE in IDLE")
     bench.upload(bench.layout())
     bench.arm(0, ahead_s=20.0, lease_ms=20_000)
     now = bench.ping().tx_tick
@@ -215,9 +212,9 @@ def gates(bench: Bench) -> None:
         (RANGE, Gate(now + hz, 0, 0), "GATE for 0 ticks"),
         (RANGE, Gate(now + hz, 1, 0xFFFF), "GATE of output 65535"),
     ):
-        bench.refused(status, Opcode.GATE, pack_gate(gate), what)
+        bench.refused(status, Opcode.GATE, pack_command(gate), what)
     if bench.facts.get("gate_channels", 1):
-        bench.done(Opcode.GATE, pack_gate(Gate(bench.ping().tx_tick + hz // 2, hz // 1000, 0)))
+        bench.done(Opcode.GATE, pack_command(Gate(bench.ping().tx_tick + hz // 2, hz // 1000, 0)))
     bench.done(Opcode.STOP)
 
 
@@ -228,7 +225,7 @@ def pattern_pieces(bench: Bench) -> None:
         raise NotTried("patterns of less than four pixels")
 
     def piece(first: int, count: int) -> bytes:
-        return pack_pattern(PatternChunk(0, first, whole, np.zeros(count, np.uint16)))
+        return pack_command(PatternChunk(0, first, whole, np.zeros(count, np.uint16)))
 
     bench.done(Opcode.LOAD_PATTERN, piece(0, 2))
     bench.refused(RANGE, Opcode.LOAD_PATTERN, piece(3, 1), "a piece behind a gap")

@@ -19,8 +19,7 @@ from pans.runtime.wire.commands import (
     PARALLEL,
     PatternChunk,
     PlanChunk,
-    pack_pattern,
-    pack_plan,
+    pack_command,
 )
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, Opcode
 
@@ -92,8 +91,8 @@ class Layout:
 
     def commands(self) -> Iterator[tuple[Opcode, bytes]]:
         """Opcode and body of everything that the device needs."""
-        yield from ((Opcode.LOAD_PATTERN, pack_pattern(chunk)) for chunk in self.patterns())
-        yield Opcode.LOAD_PLAN, pack_plan(self.chunk())
+        yield from ((Opcode.LOAD_PATTERN, pack_command(chunk)) for chunk in self.patterns())
+        yield Opcode.LOAD_PLAN, pack_command(self.chunk())
 
 
 def layout_for(profile: Profile, facts: Mapping[str, Any], pixels: int, **changes: Any) -> Layout:

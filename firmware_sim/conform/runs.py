@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pans.runtime.wire.commands import Arm, pack_arm
+from pans.runtime.wire.commands import Arm, pack_command
 from pans.runtime.wire.messages import (
     AckStatus,
     ClickBlock,
@@ -128,7 +128,7 @@ def safe(bench: Bench) -> None:
     bench.arm(0, lease_ms=150, ahead_s=0.05)
     bench.until_state(DeviceState.SAFE)
     start = bench.ping().tx_tick + bench.facts["tick_hz"]
-    bench.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_arm(Arm(start, 1, 1000)), "ARM in SAFE")
+    bench.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM in SAFE")
     bench.done(Opcode.RESET)
     bench.until_state(DeviceState.IDLE)
     bench.arm(0, lease_ms=150, ahead_s=0.05)

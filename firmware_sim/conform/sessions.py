@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, pack_arm
+from pans.runtime.wire.commands import Arm, pack_command
 from pans.runtime.wire.framing import encode_frame
 from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA, wrong_facts
@@ -43,13 +43,13 @@ def new_session(bench: Bench) -> None:
     ack = bench.command(Opcode.STOP)
     need(ack.last_id == bench.last_id, f"the command ids did not start over: last id {ack.last_id}")
     start = bench.ping().tx_tick + bench.facts["tick_hz"]
-    bench.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_arm(Arm(start, 1, 1000)), "ARM after a new session")
+    bench.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM after a new session")
     for opcode, body in bench.layout().commands():
         if opcode != Opcode.LOAD_PLAN:
             bench.done(opcode, body)
     start = bench.ping().tx_tick + bench.facts["tick_hz"]
     bench.refused(
-        AckStatus.WRONG_STATE, Opcode.ARM, pack_arm(Arm(start, 1, 1000)), "ARM with the plan of the session before"
+        AckStatus.WRONG_STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM with the plan of the session before"
     )
 
 
@@ -70,7 +70,7 @@ def other_schema(bench: Bench) -> None:
     bench.inbox.clear()
     bench.send(
         encode_frame(
-            MessageType.HELLO, wire.STRUCTS["HELLO"].pack(wire.SCHEMA ^ 1, wire.PROTOCOL_VERSION, 0), bench.session
+            MessageType.HELLO, wire.STRUCTS["HELLO"].pack(wire.SCHEMA ^ 1, wire.PROTOCOL_VERSION), bench.session
         )
     )
     found = bench.wait(MessageType.WELCOME, what="to a HELLO of another schema")

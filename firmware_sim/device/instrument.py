@@ -21,15 +21,13 @@ from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import (
     Arm,
     Extension,
+    Gate,
+    MaskChunk,
+    PatternChunk,
+    PlanChunk,
     ReadCounts,
-    unpack_arm,
-    unpack_count_states,
-    unpack_gate,
-    unpack_masks,
-    unpack_pattern,
-    unpack_plan,
-    unpack_read_counts,
-    unpack_show,
+    Show,
+    unpack_command,
     unpack_states,
 )
 from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
@@ -294,14 +292,14 @@ class Instrument:
             self._require_idle("LOAD_PATTERN")
             if self.view.optics is not None:
                 raise Refused(AckStatus.OUT_OF_RANGE, "passive optics: there is no projector to show a pattern")
-            self._patterns.load(unpack_pattern(body))
+            self._patterns.load(unpack_command(PatternChunk, body))
         elif opcode in (Opcode.LOAD_MASKS, Opcode.LOAD_STATES, Opcode.SHOW) and self.extension is not None:
             self._automaton(Opcode(opcode), body)
         elif opcode in (Opcode.READ_COUNTS, Opcode.LOAD_COUNT_STATES) and max(self.number_max, self.channels_max) > 1:
             self._counts(Opcode(opcode), body)
         elif opcode == Opcode.LOAD_PLAN:
             self._require_idle("LOAD_PLAN")
-            chunk = unpack_plan(body)
+            chunk = unpack_command(PlanChunk, body)
             self._plan.load(chunk)
             if chunk.first_slot == 0:
                 self._states.forget()
@@ -310,7 +308,7 @@ class Instrument:
                     self._light_table(self._plan.program)  # seconds for many pictures in flow: ARM must not wait for it
         elif opcode == Opcode.ARM:
             self._require_idle("ARM")
-            self._arm(unpack_arm(body))
+            self._arm(unpack_command(Arm, body))
         elif opcode == Opcode.GATE:
             self._gate(body)
         elif opcode in (Opcode.STOP, Opcode.RESET):
@@ -328,13 +326,13 @@ class Instrument:
             run, shows, program = self._run, self._shows, self._plan.program
             if run is None or shows is None or program is None:
                 raise Refused(AckStatus.WRONG_STATE, "SHOW needs a run whose states the host names")
-            shows.put(unpack_show(body), program, run.begun_by(self._tick), run.n_exposures)
+            shows.put(unpack_command(Show, body), program, run.begun_by(self._tick), run.n_exposures)
             return
         self._require_idle(opcode.name)
         if opcode == Opcode.LOAD_MASKS:
-            self._patterns.load_masks(unpack_masks(body))
+            self._patterns.load_masks(unpack_command(MaskChunk, body))
             return
-        self._states.load(piece_of(unpack_states(body)), self._plan.program)
+        self._states.load(piece_of(unpack_states(opcode, body)), self._plan.program)
         if self._states.states is not None:
             from . import readings
 
@@ -347,9 +345,9 @@ class Instrument:
         self._require_idle(opcode.name)
         program = self._plan.program
         if opcode == Opcode.LOAD_COUNT_STATES:
-            self._states.load(piece_of(unpack_count_states(body)), program)
+            self._states.load(piece_of(unpack_states(opcode, body)), program)
             return
-        asked = unpack_read_counts(body)
+        asked = unpack_command(ReadCounts, body)
         self._states.read_counts(asked, program)
         readings.warm_up(self._states.largest + 1, self._states.channels)
         if program is not None:
@@ -390,7 +388,7 @@ class Instrument:
         return self._light[1]
 
     def _gate(self, body: bytes) -> None:
-        gate = unpack_gate(body)
+        gate = unpack_command(Gate, body)
         if self.state not in (DeviceState.ARMED, DeviceState.RUNNING):
             raise Refused(AckStatus.WRONG_STATE, f"GATE needs a run, the device is {self.state.name}")
         self.gates.add(gate, self._tick)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program, States
-from pans.runtime.wire.commands import CountStateChunk, Extension, ReadCounts, Show, StateChunk
+from pans.runtime.wire.commands import Extension, ReadCounts, Show, StateChunk
 from pans.runtime.wire.messages import (
     ADAPTIVE_PATTERN,
     BLOCK_HEADER_BYTES,
@@ -47,13 +47,11 @@ class StatePiece(NamedTuple):
         return self.n_states, self.dwell_steps, self.n_leaves, self.outcomes
 
 
-def piece_of(chunk: StateChunk | CountStateChunk) -> StatePiece:
+def piece_of(chunk: StateChunk) -> StatePiece:
     """Return the states of a LOAD_STATES or LOAD_COUNT_STATES."""
-    rows = chunk.states
-    counts = isinstance(chunk, CountStateChunk)
-    after = rows["next"] if counts else np.stack([rows["next_dark"], rows["next_click"]], axis=1)
-    shown = rows["pattern"].astype(np.int64), rows["dwell"].astype(np.int64), after.astype(np.int64)
-    return StatePiece(chunk.n_states, chunk.first_state, chunk.dwell_steps, chunk.n_leaves, after.shape[1], *shown)
+    n_states, first, dwell_steps, outcomes, n_leaves, rows = chunk
+    columns = (rows[name].astype(np.int64) for name in ("pattern", "dwell", "next"))
+    return StatePiece(n_states, first, dwell_steps, n_leaves, outcomes, *columns)
 
 
 @dataclass(slots=True)

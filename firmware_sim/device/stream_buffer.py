@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.messages import encode_counts
 
 from .sequential import Measurement, StreamMessage
 
@@ -93,8 +92,7 @@ class StreamBuffer:
         if isinstance(message, wire.Mark):
             return wire.encode_mark(message._replace(seq=self.sequence), session)
         if isinstance(message, wire.ClickBlock):
-            encode = wire.encode_clicks if message.largest == 1 else encode_counts
-            return encode(message._replace(seq=self.sequence, drops=drops), session)
+            return wire.encode_clicks(message._replace(seq=self.sequence, drops=drops), session)
         return wire.encode_frames(message._replace(seq=self.sequence, drops=drops), session)
 
 

@@ -11,20 +11,14 @@ from numpy.typing import NDArray
 from pans.runtime.wire.commands import (
     MAX_SLOTS_PER_CHUNK,
     MODES,
-    STATES_PER_COMMAND,
-    CountStateChunk,
     PlanChunk,
     ReadCounts,
     StateChunk,
-    count_state_chunks,
-    pack_count_states,
-    pack_plan,
-    pack_read_counts,
-    pack_states,
+    cut_states,
+    pack_command,
     state_dtype,
 )
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MalformedMessage, Opcode
-from pans.runtime.wire.schema import STATE_DTYPE
 
 from .plan import Plan
 
@@ -62,15 +56,10 @@ def plan_chunks(plan: Plan) -> list[PlanChunk]:
 
 def plan_commands(plan: Plan) -> list[tuple[Opcode, bytes]]:
     """Return the commands that bring `plan` to a device: its slots, what is read in an exposure, and the states that the device follows."""
-    commands = [(Opcode.LOAD_PLAN, pack_plan(chunk)) for chunk in plan_chunks(plan)]
+    commands = [(Opcode.LOAD_PLAN, pack_command(chunk)) for chunk in plan_chunks(plan)]
     if plan.largest > 1:
-        commands.append((Opcode.READ_COUNTS, pack_read_counts(*reading_of(plan))))
-    for chunk in state_chunks(plan):
-        if isinstance(chunk, CountStateChunk):
-            commands.append((Opcode.LOAD_COUNT_STATES, pack_count_states(chunk)))
-        else:
-            commands.append((Opcode.LOAD_STATES, pack_states(chunk)))
-    return commands
+        commands.append((Opcode.READ_COUNTS, pack_command(reading_of(plan))))
+    return [*commands, *((chunk.opcode, pack_command(chunk)) for chunk in state_chunks(plan))]
 
 
 def reading_of(plan: Plan) -> ReadCounts:
@@ -78,26 +67,15 @@ def reading_of(plan: Plan) -> ReadCounts:
     return ReadCounts(plan.largest, plan.channels_at_once if plan.channels_at_once > 1 else 0)
 
 
-def state_chunks(plan: Plan) -> Sequence[StateChunk | CountStateChunk]:
+def state_chunks(plan: Plan) -> Sequence[StateChunk]:
     """Return the automaton that the device is to follow as bodies of commands; none of a plan that it does not drive."""
     return [] if plan.automaton is None or plan.drive != "device" else _chunks_of(plan.automaton)
 
 
-def _chunks_of(automaton: Automaton) -> Sequence[StateChunk | CountStateChunk]:
-    states = np.zeros(automaton.n_states, _dtype_of(automaton))
-    states["pattern"], states["dwell"] = automaton.pattern, automaton.dwell
-    if automaton.n_outcomes > 2:
-        states["next"] = automaton.successors
-        facts = automaton.n_states, automaton.dwell_steps, automaton.n_outcomes, automaton.n_leaves
-        return count_state_chunks(facts, states)
-    states["next_dark"], states["next_click"] = automaton.successors.T
-    starts = range(0, len(states), STATES_PER_COMMAND)
-    head = automaton.dwell_steps, automaton.n_leaves
-    return [StateChunk(len(states), first, *head, states[first : first + STATES_PER_COMMAND]) for first in starts]
-
-
-def _dtype_of(automaton: Automaton) -> np.dtype[Any]:
-    return state_dtype(automaton.n_outcomes) if automaton.n_outcomes > 2 else STATE_DTYPE
+def _chunks_of(automaton: Automaton) -> Sequence[StateChunk]:
+    states = np.zeros(automaton.n_states, state_dtype(automaton.n_outcomes))
+    states["pattern"], states["dwell"], states["next"] = automaton.pattern, automaton.dwell, automaton.successors
+    return cut_states((automaton.n_states, automaton.dwell_steps, automaton.n_outcomes, automaton.n_leaves), states)
 
 
 def upload_bytes(plan: Plan, bundle: Bundle) -> int:
@@ -106,7 +84,7 @@ def upload_bytes(plan: Plan, bundle: Bundle) -> int:
     pattern = (n_pixels + 7) // 8 if bundle.levels == 2 else 2 * n_pixels
     states = 0
     if plan.automaton is not None and plan.drive == "device":
-        states = plan.automaton.n_states * _dtype_of(plan.automaton).itemsize
+        states = plan.automaton.n_states * state_dtype(plan.automaton.n_outcomes).itemsize
     return n_patterns * pattern + plan.slots_per_cycle * SLOT_DTYPE.itemsize + states
 
 
@@ -132,7 +110,7 @@ def plan_from_chunks(
     chunks: Sequence[PlanChunk],
     tick_hz: int,
     automaton: Automaton | None = None,
-    states: Sequence[StateChunk | CountStateChunk] = (),
+    states: Sequence[StateChunk] = (),
     largest: int = 1,
 ) -> Plan:
     """Invert `plan_chunks` and `state_chunks`: the plan that a device was sent, with the `automaton` that it was made for.
@@ -185,9 +163,7 @@ def plan_from_chunks(
     )
 
 
-def _check_automaton(
-    adaptive: NDArray[Any], automaton: Automaton | None, states: Sequence[StateChunk | CountStateChunk]
-) -> None:
+def _check_automaton(adaptive: NDArray[Any], automaton: Automaton | None, states: Sequence[StateChunk]) -> None:
     """Raise MalformedMessage unless the adaptive slots and the states that were sent are those of `automaton`."""
     walk = 0 if automaton is None else automaton.n_slots
     if len(adaptive) != walk:

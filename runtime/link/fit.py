@@ -22,8 +22,7 @@ from pans.runtime.wire.commands import (
     announced_channels,
     announced_counts,
     mask_chunks,
-    pack_masks,
-    pack_pattern,
+    pack_command,
 )
 from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA, COUNT_SCHEMA
@@ -35,12 +34,12 @@ TEXT_MAX_BYTES = 240  # a receiver of WELCOME takes at most 256 bytes of text
 def upload_commands(plan: Plan, bundle: Bundle, facts: Mapping[str, Any]) -> Iterator[tuple[Opcode, bytes]]:
     """Yield opcode and body of each command that brings `bundle`'s patterns and `plan` to a device with the WELCOME `facts`."""
     if bundle.levels == 2 and announced(facts) is not None:
-        yield from ((Opcode.LOAD_MASKS, pack_masks(chunk)) for chunk in mask_chunks(bundle.pattern_levels))
+        yield from ((Opcode.LOAD_MASKS, pack_command(chunk)) for chunk in mask_chunks(bundle.pattern_levels))
     else:
         for index, levels in enumerate(bundle.pattern_levels):
             for first in range(0, len(levels), MAX_PIXELS_PER_CHUNK):
                 part = levels[first : first + MAX_PIXELS_PER_CHUNK]
-                yield Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, first, len(levels), part))
+                yield Opcode.LOAD_PATTERN, pack_command(PatternChunk(index, first, len(levels), part))
     yield from plan_commands(plan)
 
 

@@ -15,7 +15,7 @@ from pans.runtime.core.window import DecisionWindows
 from pans.runtime.kernel.state import Drive
 from pans.runtime.link.connection import Connection
 from pans.runtime.timing.ledger import LatencyHistogram
-from pans.runtime.wire.commands import Show, pack_show
+from pans.runtime.wire.commands import Show, pack_command
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.schema import HEADER, STRUCTS
 
@@ -38,7 +38,7 @@ class WalkPlace:
         """Return what the kernel drives by, with the `tails` of SHOW by state, in `session`."""
         size = HEADER.size + STRUCTS["COMMAND"].size
         plain: npt.NDArray[np.uint8] = np.zeros(size + _EXPOSURE_BYTES + len(tails[0]) + CRC_BYTES, np.uint8)
-        head = HEADER.pack(MessageType.COMMAND, 0, 0, session) + STRUCTS["COMMAND"].pack(0, Opcode.SHOW, 0, 0)
+        head = HEADER.pack(MessageType.COMMAND, 0, session) + STRUCTS["COMMAND"].pack(0, Opcode.SHOW)
         plain[:size] = np.frombuffer(head, np.uint8)
         return Drive(
             np.array(self._next_step, np.int64),
@@ -68,7 +68,7 @@ class HostDriver:
         automaton = place.automaton
         shown = zip(automaton.pattern.tolist(), automaton.dwell.tolist())
         self._tails = [
-            pack_show(Show(0, state, pattern, dwell, automaton.dwell_steps))[_EXPOSURE_BYTES:]
+            pack_command(Show(0, state, pattern, dwell, automaton.dwell_steps))[_EXPOSURE_BYTES:]
             for state, (pattern, dwell) in enumerate(shown)
         ]
         self._sent = (-1, -1)

@@ -28,7 +28,7 @@ from pans.runtime.link.connection import ARM_LEAD_NS, NS_PER_S, Connection
 from pans.runtime.offered import load_offered
 from pans.runtime.record import Recorder
 from pans.runtime.timing.clock import ClockModel
-from pans.runtime.wire.commands import Arm, Gate, PatternChunk, pack_arm, pack_gate, pack_pattern, pack_plan
+from pans.runtime.wire.commands import Arm, Gate, PatternChunk, pack_command
 from pans.runtime.wire.messages import DARK_PATTERN, DeviceState, Opcode
 from pans.runtime.wire.session import COMMAND_WINDOW, HostSession
 
@@ -95,9 +95,9 @@ class SecondInstrument:
             )
         plan = idle_plan(profile)
         dark = PatternChunk(0, 0, 1, np.zeros(1, np.uint16))
-        connection.session.submit(Opcode.LOAD_PATTERN, pack_pattern(dark))
+        connection.session.submit(Opcode.LOAD_PATTERN, pack_command(dark))
         for chunk in plan_chunks(plan):
-            connection.session.submit(Opcode.LOAD_PLAN, pack_plan(chunk))
+            connection.session.submit(Opcode.LOAD_PLAN, pack_command(chunk))
         connection.settle()
         connection.synchronise()
         self._arm()
@@ -129,7 +129,7 @@ class SecondInstrument:
         tick = clock.to_tick(at_ns)
         uncertainty_ns = clock.to_host_ns(tick)[1]
         gate = Gate(tick, max(1, round(duration_us * clock.tick_hz / 1e6)), channel)
-        command_id = self.connection.session.submit(Opcode.GATE, pack_gate(gate), may_be_refused=True)
+        command_id = self.connection.session.submit(Opcode.GATE, pack_command(gate), may_be_refused=True)
         self.connection.session.poll(self.now_ns())
         self.connection.flush()
         self._last_pulse_ns = max(self._last_pulse_ns, at_ns + round(duration_us * 1000))
@@ -173,7 +173,7 @@ class SecondInstrument:
     def _arm(self) -> None:
         now_ns = self.now_ns()
         start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
-        self.connection.session.submit(Opcode.ARM, pack_arm(Arm(start_tick, 0, LEASE_MS)))
+        self.connection.session.submit(Opcode.ARM, pack_command(Arm(start_tick, 0, LEASE_MS)))
         self._arm_sent_ns = now_ns
 
 
@@ -288,7 +288,7 @@ class GateQueue:
 
     def _do(self, action: Action, session: HostSession, clock: ClockModel) -> None:
         if self.actuator is None and self.second is None:
-            body = pack_gate(Gate(action.tick, action.duration_ticks, action.channel))
+            body = pack_command(Gate(action.tick, action.duration_ticks, action.channel))
             self._session = session
             self._sent.append((session.submit(Opcode.GATE, body, may_be_refused=True), action))
             return

@@ -26,7 +26,7 @@ from pans.runtime.record.format import TIMING_RUN_DTYPE
 from pans.runtime.record.recorder import repeated_setup
 from pans.runtime.timing.clock import future_tick
 from pans.runtime.timing.ledger import TimingLedger
-from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
+from pans.runtime.wire.commands import Arm, Gate, pack_command
 from pans.runtime.wire.framing import Frame
 from pans.runtime.wire.messages import DeviceState, MessageType, Opcode, StateReason, decode_status, pack_body
 from pans.runtime.wire.schema import LARGEST_TICK, MalformedMessage
@@ -163,7 +163,7 @@ class LiveRun(Reconciled):
     def _send_arm(self, now_ns: int, arm: Arm) -> None:
         start_ns = now_ns + self._lead_ns
         self.lateness.attach(self.connection, start_ns)
-        self.connection.session.submit(Opcode.ARM, pack_arm(arm))
+        self.connection.session.submit(Opcode.ARM, pack_command(arm))
         if self.driver is not None:
             self.driver.begin(self.connection)
         if self.recorder is not None and self.recorder.limits is not None:
@@ -228,7 +228,7 @@ class LiveRun(Reconciled):
         """
         if self.recorder is not None:
             self.recorder.flush_decisions()
-        body = pack_gate(Gate(tick, duration_ticks, channel))
+        body = pack_command(Gate(tick, duration_ticks, channel))
         return self.connection.session.submit(Opcode.GATE, body, may_be_refused=True)
 
     # -- one iteration -------------------------------------------------------------------------------------------------

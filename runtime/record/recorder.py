@@ -29,7 +29,7 @@ from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.outputs import refuse_existing
 from pans.runtime.timing.clock import CLOCK_DTYPE
-from pans.runtime.wire.commands import Arm, pack_arm
+from pans.runtime.wire.commands import Arm, pack_command
 from pans.runtime.wire.messages import Opcode, encode_command
 
 from .format import (
@@ -84,7 +84,7 @@ class PartFacts:
 
 def repeated_setup(plan: Plan, arm: Arm, nonce: int) -> list[bytes]:
     """Return plan, states and ARM as frames of session `nonce`: with them at its beginning a part can be replayed by itself."""
-    bodies = [*plan_commands(plan), (Opcode.ARM, pack_arm(arm))]
+    bodies = [*plan_commands(plan), (Opcode.ARM, pack_command(arm))]
     return [encode_command(number, opcode, body, nonce) for number, (opcode, body) in enumerate(bodies, 1)]
 
 

@@ -17,15 +17,11 @@ from pans.runtime.errors import DamagedFileError
 from pans.runtime.ranges import Range
 from pans.runtime.wire.commands import (
     Arm,
-    CountStateChunk,
     PlanChunk,
     ReadCounts,
+    Show,
     StateChunk,
-    unpack_arm,
-    unpack_count_states,
-    unpack_plan,
-    unpack_read_counts,
-    unpack_show,
+    unpack_command,
     unpack_states,
 )
 from pans.runtime.wire.messages import (
@@ -65,7 +61,7 @@ class Sent:
     """What a device was sent: plan, states of an automaton, what each state named by the host showed, and ARM by session."""
 
     chunks: dict[int, PlanChunk] = field(default_factory=dict)  # by first slot
-    states: dict[int, StateChunk | CountStateChunk] = field(default_factory=dict)  # by first state
+    states: dict[int, StateChunk] = field(default_factory=dict)  # by first state
     shown: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # state: pattern, dwell, dwell steps
     arms: dict[int, Arm] = field(default_factory=dict)
     read: list[ReadCounts] = field(default_factory=list)  # each READ_COUNTS
@@ -91,23 +87,20 @@ class Sent:
     def take(self, frame: Frame, command: CommandMessage) -> None:
         """Take one command; MalformedMessage when it cannot be read, or a state was shown in two ways."""
         if command.opcode == Opcode.LOAD_PLAN:
-            chunk = unpack_plan(command.body)
+            chunk = unpack_command(PlanChunk, command.body)
             self.chunks[chunk.first_slot] = chunk
-        elif command.opcode == Opcode.LOAD_STATES:
-            states = unpack_states(command.body)
+        elif command.opcode in (Opcode.LOAD_STATES, Opcode.LOAD_COUNT_STATES):
+            states = unpack_states(command.opcode, command.body)
             self.states[states.first_state] = states
-        elif command.opcode == Opcode.LOAD_COUNT_STATES:
-            counting = unpack_count_states(command.body)
-            self.states[counting.first_state] = counting
         elif command.opcode == Opcode.READ_COUNTS:
-            self.read.append(unpack_read_counts(command.body))
+            self.read.append(unpack_command(ReadCounts, command.body))
         elif command.opcode == Opcode.SHOW:
-            show = unpack_show(command.body)
+            show = unpack_command(Show, command.body)
             seen = (show.pattern, show.dwell, show.dwell_steps)
             if self.shown.setdefault(show.state, seen) != seen:
                 raise MalformedMessage(f"state {show.state} was shown in two ways")
         elif command.opcode == Opcode.ARM:
-            self.arms[frame.session] = unpack_arm(command.body)
+            self.arms[frame.session] = unpack_command(Arm, command.body)
 
 
 def sent_to_device(recording: Recording) -> Sent:

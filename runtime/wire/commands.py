@@ -1,19 +1,28 @@
 """Bodies of the protocol's commands, and what a device announces of the extensions (docs/reference/protocol.md, sections 4, 11, 13, 14).
 
-`pack_*` return bytes for `encode_command`; `unpack_*` return named tuples or raise `MalformedMessage`. `announced*` read WELCOME's map,
-`*announcement` make its keys. Sizes are checked before anything is allocated.
+Named tuples become bytes for `encode_command` by `pack_command`, and bytes named tuples again by `unpack_command`, which raises
+`MalformedMessage`. `announced*` read WELCOME's map, `*announcement` make its keys.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from .messages import MAX_PAYLOAD_BYTES, SLOT_DTYPE, STRUCTS, U8, U16, MalformedMessage, fields
-from .schema import AUTOMATON_SCHEMA, COUNT_SCHEMA, MAX_PHOTON_NUMBER, STATE_DTYPE, U16_MAX
+from .messages import U8, U16, fields
+from .schema import (
+    AUTOMATON_SCHEMA,
+    COUNT_SCHEMA,
+    MAX_PHOTON_NUMBER,
+    SLOT_DTYPE,
+    STRUCTS,
+    U16_MAX,
+    MalformedMessage,
+    Opcode,
+)
 
 SEQUENTIAL, PARALLEL = 0, 1
 MODES = {"sequential": SEQUENTIAL, "parallel": PARALLEL}
@@ -22,7 +31,6 @@ MAX_SLOTS_PER_CHUNK = 1024
 MAX_STATES_PER_CHUNK = 4096
 # What the host puts into one command: a fifth of a second at 40 kB/s, so that even a slow line acknowledges it before it is repeated.
 MASK_BYTES = 8192
-STATES_PER_COMMAND = 680
 STATE_BYTES_PER_COMMAND = 8160
 
 
@@ -64,17 +72,7 @@ class MaskChunk(NamedTuple):
 
 
 class StateChunk(NamedTuple):
-    """The automaton's header and some of its states; `states` has STATE_DTYPE (pattern, dwell, next_dark, next_click)."""
-
-    n_states: int
-    first_state: int
-    dwell_steps: int
-    n_leaves: int
-    states: npt.NDArray[Any]
-
-
-class CountStateChunk(NamedTuple):
-    """The header of an automaton over photon numbers and some of its states, of `state_dtype(outcomes)`."""
+    """The automaton's header and some of its states, of `state_dtype(outcomes)`; two outcomes are no click and a click."""
 
     n_states: int
     first_state: int
@@ -82,6 +80,11 @@ class CountStateChunk(NamedTuple):
     outcomes: int
     n_leaves: int
     states: npt.NDArray[Any]
+
+    @property
+    def opcode(self) -> Opcode:
+        """The command that loads them."""
+        return Opcode.LOAD_COUNT_STATES if self.outcomes > 2 else Opcode.LOAD_STATES
 
 
 class Arm(NamedTuple):
@@ -124,30 +127,67 @@ class Extension(NamedTuple):
     dwell_steps: int
 
 
-def pack_pattern(chunk: PatternChunk) -> bytes:
-    """Return the body of LOAD_PATTERN."""
-    head = STRUCTS["LOAD_PATTERN"].pack(chunk.pattern, 0, chunk.first_pixel, chunk.n_pixels)
-    return head + chunk.levels.astype("<u2").tobytes()
+Command = PatternChunk | MaskChunk | PlanChunk | StateChunk | Arm | Gate | Show | ReadCounts
+T = TypeVar("T")
+_LAYOUTS: Mapping[Any, str] = {
+    **{PatternChunk: "LOAD_PATTERN", PlanChunk: "LOAD_PLAN", MaskChunk: "LOAD_MASKS"},
+    **{Arm: "ARM", Gate: "GATE", Show: "SHOW", ReadCounts: "READ_COUNTS"},
+}
+# the rows behind a command's header: their layout, the most of them, and where the header has the first one and how many there are
+_ROWS: Mapping[Any, tuple[np.dtype[Any], int, int, int]] = {
+    PatternChunk: (np.dtype("<u2"), MAX_PIXELS_PER_CHUNK, 1, 2),
+    PlanChunk: (SLOT_DTYPE, MAX_SLOTS_PER_CHUNK, 3, 2),
+}
 
 
-def unpack_pattern(body: bytes) -> PatternChunk:
-    """Invert `pack_pattern`."""
-    pattern, _, first_pixel, n_pixels = fields("LOAD_PATTERN", body, exact=False)
-    rest = len(body) - STRUCTS["LOAD_PATTERN"].size
-    if rest == 0 or rest % 2 or rest // 2 > MAX_PIXELS_PER_CHUNK or first_pixel + rest // 2 > n_pixels:
-        raise MalformedMessage(f"LOAD_PATTERN holds {rest} bytes of levels from pixel {first_pixel} of {n_pixels}")
-    levels = np.frombuffer(body, "<u2", rest // 2, STRUCTS["LOAD_PATTERN"].size).astype(np.uint16)
-    return PatternChunk(pattern, first_pixel, n_pixels, levels)
+def pack_command(command: Command) -> bytes:
+    """Return the body of a COMMAND."""
+    if isinstance(command, StateChunk):
+        head = command[: 4 if command.outcomes > 2 else 3] + command[4:5]
+        return STRUCTS[command.opcode.name].pack(*head) + command.states.astype(state_dtype(command.outcomes)).tobytes()
+    pack = STRUCTS[_LAYOUTS[type(command)]].pack
+    if isinstance(command, MaskChunk):
+        first_pattern, *pixels, rows = command
+        return pack(first_pattern, len(rows), *pixels) + rows.tobytes()
+    if isinstance(command, (PatternChunk, PlanChunk)):
+        return pack(*command[:-1]) + command[-1].astype(_ROWS[type(command)][0]).tobytes()
+    return pack(*command)
 
 
-def pack_masks(chunk: MaskChunk) -> bytes:
-    """Return the body of LOAD_MASKS."""
-    head = (chunk.first_pattern, len(chunk.rows), chunk.first_pixel, chunk.n_pixels, chunk.pixels)
-    return STRUCTS["LOAD_MASKS"].pack(*head) + chunk.rows.tobytes()
+def unpack_command(kind: Callable[..., T], body: bytes) -> T:
+    """Return the body of a COMMAND as a `kind`: any named tuple of this module but StateChunk, see `unpack_states`."""
+    name = _LAYOUTS[kind]
+    if kind is MaskChunk:
+        return kind(*_unpacked_masks(body))
+    if kind not in _ROWS:
+        return kind(*fields(name, body))
+    head = fields(name, body, exact=False)
+    return kind(*head, _rows(name, body, head, *_ROWS[kind]))
 
 
-def unpack_masks(body: bytes) -> MaskChunk:
-    """Invert `pack_masks`; `rows` is a read-only view of the body."""
+def unpack_states(opcode: int, body: bytes) -> StateChunk:
+    """Return the body of LOAD_STATES or LOAD_COUNT_STATES."""
+    name = Opcode(opcode).name
+    n_states, first, dwell_steps, *counted, n_leaves = fields(name, body, exact=False)
+    outcomes = counted[0] if counted else 2
+    if counted and not 3 <= outcomes <= MAX_PHOTON_NUMBER + 1:
+        raise MalformedMessage(f"{name} of {outcomes} outcomes, allowed 3 to {MAX_PHOTON_NUMBER + 1}")
+    rows = _rows(name, body, (n_states, first), state_dtype(outcomes), MAX_STATES_PER_CHUNK, 1, 0)
+    return StateChunk(n_states, first, dwell_steps, outcomes, n_leaves, rows)
+
+
+def _rows(
+    name: str, body: bytes, head: tuple[int, ...], dtype: np.dtype[Any], most: int, first: int, total: int
+) -> npt.NDArray[Any]:
+    """Return a copy of the rows behind the header of `body`; their number is checked before anything is allocated."""
+    size = STRUCTS[name].size
+    count, odd = divmod(len(body) - size, dtype.itemsize)
+    if odd or not 0 < count <= most or head[first] + count > head[total]:
+        raise MalformedMessage(f"{name} holds {len(body) - size} bytes of rows from {head[first]} of {head[total]}")
+    return np.frombuffer(body, dtype, count, size).copy()
+
+
+def _unpacked_masks(body: bytes) -> MaskChunk:
     first, count, first_pixel, n_pixels, pixels = fields("LOAD_MASKS", body, exact=False)
     size, rest = STRUCTS["LOAD_MASKS"].size, len(body) - STRUCTS["LOAD_MASKS"].size
     row_bytes = (pixels + 7) // 8
@@ -177,117 +217,19 @@ def mask_chunks(levels: npt.NDArray[Any]) -> Iterator[MaskChunk]:
             yield MaskChunk(number, first, n_pixels, piece.shape[1], rows)
 
 
-def pack_plan(chunk: PlanChunk) -> bytes:
-    """Return the body of LOAD_PLAN."""
-    head = STRUCTS["LOAD_PLAN"].pack(
-        chunk.mode, 0, chunk.n_patterns, chunk.n_slots, chunk.first_slot, chunk.exposure_ticks, chunk.slot_period_ticks,
-        chunk.cycle_ticks, chunk.block_exposures, 0, chunk.cycles_per_object,
-    )  # fmt: skip
-    return head + chunk.slots.astype(SLOT_DTYPE).tobytes()
-
-
-def unpack_plan(body: bytes) -> PlanChunk:
-    """Invert `pack_plan`."""
-    mode, _, n_patterns, n_slots, first_slot, exposure, period, cycle, block, _, per_object = fields(
-        "LOAD_PLAN", body, exact=False
-    )
-    size = STRUCTS["LOAD_PLAN"].size
-    count, odd = divmod(len(body) - size, SLOT_DTYPE.itemsize)
-    if odd or not 0 < count <= MAX_SLOTS_PER_CHUNK or first_slot + count > n_slots or len(body) > MAX_PAYLOAD_BYTES:
-        raise MalformedMessage(f"LOAD_PLAN holds {len(body) - size} bytes of slots from slot {first_slot} of {n_slots}")
-    slots = np.frombuffer(body, SLOT_DTYPE, count, size).copy()
-    return PlanChunk(mode, n_patterns, n_slots, first_slot, exposure, period, cycle, block, per_object, slots)
-
-
-def pack_states(chunk: StateChunk) -> bytes:
-    """Return the body of LOAD_STATES."""
-    head = STRUCTS["LOAD_STATES"].pack(chunk.n_states, chunk.first_state, chunk.dwell_steps, 0, chunk.n_leaves)
-    return head + chunk.states.astype(STATE_DTYPE).tobytes()
-
-
-def unpack_states(body: bytes) -> StateChunk:
-    """Invert `pack_states`."""
-    n_states, first, dwell_steps, _, n_leaves = fields("LOAD_STATES", body, exact=False)
-    size = STRUCTS["LOAD_STATES"].size
-    count, odd = divmod(len(body) - size, STATE_DTYPE.itemsize)
-    if odd or not 0 < count <= MAX_STATES_PER_CHUNK or first + count > n_states or len(body) > MAX_PAYLOAD_BYTES:
-        raise MalformedMessage(f"LOAD_STATES holds {len(body) - size} bytes of states from state {first} of {n_states}")
-    return StateChunk(n_states, first, dwell_steps, n_leaves, np.frombuffer(body, STATE_DTYPE, count, size).copy())
-
-
 def state_dtype(outcomes: int) -> np.dtype[Any]:
     """The layout of one state: pattern, dwell, and `next`, the successors after 0, 1, ... `outcomes` - 1 photons."""
     return np.dtype([("pattern", "<u2"), ("dwell", "<u2"), ("next", "<u4", (outcomes,))])
 
 
-def pack_count_states(chunk: CountStateChunk) -> bytes:
-    """Return the body of LOAD_COUNT_STATES."""
-    return STRUCTS["LOAD_COUNT_STATES"].pack(*chunk[:5]) + chunk.states.astype(state_dtype(chunk.outcomes)).tobytes()
-
-
-def unpack_count_states(body: bytes) -> CountStateChunk:
-    """Invert `pack_count_states`."""
-    n_states, first, dwell_steps, outcomes, n_leaves = fields("LOAD_COUNT_STATES", body, exact=False)
-    if not 3 <= outcomes <= MAX_PHOTON_NUMBER + 1:
-        raise MalformedMessage(f"LOAD_COUNT_STATES of {outcomes} outcomes, allowed 3 to {MAX_PHOTON_NUMBER + 1}")
-    size, dtype = STRUCTS["LOAD_COUNT_STATES"].size, state_dtype(outcomes)
-    count, odd = divmod(len(body) - size, dtype.itemsize)
-    if odd or not count or first + count > n_states or len(body) > MAX_PAYLOAD_BYTES:
-        raise MalformedMessage(
-            f"LOAD_COUNT_STATES holds {len(body) - size} bytes of states from state {first} of {n_states}"
-        )
-    states = np.frombuffer(body, dtype, count, size).copy()
-    return CountStateChunk(n_states, first, dwell_steps, outcomes, n_leaves, states)
-
-
-def count_state_chunks(header: tuple[int, int, int, int], states: npt.NDArray[Any]) -> list[CountStateChunk]:
+def cut_states(header: tuple[int, int, int, int], states: npt.NDArray[Any]) -> list[StateChunk]:
     """Cut the states of an automaton into commands; `header` holds its states, dwell steps, outcomes and leaves."""
     n_states, dwell_steps, outcomes, n_leaves = header
-    step = STATE_BYTES_PER_COMMAND // state_dtype(outcomes).itemsize
+    step = STATE_BYTES_PER_COMMAND // states.itemsize
     return [
-        CountStateChunk(n_states, first, dwell_steps, outcomes, n_leaves, states[first : first + step])
+        StateChunk(n_states, first, dwell_steps, outcomes, n_leaves, states[first : first + step])
         for first in range(0, n_states, step)
     ]
-
-
-def pack_arm(arm: Arm) -> bytes:
-    """Return the body of ARM."""
-    return STRUCTS["ARM"].pack(*arm, 0)
-
-
-def unpack_arm(body: bytes) -> Arm:
-    """Invert `pack_arm`."""
-    return Arm(*fields("ARM", body)[:3])
-
-
-def pack_gate(gate: Gate) -> bytes:
-    """Return the body of GATE."""
-    return STRUCTS["GATE"].pack(*gate, 0)
-
-
-def unpack_gate(body: bytes) -> Gate:
-    """Invert `pack_gate`."""
-    return Gate(*fields("GATE", body)[:3])
-
-
-def pack_show(show: Show) -> bytes:
-    """Return the body of SHOW."""
-    return STRUCTS["SHOW"].pack(*show)
-
-
-def unpack_show(body: bytes) -> Show:
-    """Invert `pack_show`."""
-    return Show(*fields("SHOW", body))
-
-
-def pack_read_counts(largest: int, channels: int = 0) -> bytes:
-    """Return the body of READ_COUNTS: runs of the loaded plan send COUNTS of numbers up to `largest`; see `ReadCounts`."""
-    return STRUCTS["READ_COUNTS"].pack(largest, channels)
-
-
-def unpack_read_counts(body: bytes) -> ReadCounts:
-    """Invert `pack_read_counts`; the range is the device's to judge."""
-    return ReadCounts(*fields("READ_COUNTS", body))
 
 
 def announced(facts: Mapping[str, Any]) -> Extension | None:

@@ -38,20 +38,20 @@ class Frame(NamedTuple):
 
 def pack_body(frame: Frame) -> bytes:
     """Return header and payload as they stood inside the frame: what a recording keeps."""
-    return HEADER.pack(frame.type, frame.flags, 0, frame.session) + frame.payload
+    return HEADER.pack(frame.type, frame.flags, frame.session) + frame.payload
 
 
 def unpack_body(body: bytes) -> Frame:
     """Invert `pack_body`; MalformedMessage when there is no whole header."""
     if len(body) < HEADER.size:
         raise MalformedMessage(f"a message has {len(body)} bytes, at least {HEADER.size} expected")
-    message_type, flags, _, session = HEADER.unpack_from(body)
+    message_type, flags, session = HEADER.unpack_from(body)
     return Frame(message_type, flags, session, body[HEADER.size :])
 
 
 def content_crc(frame: Frame) -> int:
     """Return the CRC-32 that a stream frame has on the wire with flags and reserved bits 0: those are ignored (rule 1.10)."""
-    return zlib.crc32(frame.payload, zlib.crc32(HEADER.pack(frame.type, 0, 0, frame.session), SCHEMA))
+    return zlib.crc32(frame.payload, zlib.crc32(HEADER.pack(frame.type, 0, frame.session), SCHEMA))
 
 
 class Messages(NamedTuple):
@@ -122,7 +122,7 @@ def encode_frame(message_type: int, payload: bytes, session: int, flags: int = 0
     """Return one frame ready to send, delimiter included; `MalformedMessage` above MAX_PAYLOAD_BYTES."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise MalformedMessage(f"payload has {len(payload)} bytes, allowed {MAX_PAYLOAD_BYTES}")
-    body = HEADER.pack(message_type, flags, 0, session) + payload
+    body = HEADER.pack(message_type, flags, session) + payload
     crc = zlib.crc32(body, _CRC_SEEDS[message_type])
     # A run that ends exactly at a 254-byte boundary would cost one code byte more; cobs_encode keeps the plain form.
     return cobs_encode(body + crc.to_bytes(4, "little")) + b"\0"
@@ -193,7 +193,7 @@ class FrameDecoder:
 
     def frame(self, first: int, stop: int) -> Frame:
         """Return what lies between `first` and `stop` in `buffer` as a frame of its own."""
-        kind, flags, _, session = HEADER.unpack_from(self._raw, first)
+        kind, flags, session = HEADER.unpack_from(self._raw, first)
         return Frame(kind, flags, session, bytes(self._view[first + HEADER.size : stop]))
 
     def warm_up(self) -> None:

@@ -7,7 +7,7 @@ count. The names of schema.py and framing.py are offered from here too.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import msgpack
@@ -16,28 +16,20 @@ import numpy.typing as npt
 
 from .framing import Frame as Frame
 from .framing import FrameDecoder as FrameDecoder
-from .framing import cobs_encode as cobs_encode
 from .framing import encode_frame as encode_frame
 from .framing import pack_body as pack_body
 from .framing import unpack_body as unpack_body
 from .schema import ADAPTIVE_PATTERN as ADAPTIVE_PATTERN
 from .schema import BLOCK_HEADER_BYTES as BLOCK_HEADER_BYTES
 from .schema import DARK_PATTERN as DARK_PATTERN
-from .schema import FACTS, FROM_DEVICE, LARGEST_TICK, narrow_fields
-from .schema import HEADER as HEADER
-from .schema import LAYOUTS as LAYOUTS
-from .schema import MAX_ACK_TEXT_BYTES as MAX_ACK_TEXT_BYTES
-from .schema import MAX_FRAME_BYTES as MAX_FRAME_BYTES
+from .schema import FACTS, FROM_DEVICE, MAX_ACK_TEXT_BYTES, MAX_WELCOME_BYTES, narrow_fields
 from .schema import MAX_PAYLOAD_BYTES as MAX_PAYLOAD_BYTES
-from .schema import MAX_WELCOME_BYTES as MAX_WELCOME_BYTES
 from .schema import NO_OBJECT as NO_OBJECT
 from .schema import PROTOCOL_VERSION as PROTOCOL_VERSION
 from .schema import SCHEMA as SCHEMA
-from .schema import SCHEMA_TEXT as SCHEMA_TEXT
 from .schema import SLOT_DTYPE as SLOT_DTYPE
 from .schema import STRUCTS as STRUCTS
 from .schema import UNKNOWN_TRUTH as UNKNOWN_TRUTH
-from .schema import UNSEEDED as UNSEEDED
 from .schema import AckStatus as AckStatus
 from .schema import DeviceState as DeviceState
 from .schema import MalformedMessage as MalformedMessage
@@ -45,12 +37,8 @@ from .schema import MessageType as MessageType
 from .schema import Opcode as Opcode
 from .schema import StateReason as StateReason
 
-# Of a block's fields these can hold more than they mean: two comparisons settle it for the many good ones, the table names a bad one.
 EXPOSURE_BYTES = 3  # of COUNTS: the pattern shown, and the number
-_BLOCKS = ("CLICKS", "FRAMES")  # COUNTS has a field with a narrow range: it goes through the table
 _CHECKED = {name: narrow_fields(name) for name in FROM_DEVICE}
-_LITTLE_U16 = np.dtype("<u2")
-_BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")  # of each byte value
 U16 = npt.NDArray[np.uint16]
 U8 = npt.NDArray[np.uint8]
 
@@ -186,31 +174,21 @@ def fields(name: str, payload: bytes, *, exact: bool = True) -> tuple[Any, ...]:
     if len(payload) < layout.size or (exact and len(payload) != layout.size):
         raise MalformedMessage(f"{name} has {len(payload)} bytes, expected {'' if exact else 'at least '}{layout.size}")
     values = layout.unpack_from(payload)
-    if name in _BLOCKS:
-        if (values[2] | values[3]) > LARGEST_TICK or not (values[4] and values[5] and (values[6] or name == "CLICKS")):
-            _check(name, values)
-    elif name in _CHECKED:
-        _check(name, values)
-    return values
-
-
-def _check(name: str, values: tuple[Any, ...]) -> None:
-    """Raise MalformedMessage when a value lies outside the range of its field."""
-    for place, field in _CHECKED[name]:
+    for place, field in _CHECKED.get(name, ()):
         if not field.allows(values[place]):
             low, high = field.range
             raise MalformedMessage(f"{name}: {field.name} is {values[place]}, allowed {low} to {high}")
+    return values
 
 
 def encode_hello(session: int) -> bytes:
     """Return the frame that opens session `session` (a nonce the host draws, not 0)."""
-    return encode_frame(MessageType.HELLO, STRUCTS["HELLO"].pack(SCHEMA, PROTOCOL_VERSION, 0), session)
+    return encode_frame(MessageType.HELLO, STRUCTS["HELLO"].pack(SCHEMA, PROTOCOL_VERSION), session)
 
 
 def decode_hello(payload: bytes) -> Hello:
     """Decode HELLO; a longer payload of a later version is accepted so that the mismatch can be named."""
-    schema, protocol, _ = fields("HELLO", payload, exact=False)
-    return Hello(schema, protocol)
+    return Hello(*fields("HELLO", payload, exact=False))
 
 
 def encode_welcome(facts: Mapping[str, Any], session: int) -> bytes:
@@ -218,12 +196,12 @@ def encode_welcome(facts: Mapping[str, Any], session: int) -> bytes:
     body = msgpack.packb(dict(facts))
     if len(body) > MAX_WELCOME_BYTES:
         raise MalformedMessage(f"WELCOME facts have {len(body)} bytes, allowed {MAX_WELCOME_BYTES}")
-    return encode_frame(MessageType.WELCOME, STRUCTS["WELCOME"].pack(SCHEMA, PROTOCOL_VERSION, 0) + body, session)
+    return encode_frame(MessageType.WELCOME, STRUCTS["WELCOME"].pack(SCHEMA, PROTOCOL_VERSION) + body, session)
 
 
 def decode_welcome(payload: bytes) -> Welcome:
     """Decode WELCOME; msgpack limits are set before anything is allocated."""
-    schema, protocol, _ = fields("WELCOME", payload, exact=False)
+    schema, protocol = fields("WELCOME", payload, exact=False)
     body = payload[STRUCTS["WELCOME"].size :]
     if len(body) > MAX_WELCOME_BYTES:
         raise MalformedMessage(f"WELCOME facts have {len(body)} bytes, allowed {MAX_WELCOME_BYTES}")
@@ -281,12 +259,12 @@ def decode_pong(payload: bytes) -> Pong:
 
 def encode_command(command_id: int, opcode: int, body: bytes, session: int) -> bytes:
     """Return a numbered command; `body` comes from one of the `pack_*` functions."""
-    return encode_frame(MessageType.COMMAND, STRUCTS["COMMAND"].pack(command_id, opcode, 0, 0) + body, session)
+    return encode_frame(MessageType.COMMAND, STRUCTS["COMMAND"].pack(command_id, opcode) + body, session)
 
 
 def decode_command(payload: bytes) -> CommandMessage:
     """Decode COMMAND; the body stays packed."""
-    command_id, opcode, _, _ = fields("COMMAND", payload, exact=False)
+    command_id, opcode = fields("COMMAND", payload, exact=False)
     return CommandMessage(command_id, opcode, payload[STRUCTS["COMMAND"].size :])
 
 
@@ -320,36 +298,33 @@ def decode_grant(payload: bytes) -> Grant:
 
 def encode_status(status: Status, session: int) -> bytes:
     """Return the device's state."""
-    packed = STRUCTS["STATUS"].pack(status.state, status.reason, 0, *status[2:])
-    return encode_frame(MessageType.STATUS, packed, session)
+    return encode_frame(MessageType.STATUS, STRUCTS["STATUS"].pack(*status), session)
 
 
 def decode_status(payload: bytes) -> Status:
     """Decode STATUS."""
-    state, reason, _, *rest = fields("STATUS", payload)
-    return Status(state, reason, *rest)
+    return Status(*fields("STATUS", payload))
 
 
 def encode_clicks(block: ClickBlock, session: int) -> bytes:
-    """Return a sequential click block."""
-    count = len(block.patterns)
-    head = STRUCTS["CLICKS"].pack(*block[:5], count, 0, block.object_index)
-    clicks = block.patterns.astype("<u2").tobytes() + np.packbits(block.bits, bitorder="little").tobytes()
-    return encode_frame(MessageType.CLICKS, head + clicks, session)
+    """Return a sequential block: CLICKS, or COUNTS where `block.largest` is above 1."""
+    head, patterns = (*block[:5], len(block.patterns)), block.patterns.astype("<u2").tobytes()
+    if block.largest > 1:
+        payload = STRUCTS["COUNTS"].pack(*head, block.largest, block.object_index) + patterns
+        return encode_frame(MessageType.COUNTS, payload + block.bits.astype(np.uint8).tobytes(), session)
+    payload = STRUCTS["CLICKS"].pack(*head, block.object_index) + patterns
+    return encode_frame(MessageType.CLICKS, payload + np.packbits(block.bits, bitorder="little").tobytes(), session)
 
 
 def decode_clicks(payload: bytes) -> ClickBlock:
     """Decode CLICKS; the arrays are fresh copies."""
-    seq, drops, tick, first, period, count, _, object_index = fields("CLICKS", payload, exact=False)
+    seq, drops, tick, first, period, count, object_index = fields("CLICKS", payload, exact=False)
     expected = BLOCK_HEADER_BYTES + 2 * count + (count + 7) // 8
-    if count == 0 or len(payload) != expected:
+    if len(payload) != expected:
         raise MalformedMessage(f"CLICKS of {count} exposures has {len(payload)} bytes, expected {expected}")
-    patterns = np.frombuffer(payload, _LITTLE_U16, count, BLOCK_HEADER_BYTES).astype(np.uint16)
-    if count <= 8:  # a short block is one that somebody waits for
-        bits = _BITS[payload[-1], :count].copy()
-    else:
-        packed = np.frombuffer(payload, np.uint8, -1, BLOCK_HEADER_BYTES + 2 * count)
-        bits = np.unpackbits(packed, count=count, bitorder="little")
+    patterns = np.frombuffer(payload, "<u2", count, BLOCK_HEADER_BYTES).astype(np.uint16)
+    packed = np.frombuffer(payload, np.uint8, -1, BLOCK_HEADER_BYTES + 2 * count)
+    bits = np.unpackbits(packed, count=count, bitorder="little")
     return ClickBlock(seq, drops, tick, first, period, object_index, patterns, bits)
 
 
@@ -364,19 +339,12 @@ def decode_frames(payload: bytes) -> FrameBlock:
     """Decode FRAMES; `words` is a read-only view of the payload."""
     seq, drops, tick, first, period, count, word_bytes, object_index = fields("FRAMES", payload, exact=False)
     expected = BLOCK_HEADER_BYTES + count * word_bytes
-    if count == 0 or word_bytes == 0 or len(payload) != expected:
+    if len(payload) != expected:
         raise MalformedMessage(
             f"FRAMES of {count} words of {word_bytes} bytes has {len(payload)} bytes, expected {expected}"
         )
     words = np.frombuffer(payload, np.uint8, count * word_bytes, BLOCK_HEADER_BYTES)
     return FrameBlock(seq, drops, tick, first, period, object_index, words.reshape(count, word_bytes))
-
-
-def encode_counts(block: ClickBlock, session: int) -> bytes:
-    """Return a block of photon numbers, at most `block.largest` each."""
-    head = STRUCTS["COUNTS"].pack(*block[:5], len(block.patterns), block.largest, block.object_index)
-    body = block.patterns.astype("<u2").tobytes() + block.bits.astype(np.uint8).tobytes()
-    return encode_frame(MessageType.COUNTS, head + body, session)
 
 
 def decode_counts(payload: bytes) -> ClickBlock:
@@ -402,3 +370,18 @@ def decode_mark(payload: bytes) -> Mark:
     """Decode MARK."""
     seq, object_index, truth, half_exposures, exposure_index, tick, photons = fields("MARK", payload)
     return Mark(seq, object_index, truth, exposure_index, tick, photons, half_exposures)
+
+
+STREAM_DECODERS: Mapping[int, Callable[[bytes], ClickBlock | FrameBlock | Mark]] = {
+    MessageType.CLICKS: decode_clicks,
+    MessageType.FRAMES: decode_frames,
+    MessageType.MARK: decode_mark,
+    MessageType.COUNTS: decode_counts,
+}
+DECODERS: Mapping[int, Callable[[bytes], Any]] = {  # of all that a device sends
+    MessageType.WELCOME: decode_welcome,
+    MessageType.PONG: decode_pong,
+    MessageType.ACK: decode_ack,
+    MessageType.STATUS: decode_status,
+    **STREAM_DECODERS,
+}

@@ -220,7 +220,9 @@ COUNT_MESSAGES: Mapping[str, tuple[Field, ...]] = {
     ),
     "COUNT_SUCCESSOR": (Field("next", "I", "successor", low=1, high=MAX_STATES + MAX_LEAVES - 1),),
 }
-ALL_MESSAGES: Mapping[str, tuple[Field, ...]] = {**MESSAGES, **AUTOMATON_MESSAGES, **COUNT_MESSAGES}
+_WHOLE = {**MESSAGES, **AUTOMATON_MESSAGES, **COUNT_MESSAGES}
+# without what is reserved: those are 0 when sent and not looked at when they come
+ALL_MESSAGES = {name: tuple(field for field in fields if field.name != "reserved") for name, fields in _WHOLE.items()}
 # the host checks these; a device refuses commands itself
 FROM_DEVICE = ("PONG", "ACK", "STATUS", "CLICKS", "FRAMES", "MARK", "COUNTS")
 
@@ -269,15 +271,6 @@ FACTS: Mapping[str, Fact] = {
     "photon_number_max": Fact(int, False, 1, MAX_PHOTON_NUMBER),
     "channels_at_once": Fact(int, False, 1, MAX_CHANNELS_AT_ONCE),
 }
-
-
-def layout(name: str) -> str:
-    """Return a message's layout in the notation of `struct`.
-
-    >>> layout("GRANT")
-    '<II'
-    """
-    return "<" + "".join(field.code for field in ALL_MESSAGES[name])
 
 
 def narrow_fields(name: str) -> tuple[tuple[int, Field], ...]:
@@ -393,22 +386,28 @@ class AckStatus(IntEnum):
     TOO_LATE = 5
 
 
-# The schema hash is computed from the layouts of fields.py, in its order, so that a change to any of them makes the two ends refuse each
+def _schema_text(head: str, messages: Mapping[str, tuple[Field, ...]]) -> str:
+    return head + "".join(f";{name}=<{''.join(field.code for field in fields)}" for name, fields in messages.items())
+
+
+def _struct(fields: tuple[Field, ...]) -> struct.Struct:
+    """Return the layout of a message, in which what is reserved is padding."""
+    codes = (f"{struct.calcsize(one.code)}x" if one.name == "reserved" else one.code for one in fields)
+    return struct.Struct("<" + "".join(codes))
+
+
+# The hash of a schema is that of its layouts in their order, so that a change to any of them makes the two ends refuse each
 # other at the handshake instead of misreading each other's bytes.
-LAYOUTS: dict[str, str] = {name: layout(name) for name in MESSAGES}
-SCHEMA_TEXT = f"pans-wire/{PROTOCOL_VERSION};" + ";".join(f"{name}={layout}" for name, layout in LAYOUTS.items())
-SCHEMA = zlib.crc32(SCHEMA_TEXT.encode("ascii"))
-AUTOMATON_LAYOUTS: dict[str, str] = {name: layout(name) for name in AUTOMATON_MESSAGES}
-AUTOMATON_SCHEMA_TEXT = "pans-automaton/1;" + ";".join(f"{name}={layout}" for name, layout in AUTOMATON_LAYOUTS.items())
-AUTOMATON_SCHEMA = zlib.crc32(AUTOMATON_SCHEMA_TEXT.encode("ascii"))
-COUNT_LAYOUTS: dict[str, str] = {name: layout(name) for name in COUNT_MESSAGES}
-COUNT_SCHEMA_TEXT = "pans-counts/1;" + ";".join(f"{name}={layout}" for name, layout in COUNT_LAYOUTS.items())
-COUNT_SCHEMA = zlib.crc32(COUNT_SCHEMA_TEXT.encode("ascii"))
-STRUCTS = {name: struct.Struct(layout) for name, layout in {**LAYOUTS, **AUTOMATON_LAYOUTS, **COUNT_LAYOUTS}.items()}
+SCHEMA_TEXT = _schema_text(f"pans-wire/{PROTOCOL_VERSION}", MESSAGES)
+AUTOMATON_SCHEMA_TEXT = _schema_text("pans-automaton/1", AUTOMATON_MESSAGES)
+COUNT_SCHEMA_TEXT = _schema_text("pans-counts/1", COUNT_MESSAGES)
+SCHEMA, AUTOMATON_SCHEMA, COUNT_SCHEMA = (
+    zlib.crc32(text.encode("ascii")) for text in (SCHEMA_TEXT, AUTOMATON_SCHEMA_TEXT, COUNT_SCHEMA_TEXT)
+)
+STRUCTS = {name: _struct(fields) for name, fields in _WHOLE.items()}
 HEADER = STRUCTS["HEADER"]
 UNSEEDED = (MessageType.HELLO, MessageType.WELCOME)  # readable across versions, so that a mismatch can be named
 SLOT_DTYPE = np.dtype([("offset_ticks", "<u8"), ("pattern", "<u2"), ("shot", "<u2")])
-STATE_DTYPE = np.dtype([("pattern", "<u2"), ("dwell", "<u2"), ("next_dark", "<u4"), ("next_click", "<u4")])
 # What CLICKS, FRAMES and COUNTS begin with, and MARK, behind the header of their frame; `width` is word_bytes, largest or nothing.
 BLOCK_DTYPE = np.dtype(
     [

@@ -21,10 +21,8 @@ UNKNOWN_STATUS = 0xFFFF
 HELLO_EVERY_NS = 200 * NS_PER_MS
 HELLO_GIVE_UP_NS = 5_000 * NS_PER_MS
 COMMAND_WINDOW = 8
-STREAM_TYPES = frozenset(
-    (int(MessageType.CLICKS), int(MessageType.FRAMES), int(MessageType.MARK), int(MessageType.COUNTS))
-)
-ANSWER_TYPES = frozenset(int(kind) for kind in (MessageType.WELCOME, MessageType.ACK, MessageType.PONG))
+STREAM_TYPES = frozenset(map(int, wire.STREAM_DECODERS))
+ANSWER_TYPES = frozenset((int(MessageType.WELCOME), int(MessageType.ACK), int(MessageType.PONG)))
 GRANT, _GRANT = int(MessageType.GRANT), wire.STRUCTS["GRANT"]
 RETRY_FIRST_NS = 250 * NS_PER_MS
 RETRY_LONGEST_NS = 2_000 * NS_PER_MS

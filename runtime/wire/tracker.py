@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from . import messages as wire
 from .framing import content_crc
-from .messages import ClickBlock, Frame, FrameBlock, Mark, MessageType, decode_counts
-from .schema import MAX_GAP_EXPOSURES, RECEIVE_WINDOW
+from .messages import STREAM_DECODERS, ClickBlock, Frame, FrameBlock, Mark
+from .schema import MAX_GAP_EXPOSURES, RECEIVE_WINDOW, MalformedMessage
 
 SEQUENCE = 1 << 32
 HALF_SEQUENCE = 1 << 31
@@ -81,8 +80,8 @@ class StreamTracker:
         """Take one stream frame; see the module's docstring."""
         self.differs = None
         try:
-            message = _decode(frame)
-        except wire.MalformedMessage:
+            message = STREAM_DECODERS[frame.type](frame.payload)
+        except (KeyError, MalformedMessage):  # another type, or a payload that makes no sense
             self.counters.malformed += 1
             return None, None
         ahead = (message.seq - self.next_seq) % SEQUENCE
@@ -194,15 +193,3 @@ class StreamTracker:
         self.counters.gaps += 1
         self.counters.lost_exposures += missing
         return Gap(self.next_exposure, missing, lost_messages, min(dropped, missing))
-
-
-def _decode(frame: Frame) -> ClickBlock | FrameBlock | Mark:
-    if frame.type == MessageType.CLICKS:
-        return wire.decode_clicks(frame.payload)
-    if frame.type == MessageType.FRAMES:
-        return wire.decode_frames(frame.payload)
-    if frame.type == MessageType.MARK:
-        return wire.decode_mark(frame.payload)
-    if frame.type == MessageType.COUNTS:
-        return decode_counts(frame.payload)
-    raise wire.MalformedMessage(f"type {frame.type:#04x} is no stream message")

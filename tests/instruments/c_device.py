@@ -16,7 +16,7 @@ from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.link.fit import upload_commands
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, pack_arm
+from pans.runtime.wire.commands import Arm, pack_command
 from pans.runtime.wire.messages import Frame, MessageType, Opcode
 
 MODES = ("sequential", "parallel", "device-driven", "host-driven")
@@ -72,7 +72,7 @@ class Pair:
     def arm(self, cycles: int, lease_ms: int = 5000, window: int = 1 << 20) -> None:
         """Grant and arm, for a start 5000 ticks ahead."""
         self.after(1, wire.encode_grant(wire.Grant(window, lease_ms), NONCE))
-        self.command(Opcode.ARM, pack_arm(Arm(self.tick + 5000, cycles, lease_ms)))
+        self.command(Opcode.ARM, pack_command(Arm(self.tick + 5000, cycles, lease_ms)))
 
     def differences(self) -> list[str]:
         """What the two have not said alike; the texts of refusals and of WELCOME are each device's own."""

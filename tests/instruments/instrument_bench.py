@@ -12,22 +12,12 @@ from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, Show, pack_arm, pack_pattern, pack_plan, pack_show
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MessageType, Opcode, decode_counts
+from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, Show, pack_command
+from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, Opcode
 
 NONCE = 0x11223344
 POWER_ON = 1000
 IDEAL = load_profile("ideal")  # 1 MHz clock, exposures from 10 us, no readout
-DECODERS: dict[int, Any] = {
-    MessageType.WELCOME: wire.decode_welcome,
-    MessageType.PONG: wire.decode_pong,
-    MessageType.ACK: wire.decode_ack,
-    MessageType.STATUS: wire.decode_status,
-    MessageType.CLICKS: wire.decode_clicks,
-    MessageType.FRAMES: wire.decode_frames,
-    MessageType.MARK: wire.decode_mark,
-    MessageType.COUNTS: decode_counts,
-}
 
 
 class Bench:
@@ -53,7 +43,7 @@ class Bench:
     def _keep(self, tick: int, sent: bytes) -> list[Any]:
         frames = self.decoder.feed(sent)
         assert all(frame.session == self.device.session for frame in frames)
-        messages = [DECODERS[frame.type](frame.payload) for frame in frames]
+        messages = [wire.DECODERS[frame.type](frame.payload) for frame in frames]
         self.got += [(tick, message) for message in messages]
         return messages
 
@@ -88,8 +78,8 @@ class Bench:
 
     def upload(self, levels: np.ndarray, shown: list[int], **changes: Any) -> None:
         for index, row in enumerate(levels):
-            self.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, 0, len(row), row)))
-        self.done(Opcode.LOAD_PLAN, pack_plan(plan(len(levels), shown, **changes)))
+            self.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(index, 0, len(row), row)))
+        self.done(Opcode.LOAD_PLAN, pack_command(plan(len(levels), shown, **changes)))
 
     def ready(self, levels: np.ndarray | None = None, shown: list[int] | None = None, **changes: Any) -> Bench:
         levels = np.full((2, 4), 100, np.uint16) if levels is None else levels
@@ -98,7 +88,7 @@ class Bench:
         return self
 
     def arm(self, start: int = 2000, cycles: int = 2, lease_ms: int = 100) -> Bench:
-        self.done(Opcode.ARM, pack_arm(Arm(start, cycles, lease_ms)))
+        self.done(Opcode.ARM, pack_command(Arm(start, cycles, lease_ms)))
         return self
 
     def granted(self) -> Bench:
@@ -144,14 +134,14 @@ def show(automaton: Automaton, state: int, exposure: int) -> Show:
 def run_hosted(bench: Bench, made: Plan, automaton: Automaton, cycles: int) -> tuple[np.ndarray, np.ndarray]:
     """Arm and name every state as soon as the reading before it is known."""
     start = bench.device.tick + 2000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 1_000_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(start, cycles, 1_000_000)))
     slots, node, messages = made.slots_per_cycle, 0, []
     for exposure in range(cycles * slots):
         cycle, slot = divmod(exposure, slots)
         node = node if slot else 0
         shown = made.slot_pattern[slot] == ADAPTIVE_PATTERN and node < automaton.n_states
         if shown:
-            bench.done(Opcode.SHOW, pack_show(show(automaton, node, exposure)))
+            bench.done(Opcode.SHOW, pack_command(show(automaton, node, exposure)))
         end = start + cycle * made.cycle_ticks + int(made.slot_offset_ticks[slot]) + made.exposure_ticks
         (block,) = of_type(bench.run_to(end), wire.ClickBlock)
         messages.append(block)

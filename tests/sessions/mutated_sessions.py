@@ -31,17 +31,16 @@ from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.replaying import replay
 from pans.runtime.report.summary import Summary, summarise
-from pans.runtime.wire import messages
 from pans.runtime.wire.framing import Frame, FrameDecoder, encode_frame
 from pans.runtime.wire.messages import (
     BLOCK_HEADER_BYTES,
+    DECODERS,
     NO_OBJECT,
     STRUCTS,
     DeviceState,
     MalformedMessage,
     MessageType,
     Opcode,
-    decode_counts,
 )
 from pans.runtime.wire.schema import ALL_MESSAGES, AUTOMATON_MESSAGES, Field, wrong_facts
 
@@ -211,7 +210,7 @@ class MutatedLink:
     def _excludes(self, mutation: Mutation, kind: int, old: bytes, new: bytes) -> bool:
         """Whether the changed message of that type makes no sense, or cannot be true."""
         try:
-            decoded = _decoded(kind, new)
+            decoded = DECODERS[kind](new)
         except MalformedMessage:
             return True
         if mutation.message == "WELCOME":
@@ -222,11 +221,6 @@ class MutatedLink:
             return False  # of no run, or of one that has not begun
         values = [field_of(payload, mutation) for payload in (old, new)]
         return self._evidence.excludes(mutation.message, mutation.name, *values)
-
-
-def _decoded(kind: int, payload: bytes) -> Any:
-    name = MessageType(kind).name.lower()
-    return decode_counts(payload) if kind == MessageType.COUNTS else getattr(messages, f"decode_{name}")(payload)
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ from pans.firmware_sim.device.stream_buffer import StreamBuffer
 from pans.firmware_sim.ports.virtual import VirtualLink
 from pans.runtime.link.base import Link
 from pans.runtime.wire import DeviceState, FrameDecoder, MessageType, Opcode, Status, decode_status
-from pans.runtime.wire.commands import Gate, unpack_gate
+from pans.runtime.wire.commands import Gate, unpack_command
 from pans.runtime.wire.messages import ClickBlock, Mark, decode_ack, decode_command, pack_body
 from pans.runtime.wire.session import ANSWER_TYPES, STREAM_TYPES
 
@@ -76,7 +76,7 @@ class LoggedInstrument(Instrument):
 
     def _gate(self, body: bytes) -> None:
         super()._gate(body)
-        self.log.pulses.append((self.session, unpack_gate(body), self.tick))
+        self.log.pulses.append((self.session, unpack_command(Gate, body), self.tick))
 
 
 class SlowReads(VirtualLink):
@@ -161,7 +161,7 @@ class ObservedLink:
                     self._armed = True
                     self.heard.setdefault(self._session, Heard())
                 elif command.opcode == Opcode.GATE:
-                    self.gates[self._session, command.command_id] = unpack_gate(command.body)
+                    self.gates[self._session, command.command_id] = unpack_command(Gate, command.body)
 
     def now_ns(self) -> int:
         """See `Link.now_ns`."""

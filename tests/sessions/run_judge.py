@@ -24,14 +24,10 @@ from pans.runtime.record import Recording
 from pans.runtime.record.replaying import replay
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
+    STREAM_DECODERS,
     ClickBlock,
     Frame,
     Mark,
-    MessageType,
-    decode_clicks,
-    decode_counts,
-    decode_frames,
-    decode_mark,
     unpack_body,
 )
 from pans.runtime.wire.session import STREAM_TYPES
@@ -217,7 +213,7 @@ class Judge:
 
     def _accept(self, frame: Frame, log: DeviceLog, spans: list[tuple[int, int]], sequence: dict[int, int]) -> None:
         """Take one message by the rule of the protocol: numbers go up, and what comes behind its time is useless."""
-        message = _decoded(frame)
+        message = STREAM_DECODERS[frame.type](frame.payload)
         if message.seq < sequence.get(frame.session, 0):
             return
         sequence[frame.session] = message.seq + 1
@@ -334,11 +330,6 @@ class Judge:
         found = int(row["counts_crc"]), int(row["exposures"]), int(row["exposure_index"])
         if flagged or found != wanted:
             self.fail(f"decision {row['index']}: clicks, exposures and the last are {found}, emitted were {wanted}")
-
-
-def _decoded(frame: Frame) -> Any:
-    decode = {MessageType.CLICKS: decode_clicks, MessageType.COUNTS: decode_counts, MessageType.FRAMES: decode_frames}
-    return decode.get(MessageType(frame.type), decode_mark)(frame.payload)
 
 
 def _words(readings: np.ndarray) -> np.ndarray:

@@ -29,15 +29,10 @@ from pans.runtime.wire.commands import (
     StateChunk,
     announced,
     mask_chunks,
-    pack_arm,
-    pack_masks,
-    pack_pattern,
-    pack_plan,
-    pack_show,
-    pack_states,
+    pack_command,
+    state_dtype,
 )
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
-from pans.runtime.wire.schema import STATE_DTYPE
 
 IMAGES = np.random.default_rng(3).integers(0, 256, (5, 2, 3)).astype(np.uint8)
 SCENE = scene_from_arrays("five", IMAGES, np.arange(5) % 3, ("c0", "c1", "c2"))
@@ -70,11 +65,11 @@ def set_up(automaton: Automaton, drive: str, profile: Profile | None = None, **o
 
 def upload(bench: Bench, levels: np.ndarray, made: Plan) -> None:
     for masks in mask_chunks(levels):
-        bench.done(Opcode.LOAD_MASKS, pack_masks(masks))
+        bench.done(Opcode.LOAD_MASKS, pack_command(masks))
     for chunk in plan_chunks(made):
-        bench.done(Opcode.LOAD_PLAN, pack_plan(chunk))
+        bench.done(Opcode.LOAD_PLAN, pack_command(chunk))
     for states in state_chunks(made):
-        bench.done(Opcode.LOAD_STATES, pack_states(states))
+        bench.done(Opcode.LOAD_STATES, pack_command(states))
 
 
 def bright(automaton: Automaton, drive: str = "device", **options: Any) -> tuple[Bench, Plan]:
@@ -87,7 +82,7 @@ def bright(automaton: Automaton, drive: str = "device", **options: Any) -> tuple
 def run(bench: Bench, made: Plan, cycles: int, start: int = 2000) -> tuple[np.ndarray, np.ndarray, list[Any]]:
     """Arm, run to the end, and return stamps, clicks and all messages."""
     start = bench.device.tick + start
-    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 100_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(start, cycles, 100_000)))
     messages = bench.run_to(start + cycles * made.cycle_ticks)
     return (*stamps_and_readings(messages), messages)
 
@@ -207,7 +202,7 @@ def test_a_changing_detector_gives_both_ways_the_same_walks_and_other_ones_than_
 @given(st.lists(st.integers(1, 3000), min_size=1, max_size=20))
 def test_the_size_of_time_steps_changes_nothing(cuts: list[int]) -> None:
     bench, made = bright(six_states())
-    bench.done(Opcode.ARM, pack_arm(Arm(bench.device.tick + 100, 40, 100_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(bench.device.tick + 100, 40, 100_000)))
     for cut in cuts:
         bench.run_to(bench.device.tick + cut)
     bench.run_to(bench.device.tick + 41 * made.cycle_ticks)
@@ -217,7 +212,7 @@ def test_the_size_of_time_steps_changes_nothing(cuts: list[int]) -> None:
 
 def test_work_that_is_done_ahead_changes_nothing_and_ends() -> None:
     bench, made = bright(six_states())
-    bench.done(Opcode.ARM, pack_arm(Arm(bench.device.tick + 100, 40, 100_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(bench.device.tick + 100, 40, 100_000)))
     assert [bench.device.draw_ahead() for _ in range(4)] == [True, True, True, False]  # three objects
     for _ in range(100):
         bench.run_to(bench.device.tick + made.cycle_ticks // 2)
@@ -230,7 +225,7 @@ def test_work_that_is_done_ahead_changes_nothing_and_ends() -> None:
 def test_a_broken_off_walk_is_sent_as_far_as_it_went() -> None:
     bench, made = bright(six_states())
     start = bench.device.tick + 100
-    bench.done(Opcode.ARM, pack_arm(Arm(start, 10, 100_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(start, 10, 100_000)))
     bench.run_to(start + 3 * made.cycle_ticks + 2 * made.slot_period_ticks + made.exposure_ticks + 1)
     bench.done(Opcode.STOP)
     stamps, clicks = stamps_and_readings([message for _, message in bench.got])
@@ -279,14 +274,14 @@ def hosted() -> tuple[Bench, Plan, int]:
     """A bench that is armed and waits for SHOW; the run has two cycles of a dark and four adaptive slots."""
     bench, made = bright(six_states(), "host")
     start = bench.device.tick + 1000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, 2, 100_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(start, 2, 100_000)))
     return bench, made, start
 
 
 def test_the_latest_name_of_an_exposure_counts() -> None:
     bench, made, start = hosted()
     for state in (0, 1, 4):
-        bench.done(Opcode.SHOW, pack_show(show(six_states(), state, 1)))
+        bench.done(Opcode.SHOW, pack_command(show(six_states(), state, 1)))
     bench.run_to(start + made.cycle_ticks)
     assert stamps_and_readings([message for _, message in bench.got])[0].tolist() == [
         DARK_PATTERN,
@@ -299,15 +294,15 @@ def test_the_latest_name_of_an_exposure_counts() -> None:
 
 
 def states(*rows: tuple[int, int, int, int], **changes: Any) -> StateChunk:
-    chunk = StateChunk(len(rows), 0, 1, 2, np.array(list(rows), STATE_DTYPE))
+    chunk = StateChunk(len(rows), 0, 1, 2, 2, np.array([(*row[:2], row[2:]) for row in rows], state_dtype(2)))
     return chunk._replace(**changes)
 
 
 def with_plan(slots: int = 2, profile: Profile | None = None) -> Bench:
     bench = Bench(profile or instrument(), SCENE)
     bench.hello()
-    bench.done(Opcode.LOAD_MASKS, pack_masks(MaskChunk(0, 0, 6, 6, np.ones((2, 1), np.uint8))))
-    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [ADAPTIVE_PATTERN] * slots)))
+    bench.done(Opcode.LOAD_MASKS, pack_command(MaskChunk(0, 0, 6, 6, np.ones((2, 1), np.uint8))))
+    bench.done(Opcode.LOAD_PLAN, pack_command(plan(2, [ADAPTIVE_PATTERN] * slots)))
     return bench
 
 
@@ -315,16 +310,16 @@ def test_states_in_pieces_and_a_plan_that_forgets_them() -> None:
     bench = with_plan()
     whole = states((0, 1, 1, 2), (1, 1, 2, 3))
     first, second = (whole._replace(first_state=n, states=whole.states[n : n + 1]) for n in (0, 1))
-    arm = pack_arm(Arm(bench.device.tick + 10_000, 1, 1000))
-    bench.done(Opcode.LOAD_STATES, pack_states(first))
+    arm = pack_command(Arm(bench.device.tick + 10_000, 1, 1000))
+    bench.done(Opcode.LOAD_STATES, pack_command(first))
     assert bench.refused(Opcode.ARM, arm)[0] == AckStatus.WRONG_STATE
-    assert bench.refused(Opcode.LOAD_STATES, pack_states(second._replace(n_leaves=3)))[0] == AckStatus.OUT_OF_RANGE
-    bench.done(Opcode.LOAD_STATES, pack_states(second))
+    assert bench.refused(Opcode.LOAD_STATES, pack_command(second._replace(n_leaves=3)))[0] == AckStatus.OUT_OF_RANGE
+    bench.done(Opcode.LOAD_STATES, pack_command(second))
     assert bench.device._states.states is not None
-    assert bench.refused(Opcode.LOAD_STATES, pack_states(second))[0] == AckStatus.OUT_OF_RANGE
-    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [ADAPTIVE_PATTERN] * 2)))
+    assert bench.refused(Opcode.LOAD_STATES, pack_command(second))[0] == AckStatus.OUT_OF_RANGE
+    bench.done(Opcode.LOAD_PLAN, pack_command(plan(2, [ADAPTIVE_PATTERN] * 2)))
     assert bench.device._states.states is None
-    assert bench.refused(Opcode.LOAD_STATES, pack_states(second))[0] == AckStatus.OUT_OF_RANGE
+    assert bench.refused(Opcode.LOAD_STATES, pack_command(second))[0] == AckStatus.OUT_OF_RANGE
     bench.done(Opcode.ARM, arm)  # without states: the host drives
 
 
@@ -333,11 +328,11 @@ def test_masks_are_patterns_of_two_levels() -> None:
     bench.hello()
     rows = np.random.default_rng(0).integers(0, 2, (5, 13)).astype(np.uint8)
     packed = np.packbits(rows, axis=1, bitorder="little")
-    bench.done(Opcode.LOAD_MASKS, pack_masks(MaskChunk(3, 0, 13, 13, packed)))
-    bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(0, 0, 13, rows[0].astype(np.uint16))))
-    bench.done(Opcode.LOAD_MASKS, pack_masks(MaskChunk(1, 0, 13, 8, packed[1:2, :1])))
-    bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(1, 8, 13, rows[1, 8:].astype(np.uint16))))
-    bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(2, 0, 13, rows[2].astype(np.uint16))))
+    bench.done(Opcode.LOAD_MASKS, pack_command(MaskChunk(3, 0, 13, 13, packed)))
+    bench.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(0, 0, 13, rows[0].astype(np.uint16))))
+    bench.done(Opcode.LOAD_MASKS, pack_command(MaskChunk(1, 0, 13, 8, packed[1:2, :1])))
+    bench.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(1, 8, 13, rows[1, 8:].astype(np.uint16))))
+    bench.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(2, 0, 13, rows[2].astype(np.uint16))))
     held = bench.device._patterns.stack(8)
     assert np.array_equal(held, rows[[0, 1, 2, 0, 1, 2, 3, 4]])
     assert bench.device._patterns.held_bytes == held.nbytes
@@ -347,7 +342,7 @@ def test_large_masks_go_in_pieces_and_small_ones_together() -> None:
     levels = np.random.default_rng(0).integers(0, 2, (3, 200_003)).astype(np.uint16)
     bench = Bench(instrument(), SCENE)
     bench.hello()
-    bodies = [pack_masks(chunk) for chunk in mask_chunks(levels)]
+    bodies = [pack_command(chunk) for chunk in mask_chunks(levels)]
     assert max(map(len, bodies)) < 9000
     for body in bodies:
         bench.done(Opcode.LOAD_MASKS, body)
@@ -366,5 +361,5 @@ def test_what_the_device_announces() -> None:
     parallel = Bench(load_profile("wdm-snspd"))
     (welcome, _) = parallel.hello()
     assert announced(welcome.facts) is None
-    status, _ = parallel.refused(Opcode.LOAD_STATES, pack_states(states((0, 1, 1, 2))))
+    status, _ = parallel.refused(Opcode.LOAD_STATES, pack_command(states((0, 1, 1, 2))))
     assert status == AckStatus.UNKNOWN_OPCODE

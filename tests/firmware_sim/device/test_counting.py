@@ -24,13 +24,10 @@ from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import (
     Arm,
     PatternChunk,
+    ReadCounts,
     announced_counts,
     mask_chunks,
-    pack_arm,
-    pack_masks,
-    pack_pattern,
-    pack_plan,
-    pack_read_counts,
+    pack_command,
 )
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
 
@@ -67,7 +64,7 @@ def set_up(automaton: Automaton, drive: str, profile: Profile | None = None, sce
     bench = Bench(profile, scene, seed=7)
     bench.hello()
     for masks in mask_chunks(bundle.pattern_levels):
-        bench.done(Opcode.LOAD_MASKS, pack_masks(masks))
+        bench.done(Opcode.LOAD_MASKS, pack_command(masks))
     for opcode, body in plan_commands(made):
         bench.done(opcode, body)
     bench.grant()
@@ -76,7 +73,7 @@ def set_up(automaton: Automaton, drive: str, profile: Profile | None = None, sce
 
 def run(bench: Bench, made: Plan, cycles: int) -> tuple[np.ndarray, np.ndarray]:
     start = bench.device.tick + 2000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 1_000_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(start, cycles, 1_000_000)))
     return stamps_and_readings(bench.run_to(start + cycles * made.cycle_ticks))
 
 
@@ -86,15 +83,15 @@ def test_fixed_patterns_are_counted_as_the_physics_says() -> None:
     bench.hello()
     levels = [np.ones(6, np.uint16), np.array([1, 0, 0, 0, 0, 0], np.uint16)]
     for number, pattern in enumerate(levels):
-        bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(number, 0, 6, pattern)))
+        bench.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(number, 0, 6, pattern)))
     ticks = round(1000e-6 * profile.clock.tick_hz)  # a lit pixel gives LIGHT
     plan = fixed_plan(2, [0, 1, DARK_PATTERN], exposure_ticks=ticks, slot_period_ticks=2 * ticks, cycle_ticks=6 * ticks)
     plan.slots["offset_ticks"] = np.arange(3) * 2 * ticks
-    bench.done(Opcode.LOAD_PLAN, pack_plan(plan))
-    bench.done(Opcode.READ_COUNTS, pack_read_counts(4))
+    bench.done(Opcode.LOAD_PLAN, pack_command(plan))
+    bench.done(Opcode.READ_COUNTS, pack_command(ReadCounts(4)))
     bench.grant(1 << 20)
     cycles, start = 2500, bench.device.tick + 2000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 3_600_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(start, cycles, 3_600_000)))
     messages = bench.run_to(start + cycles * plan.cycle_ticks)
     shown, numbers = stamps_and_readings(messages)
     assert {block.largest for block in of_type(messages, wire.ClickBlock)} == {4}
@@ -110,9 +107,9 @@ def test_fixed_patterns_are_counted_as_the_physics_says() -> None:
             assert chi2 < 24, (place, number, found, wanted)  # of at most 4 degrees: once in 10 000
     marks = of_type(messages, wire.Mark)
     assert marks[1].photons == pytest.approx(LIGHT * IMAGES[1].sum() / 255 + LIGHT * IMAGES[1].flat[0] / 255, rel=1e-3)
-    bench.done(Opcode.LOAD_PLAN, pack_plan(plan))  # clicks again
+    bench.done(Opcode.LOAD_PLAN, pack_command(plan))  # clicks again
     start = bench.device.tick + 2000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, 30, 3_600_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(start, 30, 3_600_000)))
     again = of_type(bench.run_to(start + 30 * plan.cycle_ticks), wire.ClickBlock)
     assert {block.largest for block in again} == {1}
     assert max(int(block.bits.max()) for block in again) == 1
@@ -124,13 +121,13 @@ def test_an_object_that_stays_for_ever_is_counted_as_one_that_goes() -> None:
     for cycles_per_object in (3000, (1 << 32) - 1):
         bench = Bench(instrument(), SCENE, seed=3)
         bench.hello()
-        bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(0, 0, 6, np.ones(6, np.uint16))))
+        bench.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(0, 0, 6, np.ones(6, np.uint16))))
         times = {"exposure_ticks": 10_000, "slot_period_ticks": 20_000, "cycle_ticks": 20_000}
-        bench.done(Opcode.LOAD_PLAN, pack_plan(fixed_plan(1, [0], cycles_per_object=cycles_per_object, **times)))
-        bench.done(Opcode.READ_COUNTS, pack_read_counts(4))
+        bench.done(Opcode.LOAD_PLAN, pack_command(fixed_plan(1, [0], cycles_per_object=cycles_per_object, **times)))
+        bench.done(Opcode.READ_COUNTS, pack_command(ReadCounts(4)))
         bench.grant(1 << 20)
         start = bench.device.tick + 2000
-        bench.done(Opcode.ARM, pack_arm(Arm(start, 3000, 3_600_000)))
+        bench.done(Opcode.ARM, pack_command(Arm(start, 3000, 3_600_000)))
         drawn.append(stamps_and_readings(bench.run_to(start + 3000 * 20_000))[1].tolist())
     assert len(drawn[0]) == 3000
     assert drawn[0] == drawn[1]
@@ -162,7 +159,7 @@ def test_what_a_walk_brings_is_told_in_its_mark() -> None:
     automaton = random_automaton(5, slots=4, width=3, patterns=6, outcomes=3)
     bench, made = set_up(automaton, "device", instrument())
     start = bench.device.tick + 2000
-    bench.done(Opcode.ARM, pack_arm(Arm(start, 2, 100_000)))
+    bench.done(Opcode.ARM, pack_command(Arm(start, 2, 100_000)))
     (mark, *_) = of_type(bench.run_to(start + made.cycle_ticks), wire.Mark)
     lambdas = LIGHT * IMAGES[0].reshape(6) / 255.0 @ automaton_bundle(automaton).pattern_levels.astype(float).T
     seconds = made.exposure_us * 1e-6
@@ -199,4 +196,4 @@ def test_clicks_alone_are_announced_by_who_does_not_count() -> None:
     bench = Bench(load_profile("dmd-spad"), SCENE)
     bench.hello()
     for opcode in (Opcode.READ_COUNTS, Opcode.LOAD_COUNT_STATES):
-        assert bench.refused(opcode, pack_read_counts(2))[0] == AckStatus.UNKNOWN_OPCODE
+        assert bench.refused(opcode, pack_command(ReadCounts(2)))[0] == AckStatus.UNKNOWN_OPCODE

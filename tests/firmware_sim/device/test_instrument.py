@@ -19,7 +19,7 @@ from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.runtime.instrument.click_law import click_law, click_probability, object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, Gate, PatternChunk, pack_arm, pack_gate, pack_pattern, pack_plan
+from pans.runtime.wire.commands import Arm, Gate, PatternChunk, pack_command
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
     AckStatus,
@@ -108,7 +108,7 @@ def test_blocks_end_at_their_length_at_a_gap_and_at_the_cycle() -> None:
     slots = slots_at([0, 1, 0, 1, 0, 1])
     slots["offset_ticks"][4:] += 50
     bench = Bench().ready()
-    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [0] * 6, slots=slots, cycle_ticks=650, block_exposures=3)))
+    bench.done(Opcode.LOAD_PLAN, pack_command(plan(2, [0] * 6, slots=slots, cycle_ticks=650, block_exposures=3)))
     bench.arm(cycles=1).granted()
     blocks = of_type(bench.run_to(4000), wire.ClickBlock)
     assert [(block.exposure_index, block.tick, len(block.bits)) for block in blocks] == [
@@ -199,9 +199,9 @@ def test_word_bytes(channels: int, expected: int) -> None:
 def conversation(bench: Bench) -> bytes:
     """All that a host would send before its run, as one string."""
     patterns = np.full((2, 4), 9000, np.uint16)
-    bodies = [(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(i, 0, 4, row))) for i, row in enumerate(patterns)]
-    bodies.append((Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 1, DARK_PATTERN]))))
-    bodies.append((Opcode.ARM, pack_arm(Arm(2000, 20, 50))))
+    bodies = [(Opcode.LOAD_PATTERN, pack_command(PatternChunk(i, 0, 4, row))) for i, row in enumerate(patterns)]
+    bodies.append((Opcode.LOAD_PLAN, pack_command(plan(2, [0, 1, DARK_PATTERN]))))
+    bodies.append((Opcode.ARM, pack_command(Arm(2000, 20, 50))))
     commands = [wire.encode_command(number, *body, NONCE) for number, body in enumerate(bodies, start=1)]
     ping, grant = wire.encode_ping(1, 5, NONCE), wire.encode_grant(wire.Grant(1000, 0), NONCE)
     return wire.encode_hello(NONCE) + ping + b"".join(commands) + b"\x07garbage\0" + grant
@@ -236,7 +236,7 @@ def test_time_does_not_go_back() -> None:
 
 
 def pattern_body(**changes: Any) -> bytes:
-    return pack_pattern(PatternChunk(0, 0, 2, np.array([1, 2], np.uint16))._replace(**changes))
+    return pack_command(PatternChunk(0, 0, 2, np.array([1, 2], np.uint16))._replace(**changes))
 
 
 def test_levels_above_the_projector_are_refused() -> None:
@@ -258,7 +258,7 @@ def test_pattern_memory_is_limited_in_bytes() -> None:
 def test_patterns_may_not_change_faster_than_the_projector() -> None:
     profile = replace(IDEAL, projector=replace(IDEAL.projector, pattern_rate_max_hz=5000.0))
     bench = Bench(profile).ready(shown=[0, 0, 1, 1])  # each shown for two exposures: 200 us
-    status, said = bench.refused(Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 0, 1, 0])))
+    status, said = bench.refused(Opcode.LOAD_PLAN, pack_command(plan(2, [0, 0, 1, 0])))
     assert status == AckStatus.OUT_OF_RANGE
     assert "patterns change after 100 ticks" in said
 
@@ -266,18 +266,18 @@ def test_patterns_may_not_change_faster_than_the_projector() -> None:
 def test_a_plan_in_two_chunks() -> None:
     bench = Bench().ready()
     whole = plan(2, [0, 1, 0, 1])
-    bench.done(Opcode.LOAD_PLAN, pack_plan(whole._replace(slots=whole.slots[:3])))
-    assert bench.refused(Opcode.ARM, pack_arm(Arm(2000, 1, 100)))[0] == AckStatus.WRONG_STATE
+    bench.done(Opcode.LOAD_PLAN, pack_command(whole._replace(slots=whole.slots[:3])))
+    assert bench.refused(Opcode.ARM, pack_command(Arm(2000, 1, 100)))[0] == AckStatus.WRONG_STATE
     other = whole._replace(first_slot=3, slots=whole.slots[3:])
-    assert "does not continue" in bench.refused(Opcode.LOAD_PLAN, pack_plan(other._replace(exposure_ticks=90)))[1]
-    bench.done(Opcode.LOAD_PLAN, pack_plan(other))
+    assert "does not continue" in bench.refused(Opcode.LOAD_PLAN, pack_command(other._replace(exposure_ticks=90)))[1]
+    bench.done(Opcode.LOAD_PLAN, pack_command(other))
     bench.arm(cycles=1).granted()
     assert len(of_type(bench.run_to(3000), wire.ClickBlock)[0].bits) == 4
 
 
 def test_a_scene_of_another_shape_is_refused_with_the_numbers() -> None:
     scene = scene_from_arrays("small", np.zeros((1, 5, 5), np.uint8), None, ())
-    status, said = Bench(scene=scene).ready().refused(Opcode.ARM, pack_arm(Arm(2000, 1, 100)))
+    status, said = Bench(scene=scene).ready().refused(Opcode.ARM, pack_command(Arm(2000, 1, 100)))
     assert status == AckStatus.OUT_OF_RANGE
     assert "4 pixels, scene 'small' has 25" in said
 
@@ -303,7 +303,7 @@ def test_no_frame_brings_the_device_down(payload: bytes, kind: int) -> None:
 def test_an_expired_lease_latches_the_device_dark() -> None:
     bench = Bench().ready().arm(start=2000, cycles=0, lease_ms=10)
     bench.grant(lease_ms=0)  # no renewal
-    bench.done(Opcode.GATE, pack_gate(Gate(10_500, 5000, 2)))
+    bench.done(Opcode.GATE, pack_command(Gate(10_500, 5000, 2)))
     bench.run_to(10_900)
     assert bench.device.projector_lit
     assert bench.gate_open(2)
@@ -315,7 +315,7 @@ def test_an_expired_lease_latches_the_device_dark() -> None:
     assert of_type(bench.run_to(500_000), wire.ClickBlock) == []
     bench.grant(lease_ms=1000)
     assert bench.device.state is DeviceState.SAFE
-    assert bench.refused(Opcode.ARM, pack_arm(Arm(600_000, 1, 9)))[0] == AckStatus.WRONG_STATE
+    assert bench.refused(Opcode.ARM, pack_command(Arm(600_000, 1, 9)))[0] == AckStatus.WRONG_STATE
     bench.hello()
     assert bench.device.state is DeviceState.SAFE  # it outlives the session
     bench.done(Opcode.RESET)
@@ -335,7 +335,7 @@ def test_an_exposure_broken_off_is_no_exposure() -> None:
 
 def test_a_gate_opens_at_its_tick_for_its_time() -> None:
     bench = Bench().ready().arm(cycles=0)
-    bench.done(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))
+    bench.done(Opcode.GATE, pack_command(Gate(3000, 50, 1)))
     assert list(bench.device.gates.pulses) == [GatePulse(3000, 3050, 1)]
     states = []
     for tick in (2999, 3000, 3049, 3050):
@@ -347,12 +347,12 @@ def test_a_gate_opens_at_its_tick_for_its_time() -> None:
 
 def test_a_late_gate_is_not_executed() -> None:
     bench = Bench().ready()
-    assert bench.refused(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))[0] == AckStatus.WRONG_STATE
+    assert bench.refused(Opcode.GATE, pack_command(Gate(3000, 50, 1)))[0] == AckStatus.WRONG_STATE
     bench.arm(cycles=0)
     bench.run_to(3000)
-    assert bench.refused(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))[0] == AckStatus.TOO_LATE
-    assert bench.refused(Opcode.GATE, pack_gate(Gate(4000, 50, GATE_CHANNELS)))[0] == AckStatus.OUT_OF_RANGE
-    assert bench.refused(Opcode.GATE, pack_gate(Gate(4000, 0, 1)))[0] == AckStatus.OUT_OF_RANGE
+    assert bench.refused(Opcode.GATE, pack_command(Gate(3000, 50, 1)))[0] == AckStatus.TOO_LATE
+    assert bench.refused(Opcode.GATE, pack_command(Gate(4000, 50, GATE_CHANNELS)))[0] == AckStatus.OUT_OF_RANGE
+    assert bench.refused(Opcode.GATE, pack_command(Gate(4000, 0, 1)))[0] == AckStatus.OUT_OF_RANGE
     gates = bench.device.gates
     assert not gates.pulses
     assert list(gates.refusals) == [
@@ -365,8 +365,8 @@ def test_a_late_gate_is_not_executed() -> None:
 
 def test_stop_closes_gates_and_cancels_those_to_come() -> None:
     bench = Bench().ready().arm(cycles=0)
-    bench.done(Opcode.GATE, pack_gate(Gate(3000, 5000, 1)))
-    bench.done(Opcode.GATE, pack_gate(Gate(9000, 50, 2)))
+    bench.done(Opcode.GATE, pack_command(Gate(3000, 5000, 1)))
+    bench.done(Opcode.GATE, pack_command(Gate(9000, 50, 2)))
     bench.run_to(4000)
     bench.done(Opcode.STOP)
     assert list(bench.device.gates.pulses) == [GatePulse(3000, 4000, 1)]
@@ -375,11 +375,11 @@ def test_stop_closes_gates_and_cancels_those_to_come() -> None:
 def test_pending_gates_are_limited() -> None:
     bench = Bench().ready().arm(cycles=0)
     for number in range(MAX_PENDING_GATES):
-        bench.done(Opcode.GATE, pack_gate(Gate(5000 + number, 1, 0)))
-    assert "pending" in bench.refused(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))[1]
+        bench.done(Opcode.GATE, pack_command(Gate(5000 + number, 1, 0)))
+    assert "pending" in bench.refused(Opcode.GATE, pack_command(Gate(9000, 1, 0)))[1]
     bench.run_to(5000)
-    bench.done(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))
-    assert "pending" in bench.refused(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))[1]
+    bench.done(Opcode.GATE, pack_command(Gate(9000, 1, 0)))
+    assert "pending" in bench.refused(Opcode.GATE, pack_command(Gate(9000, 1, 0)))[1]
     assert (bench.device.gates.accepted, bench.device.gates.refused) == (MAX_PENDING_GATES + 1, 2)
 
 

@@ -32,10 +32,7 @@ from pans.runtime.wire.commands import (
     Gate,
     PatternChunk,
     PlanChunk,
-    pack_arm,
-    pack_gate,
-    pack_pattern,
-    pack_plan,
+    pack_command,
 )
 from pans.runtime.wire.messages import SLOT_DTYPE, DeviceState, Opcode
 
@@ -180,7 +177,7 @@ def story(device: Any, seed: int, ahead: Callable[[], int]) -> tuple[bytes, list
     for run in range(2):
         command(Opcode.STOP, b"")
         command(Opcode.RESET, b"")
-        command(Opcode.ARM, pack_arm(Arm(tick + 500, 900 if run else 0, 5)))
+        command(Opcode.ARM, pack_command(Arm(tick + 500, 900 if run else 0, 5)))
         for _ in range(80):
             tick += dice.choice([1, 50, 777, 5000, 30_000, 200_000])
             what = dice.random()
@@ -190,7 +187,7 @@ def story(device: Any, seed: int, ahead: Callable[[], int]) -> tuple[bytes, list
                 limit = limit + dice.randrange(60) if closed else 1 << 30
                 step(wire.encode_grant(wire.Grant(limit, 5), SESSION))
             elif what < 0.7:
-                command(Opcode.GATE, pack_gate(Gate(tick + dice.choice([-5, 0, 1, 9999]), 10, 1)))
+                command(Opcode.GATE, pack_command(Gate(tick + dice.choice([-5, 0, 1, 9999]), 10, 1)))
             else:
                 step(b"")
         tick += dice.choice([1, 2_000_000])  # beyond the lease, or not
@@ -209,7 +206,7 @@ def instrument(name: str, capacity: int, one_by_one: bool, changes: tuple[Change
     ticks, slots = round(5e-6 * profile.clock.tick_hz), np.zeros(40, SLOT_DTYPE)
     slots["offset_ticks"] = np.arange(40) * ticks
     plan = PlanChunk(PARALLEL, 10, 40, 0, ticks, ticks, ticks * 40, 40, 1, slots)
-    bodies = [(Opcode.LOAD_PATTERN, pack_pattern(chunk)) for chunk in chunks] + [(Opcode.LOAD_PLAN, pack_plan(plan))]
+    bodies = [(Opcode.LOAD_PATTERN, pack_command(chunk)) for chunk in chunks] + [(Opcode.LOAD_PLAN, pack_command(plan))]
     for number, (opcode, body) in enumerate(bodies, start=1):
         device.step(0, wire.encode_command(number, opcode, body, SESSION))
     device.view = replace(device.view, scene=replace(device.view.scene, changes=changes))

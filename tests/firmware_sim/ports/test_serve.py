@@ -28,7 +28,7 @@ from pans.runtime.errors import ConfigError, LinkError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link, open_link
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_arm, pack_pattern, pack_plan
+from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_command
 from pans.runtime.wire.messages import SLOT_DTYPE, DeviceState, MessageType, Opcode, StateReason
 from pans.runtime.wire.session import HostSession
 
@@ -157,8 +157,8 @@ def run_of(link: Link, n_cycles: int = 20, lease_ms: int = 60_000) -> tuple[list
     slots["offset_ticks"], slots["pattern"] = [0, 100, 200], [0, 1, wire.DARK_PATTERN]
     for index in range(2):
         levels = np.full(2, 2000 * (index + 1), np.uint16)
-        session.submit(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, 0, 2, levels)))
-    session.submit(Opcode.LOAD_PLAN, pack_plan(PlanChunk(0, 2, 3, 0, 90, 100, 300, 16, 1, slots)))
+        session.submit(Opcode.LOAD_PATTERN, pack_command(PatternChunk(index, 0, 2, levels)))
+    session.submit(Opcode.LOAD_PLAN, pack_command(PlanChunk(0, 2, 3, 0, 90, 100, 300, 16, 1, slots)))
     session.grant(1 << 20, 0)
     session.probe(link.now_ns())
     raw, messages, armed = b"", [], False
@@ -167,7 +167,7 @@ def run_of(link: Link, n_cycles: int = 20, lease_ms: int = 60_000) -> tuple[list
         if session.pongs and session.settled and not armed:
             armed = True
             start_tick = session.pongs[-1][0].tx_tick + 200_000
-            session.submit(Opcode.ARM, pack_arm(Arm(start_tick, n_cycles, lease_ms)))
+            session.submit(Opcode.ARM, pack_command(Arm(start_tick, n_cycles, lease_ms)))
         session.poll(link.now_ns())
         link.write(session.take_output())
         data = link.read(0.05)

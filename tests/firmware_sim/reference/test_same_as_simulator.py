@@ -9,7 +9,7 @@ import pytest
 from c_device import MODES, NONCE, Pair, needs_compiler, strange_frames
 
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Gate, Show, pack_gate, pack_show
+from pans.runtime.wire.commands import Gate, Show, pack_command
 from pans.runtime.wire.messages import MessageType, Opcode
 
 pytestmark = needs_compiler
@@ -52,7 +52,7 @@ def test_what_the_host_names_is_the_same_on_both() -> None:
     dice = random.Random(5)
     for exposure in range(0, 110):
         show = Show(exposure, dice.randrange(6), dice.randrange(5), dice.randrange(6), dice.choice((1, 2, 4, 3)))
-        pair.command(Opcode.SHOW, pack_show(show), ticks=dice.choice((10, 60, 200)))
+        pair.command(Opcode.SHOW, pack_command(show), ticks=dice.choice((10, 60, 200)))
     pair.after(pair.profile.clock.tick_hz)
     shown = {
         stamp for f in pair.heard[1] if f.type == MessageType.CLICKS for stamp in wire.decode_clicks(f.payload).patterns
@@ -68,7 +68,7 @@ def clicks_of_short_light(dead: float) -> list[bytes]:
     for _ in range(5):
         pair.arm(cycles=15)
         for exposure in range(60):
-            pair.command(Opcode.SHOW, pack_show(Show(exposure, 1, exposure % 4, 3, 4)), ticks=1)
+            pair.command(Opcode.SHOW, pack_command(Show(exposure, 1, exposure % 4, 3, 4)), ticks=1)
         pair.after(pair.profile.clock.tick_hz)
     assert pair.differences() == []
     blocks = [wire.decode_clicks(frame.payload) for frame in pair.heard[1] if frame.type == MessageType.CLICKS]
@@ -100,7 +100,7 @@ def test_the_lease_stop_and_gates_are_alike() -> None:
     hz = pair.profile.clock.tick_hz
     pair.arm(cycles=0, lease_ms=50)
     for tick, ticks, channel in ((100, 5, 0), (6000, 100, 7), (0, 5, 0), (9000, 0, 1), (9000, 5, 8)):
-        pair.command(Opcode.GATE, pack_gate(Gate(pair.tick + tick, ticks, channel)))
+        pair.command(Opcode.GATE, pack_command(Gate(pair.tick + tick, ticks, channel)))
     pair.after(hz // 50, wire.encode_grant(wire.Grant(1 << 20, 30), NONCE))
     pair.after(hz)  # SAFE
     pair.arm(cycles=1)

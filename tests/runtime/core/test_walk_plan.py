@@ -15,7 +15,7 @@ from pans.runtime.core.plan import ADAPTIVE_PATTERN, DARK_PATTERN, NO_SHOT, buil
 from pans.runtime.core.plan_codec import drive_words, plan_chunks, plan_from_chunks, state_chunks, upload_bytes
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.wire.commands import STATES_PER_COMMAND, pack_states, unpack_states
+from pans.runtime.wire.commands import pack_command, unpack_states
 from pans.runtime.wire.messages import MalformedMessage
 
 DMD = load_profile("dmd-spad")
@@ -125,12 +125,12 @@ def test_a_stopped_automaton_takes_fewer_slots() -> None:
 def test_a_plan_goes_to_the_device_and_back(automaton: Automaton) -> None:
     profile = instrument(60_000)
     plan = build_plan(profile, bundle_for(automaton))
-    states = [unpack_states(pack_states(chunk)) for chunk in state_chunks(plan)]
-    assert len(states) == -(-automaton.n_states // STATES_PER_COMMAND)
+    states = [unpack_states(chunk.opcode, pack_command(chunk)) for chunk in state_chunks(plan)]
+    assert len(states) == -(-automaton.n_states // 680)
     rows = np.concatenate([chunk.states for chunk in states])
     assert np.array_equal(rows["pattern"], automaton.pattern)
     assert np.array_equal(rows["dwell"], automaton.dwell)
-    assert np.array_equal(np.stack([rows["next_dark"], rows["next_click"]], 1), automaton.successors)
+    assert np.array_equal(rows["next"], automaton.successors)
     again = plan_from_chunks(plan_chunks(plan), profile.clock.tick_hz, automaton, states)
     for name in ("slot_pattern", "slot_shot", "slot_offset_ticks"):
         assert np.array_equal(getattr(plan, name), getattr(again, name))

@@ -46,7 +46,7 @@ from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.live.loop import NO_OBSERVERS
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.replaying import replay
-from pans.runtime.wire.commands import unpack_show
+from pans.runtime.wire.commands import Show, unpack_command
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, Ack, Opcode, decode_command, encode_ack, pack_body
 from pans.runtime.wire.session import HostSession
@@ -266,7 +266,7 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
         frame = FrameDecoder().feed(turn.rings.kept[:size].tobytes())[0]
         command = decode_command(frame.payload)
         assert (frame.session, command.command_id, command.opcode) == (SESSION, 5, Opcode.SHOW)
-        assert unpack_show(command.body)[:2] == (int(setup.plan.slot_pattern[0] == DARK_PATTERN), 0)
+        assert unpack_command(Show, command.body)[:2] == (int(setup.plan.slot_pattern[0] == DARK_PATTERN), 0)
 
 
 def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:

@@ -24,7 +24,6 @@ from pans.runtime.wire.messages import (
     FrameBlock,
     Mark,
     encode_clicks,
-    encode_counts,
     encode_frames,
     encode_mark,
 )
@@ -54,7 +53,7 @@ def stream(kind: str, n: int, rng: np.random.Generator, session: int = 7) -> Ite
         if kind == "frames":
             yield body_of(encode_frames(FrameBlock(*head, rng.integers(0, 32, (count, 1), np.uint8)), session))
         elif kind == "counts":
-            yield body_of(encode_counts(ClickBlock(*head, shown, rng.integers(0, 4, count, np.uint8), 3), session))
+            yield body_of(encode_clicks(ClickBlock(*head, shown, rng.integers(0, 4, count, np.uint8), 3), session))
         else:
             yield body_of(encode_clicks(ClickBlock(*head, shown, rng.integers(0, 2, count, np.uint8)), session))
         exposure += count
@@ -91,7 +90,7 @@ def spoilt(bodies: list[bytes], dice: random.Random) -> list[bytes]:
         elif what == 8 and not is_mark:
             found[-1] = patched(body, 8, 8, 1 << 63)  # a tick that no counter has
         elif what == 9:
-            found.append(HEADER.pack(0x85, 0, 0, 7) + b"no stream message")
+            found.append(HEADER.pack(0x85, 0, 7) + b"no stream message")
         elif what == 10:
             found[-1:] = found[-1:-3:-1]  # overtaken
         elif what == 11 and body[0] == 0x93:

@@ -13,20 +13,18 @@ from tree import ROOT
 
 from pans.runtime.wire import FrameDecoder, MalformedMessage, MessageType, StreamTracker
 from pans.runtime.wire.commands import (
-    CountStateChunk,
     ReadCounts,
+    StateChunk,
     announced_channels,
     announced_counts,
     count_announcement,
-    count_state_chunks,
-    pack_count_states,
-    pack_read_counts,
+    cut_states,
+    pack_command,
     state_dtype,
-    unpack_count_states,
-    unpack_read_counts,
+    unpack_command,
+    unpack_states,
 )
-from pans.runtime.wire.messages import ClickBlock, decode_counts, encode_counts, unpack_body
-from pans.runtime.wire.session import STREAM_TYPES
+from pans.runtime.wire.messages import ClickBlock, Opcode, decode_counts, encode_clicks, unpack_body
 
 PROTOCOL = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")
 SECTION = PROTOCOL.partition("## 13. Photon numbers")[2]
@@ -43,7 +41,7 @@ def by_hand(numbers: list[int], largest: int, stamps: list[int]) -> bytes:
 
 def test_the_worked_example_of_the_document() -> None:
     golden = bytes.fromhex(re.search(r"^(02 93 01[0-9A-F ]+)$", SECTION, re.MULTILINE)[1])  # type: ignore[index]
-    assert encode_counts(BLOCK, 0x11223344) == golden
+    assert encode_clicks(BLOCK, 0x11223344) == golden
     (frame,) = FrameDecoder().feed(golden)
     assert (frame.type, frame.session) == (MessageType.COUNTS, 0x11223344)
     found = decode_counts(frame.payload)
@@ -67,7 +65,7 @@ def test_what_is_packed_by_hand_is_decoded(drawn: tuple[int, list[tuple[int, int
     assert (found.bits.tolist(), found.patterns.tolist()) == (numbers, stamps)
     assert (found.bits.dtype, found.patterns.dtype) == (np.uint8, np.uint16)
     assert found.bits.flags.writeable
-    (frame,) = FrameDecoder().feed(encode_counts(found, 5))
+    (frame,) = FrameDecoder().feed(encode_clicks(found, 5))
     assert frame.payload == by_hand(numbers, largest, stamps)
 
 
@@ -97,45 +95,55 @@ def test_the_stream_accounts_for_numbers_as_for_clicks() -> None:
     tracker = StreamTracker()
     for seq, first, drops, gap in ((0, 0, 0, None), (2, 8, 2, (3, 5, 1, 2))):
         block = BLOCK._replace(seq=seq, exposure_index=first, drops=drops)
-        assert tracker.accept(*FrameDecoder().feed(encode_counts(block, 1)))[1] == gap
-    assert int(MessageType.COUNTS) in STREAM_TYPES
+        assert tracker.accept(*FrameDecoder().feed(encode_clicks(block, 1)))[1] == gap
 
 
-def test_commands_by_hand() -> None:
-    assert pack_read_counts(5) == b"\5\0\0\0"
-    assert unpack_read_counts(b"\5\0\0\0") == ReadCounts(5, 0)
-    assert pack_read_counts(15, 4) == b"\17\0\4\0"
-    assert unpack_read_counts(b"\3\0\2\0") == ReadCounts(3, 2)
+@pytest.mark.parametrize(
+    ("asked", "body"),
+    [(ReadCounts(5), b"\5\0\0\0"), (ReadCounts(15, 4), b"\17\0\4\0"), (ReadCounts(3, 2), b"\3\0\2\0")],
+)
+def test_read_counts_by_hand(asked: ReadCounts, body: bytes) -> None:
+    assert pack_command(asked) == body
+    assert unpack_command(ReadCounts, body) == asked
     with pytest.raises(MalformedMessage):
-        unpack_read_counts(b"\5\0\0")
-    rows = np.zeros(2, state_dtype(3))
-    rows["pattern"], rows["dwell"], rows["next"] = (0, 7), (4, 1), ((1, 2, 3), (2, 3, 4))
-    body = pack_count_states(CountStateChunk(2, 0, 4, 3, 3, rows))
-    wanted = struct.pack("<HHHHI", 2, 0, 4, 3, 3) + struct.pack("<HHIII", 0, 4, 1, 2, 3)
-    assert body == wanted + struct.pack("<HHIII", 7, 1, 2, 3, 4)
-    found = unpack_count_states(body)
-    assert found[:5] == (2, 0, 4, 3, 3)
-    assert found.states["next"].tolist() == [[1, 2, 3], [2, 3, 4]]
+        unpack_command(ReadCounts, body[:3])
+
+
+def test_states_by_hand() -> None:
+    rows = np.array([(0, 4, (1, 2, 3)), (7, 1, (2, 3, 4))], state_dtype(3))
+    body = pack_command(StateChunk(2, 0, 4, 3, 3, rows))
+    by_bytes = struct.pack("<HHIII", 0, 4, 1, 2, 3) + struct.pack("<HHIII", 7, 1, 2, 3, 4)
+    assert body == struct.pack("<HHHHI", 2, 0, 4, 3, 3) + by_bytes
+    found = unpack_states(Opcode.LOAD_COUNT_STATES, body)
+    assert (found[:5], found.opcode) == ((2, 0, 4, 3, 3), Opcode.LOAD_COUNT_STATES)
+    assert found.states.tobytes() == rows.tobytes()
+    clicks = np.array([(0, 4, (1, 2))], state_dtype(2))
+    two = pack_command(StateChunk(2, 1, 4, 2, 3, clicks))
+    assert two == struct.pack("<HHHHI", 2, 1, 4, 0, 3) + struct.pack("<HHII", 0, 4, 1, 2)
+    assert unpack_states(Opcode.LOAD_STATES, two)[:5] == (2, 1, 4, 2, 3)
     for wrong in (body[:-1], body[:12], body + bytes(16), b"", struct.pack("<HHHHI", 2, 0, 4, 2, 3) + bytes(24)):
         with pytest.raises(MalformedMessage):
-            unpack_count_states(wrong)
+            unpack_states(Opcode.LOAD_COUNT_STATES, wrong)
 
 
 def test_states_are_cut_and_joined() -> None:
     rows = np.zeros(2000, state_dtype(16))
     rows["next"] = np.arange(2000 * 16).reshape(2000, 16)
-    chunks = [unpack_count_states(pack_count_states(one)) for one in count_state_chunks((2000, 4, 16, 5), rows)]
+    chunks = [unpack_states(one.opcode, pack_command(one)) for one in cut_states((2000, 4, 16, 5), rows)]
     assert len(chunks) > 10
     assert [one.first_state for one in chunks] == list(np.cumsum([0, *(len(one.states) for one in chunks[:-1])]))
     assert np.array_equal(np.concatenate([one.states for one in chunks]), rows)
 
 
-def test_what_a_device_announces() -> None:
-    assert announced_counts(count_announcement(15)) == 15
-    assert announced_channels(count_announcement(15)) == 1
-    assert announced_channels(count_announcement(1, 4)) == 4
-    assert announced_counts(count_announcement(1, 4)) == 1
-    assert announced_channels({"channels_at_once": 4}) == 1  # of an extension of another number nothing is known
-    assert count_announcement(1) == {}
-    assert announced_counts({}) == announced_counts({"photon_number_max": 15}) == 1
-    assert announced_counts({"photon_number_max": 15, "count_schema": 0xEEF01CE0}) == 1
+@pytest.mark.parametrize(
+    ("facts", "largest", "channels"),
+    [
+        (count_announcement(15), 15, 1),
+        (count_announcement(1, 4), 1, 4),
+        (count_announcement(1), 1, 1),
+        ({"photon_number_max": 15, "channels_at_once": 4}, 1, 1),  # of an extension of another number nothing is known
+        ({"photon_number_max": 15, "channels_at_once": 4, "count_schema": 0xEEF01CE0}, 1, 1),
+    ],
+)
+def test_what_a_device_announces(facts: dict[str, int], largest: int, channels: int) -> None:
+    assert (announced_counts(facts), announced_channels(facts)) == (largest, channels)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 from typing import Any
 
 import msgpack
@@ -14,7 +13,7 @@ from tree import ROOT
 
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire import wire_kernels as walk
-from pans.runtime.wire.messages import MalformedMessage, decode_counts, decode_welcome
+from pans.runtime.wire.messages import MalformedMessage, decode_welcome
 from pans.runtime.wire.schema import (
     ALL_MESSAGES,
     AUTOMATON_SCHEMA,
@@ -24,7 +23,6 @@ from pans.runtime.wire.schema import (
     FACTS,
     FROM_DEVICE,
     LARGEST_TICK,
-    LAYOUTS,
     SCHEMA,
     SCHEMA_TEXT,
     STRUCTS,
@@ -39,8 +37,8 @@ ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in RANGES
 GOOD: dict[str, tuple[Any, ...]] = {
     "PONG": (1, 5, 10, 11),
     "ACK": (3, 3, 1, 5, 0),
-    "STATUS": (2, 1, 0, 10, 0, 100, 4),
-    "CLICKS": (0, 0, 100, 4, 10, 8, 0, 1),
+    "STATUS": (2, 1, 10, 0, 100, 4),
+    "CLICKS": (0, 0, 100, 4, 10, 8, 1),
     "FRAMES": (0, 0, 100, 4, 10, 8, 2, 1),
     "MARK": (0, 1, 2, 0, 4, 100, 1.5),
     "COUNTS": (0, 0, 100, 4, 10, 8, 2, 1),
@@ -64,7 +62,7 @@ FACTS_OF_A_DEVICE = {
 
 def decode(name: str, values: tuple[Any, ...]) -> Any:
     payload = STRUCTS[name].pack(*values) + TAILS.get(name, b"")
-    return decode_counts(payload) if name == "COUNTS" else getattr(wire, f"decode_{name.lower()}")(payload)
+    return wire.DECODERS[wire.MessageType[name]](payload)
 
 
 def with_field(name: str, place: int, value: Any) -> tuple[Any, ...]:
@@ -129,8 +127,6 @@ def test_the_kernels_take_nothing_that_the_decoders_refuse(case: tuple[str, int,
 def test_the_schema_is_that_of_version_1() -> None:
     assert SCHEMA == 0x2E64AFC4
     assert SCHEMA_TEXT in DOCUMENT
-    for name, layout in LAYOUTS.items():
-        assert struct.calcsize(layout) == STRUCTS[name].size
 
 
 @pytest.mark.parametrize(
@@ -191,7 +187,7 @@ def test_a_key_of_welcome_holds_what_the_dictionary_says_or_is_named(key: str) -
 
 
 def test_only_plain_values_of_unknown_keys_are_kept() -> None:
-    head = STRUCTS["WELCOME"].pack(SCHEMA, 1, 0)
+    head = STRUCTS["WELCOME"].pack(SCHEMA, 1)
     facts = {"a": float("nan"), "b": [1], "c": {"d": 1}, "e": 1.5, "f": LARGEST_TICK, "g": None, "h": float("inf")}
     assert decode_welcome(head + msgpack.packb(facts)).facts == {"e": 1.5, "f": LARGEST_TICK}
     for packed in (

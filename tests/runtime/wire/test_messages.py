@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import re
 import struct
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,18 +21,17 @@ from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import (
     Arm,
     Gate,
+    MaskChunk,
     PatternChunk,
     PlanChunk,
-    pack_arm,
-    pack_gate,
-    pack_pattern,
-    pack_plan,
-    unpack_arm,
-    unpack_gate,
-    unpack_pattern,
-    unpack_plan,
+    ReadCounts,
+    Show,
+    pack_command,
+    unpack_command,
+    unpack_states,
 )
 from pans.runtime.wire.messages import FrameDecoder, MessageType
+from pans.runtime.wire.schema import MAX_FRAME_BYTES
 
 SESSION = 0x11223344
 PROTOCOL = (ROOT / "docs" / "reference" / "protocol.md").read_text()
@@ -57,6 +57,11 @@ def frame_by_hand(message_type: int, payload: bytes, seed: int = wire.SCHEMA, se
             out += b"\xff" + group
             group.clear()
     return bytes(out + bytes([len(group) + 1]) + group) + b"\0"
+
+
+UNPACK = {
+    kind: partial(unpack_command, kind) for kind in (PatternChunk, PlanChunk, MaskChunk, Arm, Gate, Show, ReadCounts)
+}
 
 
 def one(data: bytes) -> wire.Frame:
@@ -106,17 +111,17 @@ GOLDEN = [
         "01000000 02000000 0300 0201 0300000000000000 0400000000000000 0000c03f",
     ),
     (
-        wire.encode_command(1, wire.Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(2, 0, 3, np.array([1, 0, 123], np.uint16))), SESSION),
+        wire.encode_command(1, wire.Opcode.LOAD_PATTERN, pack_command(PatternChunk(2, 0, 3, np.array([1, 0, 123], np.uint16))), SESSION),
         0x03,
         "01000000 01 00 0000 0200 0000 00000000 03000000 0100 0000 7b00",
     ),
     (
-        wire.encode_command(2, wire.Opcode.ARM, pack_arm(Arm(1 << 33, 7, 1000)), SESSION),
+        wire.encode_command(2, wire.Opcode.ARM, pack_command(Arm(1 << 33, 7, 1000)), SESSION),
         0x03,
         "02000000 03 00 0000 0000000002000000 0700000000000000 e8030000 00000000",
     ),
     (
-        wire.encode_command(3, wire.Opcode.GATE, pack_gate(Gate(9, 8, 1)), SESSION),
+        wire.encode_command(3, wire.Opcode.GATE, pack_command(Gate(9, 8, 1)), SESSION),
         0x03,
         "03000000 06 00 0000 0900000000000000 08000000 0100 0000",
     ),
@@ -124,7 +129,7 @@ GOLDEN = [
         wire.encode_command(
             4,
             wire.Opcode.LOAD_PLAN,
-            pack_plan(PlanChunk(0, 1, 2, 0, 30, 33, 99, 1, 5, np.array([(0, 0xFFFF, 0xFFFF), (50, 0, 0)], wire.SLOT_DTYPE))),
+            pack_command(PlanChunk(0, 1, 2, 0, 30, 33, 99, 1, 5, np.array([(0, 0xFFFF, 0xFFFF), (50, 0, 0)], wire.SLOT_DTYPE))),
             SESSION,
         ),
         0x03,
@@ -142,27 +147,26 @@ def test_golden_frames(encoded: bytes, message_type: int, payload: str) -> None:
 
 
 def test_messages_survive_the_round_trip() -> None:
-    patterns = np.arange(300, dtype=np.uint16) % 11
-    bits = (np.arange(300) % 3 == 0).astype(np.uint8)
-    block = wire.decode_clicks(
-        one(wire.encode_clicks(wire.ClickBlock(2**32 - 1, 2, 2**63 - 1, 2**40, 5, 9, patterns, bits), SESSION)).payload
-    )
-    assert block[:6] == (2**32 - 1, 2, 2**63 - 1, 2**40, 5, 9)
-    np.testing.assert_array_equal(block.patterns, patterns)
-    np.testing.assert_array_equal(block.bits, bits)
+    patterns, bits = np.arange(300, dtype=np.uint16) % 11, (np.arange(300) % 3 == 0).astype(np.uint8)
+    sent = wire.ClickBlock(2**32 - 1, 2, 2**63 - 1, 2**40, 5, 9, patterns, bits)
+    block = wire.decode_clicks(one(wire.encode_clicks(sent, SESSION)).payload)
+    assert block[:6] == sent[:6]
+    assert np.array_equal(block[6:8], sent[6:8])
     for mark in (wire.Mark(1, 2, 9, 3, 4, 1.5), wire.Mark(1, 2, -1, 3, 4, 1.5, 0xFFFF)):
         assert wire.decode_mark(one(wire.encode_mark(mark, 1)).payload) == mark
     status = wire.Status(3, 3, 0, 7, 8, 9)
     assert wire.decode_status(one(wire.encode_status(status, 1)).payload) == status
-    slots = np.array([(10, 1, 0), (20, 0, 1)], wire.SLOT_DTYPE)
-    chunk = PlanChunk(1, 2, 5, 3, 1, 2, 3, 4, 5, slots)
-    back = unpack_plan(pack_plan(chunk))
-    assert back[:-1] == chunk[:-1]
-    np.testing.assert_array_equal(back.slots, slots)
-    levels = np.arange(50, dtype=np.uint16)
-    np.testing.assert_array_equal(unpack_pattern(pack_pattern(PatternChunk(0, 10, 60, levels))).levels, levels)
-    assert unpack_arm(pack_arm(Arm(1, 2, 3))) == Arm(1, 2, 3)
-    assert unpack_gate(pack_gate(Gate(1, 2, 3))) == Gate(1, 2, 3)
+    rows = np.array([[0x5, 0x1], [0x2, 0x0]], np.uint8)
+    slots, levels = np.array([(10, 1, 0), (20, 0, 1)], wire.SLOT_DTYPE), np.arange(50, dtype=np.uint16)
+    for command in (
+        PlanChunk(1, 2, 5, 3, 1, 2, 3, 4, 5, slots),
+        PatternChunk(0, 10, 60, levels),
+        MaskChunk(7, 0, 9, 9, rows),
+        *(Arm(1, 2, 3), Gate(1, 2, 3), Show(1, 2, 3, 4, 5), ReadCounts(3, 2)),
+    ):
+        back = unpack_command(type(command), pack_command(command))
+        assert type(back) is type(command)
+        assert all(np.array_equal(*pair) for pair in zip(back, command, strict=True))
 
 
 def test_welcome_carries_facts_and_names_another_schema() -> None:
@@ -193,7 +197,7 @@ def test_an_endless_frame_is_bounded_and_the_next_one_read() -> None:
     decoder = FrameDecoder()
     for _ in range(100):
         assert decoder.feed(b"\x01" * 10_000) == []
-        assert decoder.held_bytes <= wire.MAX_FRAME_BYTES
+        assert decoder.held_bytes <= MAX_FRAME_BYTES
     assert decoder.counters.oversized_frames == 1
     assert decoder.feed(b"\0" + traffic()[0]) == [one(traffic()[0])]
     assert decoder.counters.bytes_discarded == 1_000_000
@@ -218,11 +222,13 @@ def test_a_payload_that_is_too_large_is_not_sent() -> None:
         (wire.decode_welcome, struct.pack("<IHH", wire.SCHEMA, 1, 0) + b"\xdf\xff\xff\xff\xff"),
         (wire.decode_welcome, struct.pack("<IHH", wire.SCHEMA, 1, 0) + b"\x91\x01"),
         (wire.decode_welcome, struct.pack("<IHH", wire.SCHEMA, 1, 0) + b"\xc0" * 5000),
-        (unpack_plan, b"\0" * 36),
-        (unpack_plan, b"\0" * 37),
-        (unpack_pattern, b"\0" * 12),
-        (unpack_pattern, struct.pack("<HHII", 0, 0, 2, 2) + b"\0\0"),
-        (unpack_arm, b"\0" * 23),
+        (UNPACK[PlanChunk], b"\0" * 36),
+        (UNPACK[PlanChunk], b"\0" * 37),
+        (UNPACK[PatternChunk], b"\0" * 12),
+        (UNPACK[PatternChunk], struct.pack("<HHII", 0, 0, 2, 2) + b"\0\0"),
+        (UNPACK[MaskChunk], struct.pack("<HHIII", 0, 2, 0, 16, 8) + b"\0\0"),  # pieces of two patterns
+        (UNPACK[MaskChunk], struct.pack("<HHIII", 0, 1, 0, 16, 16) + b"\0"),
+        (UNPACK[Arm], b"\0" * 23),
     ],
 )
 def test_impossible_payloads_are_refused(decode: object, payload: bytes) -> None:
@@ -232,16 +238,11 @@ def test_impossible_payloads_are_refused(decode: object, payload: bytes) -> None
 
 @given(st.binary(max_size=200))
 def test_no_decoder_raises_anything_else(payload: bytes) -> None:
-    decoders = [
-        wire.decode_hello,
-        wire.decode_welcome,
-        wire.decode_ping,
-        wire.decode_pong,
-        wire.decode_command,
-        wire.decode_ack,
+    decoders = [wire.decode_hello, wire.decode_ping, wire.decode_command, wire.decode_grant, *wire.DECODERS.values()]
+    decoders += [
+        *UNPACK.values(),
+        *(partial(unpack_states, wire.Opcode[f"LOAD_{name}"]) for name in ("STATES", "COUNT_STATES")),
     ]
-    decoders += [wire.decode_grant, wire.decode_status, wire.decode_clicks, wire.decode_frames, wire.decode_mark]
-    decoders += [unpack_pattern, unpack_plan, unpack_arm, unpack_gate]
     for decode in decoders:
         for candidate in (payload, struct.pack("<IHH", wire.SCHEMA, 1, 0) + payload):
             with contextlib.suppress(wire.MalformedMessage):
