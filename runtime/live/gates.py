@@ -103,7 +103,7 @@ class SecondInstrument:
         self._arm()
         connection.settle()
 
-    def turn(self, now_ns: int, *, waits: bool) -> None:
+    def exchange(self, now_ns: int, *, waits: bool) -> None:
         """Read what came and send what is due; `waits` for an answer: look soon. LinkError when it is gone."""
         session = self.connection.session
         if now_ns >= self._probe_due_ns:
@@ -328,7 +328,7 @@ class GateQueue:
         if self._lost:
             return
         try:
-            second.turn(now_ns, waits=bool(self._sent))
+            second.exchange(now_ns, waits=bool(self._sent))
         except (LinkError, DeviceError) as error:
             self._lose_second(error)
 
