@@ -181,7 +181,7 @@ def test_a_lease_that_ran_out_is_taken_again(serve_one: Callable[..., Served], m
         time.sleep(0.01)  # the host is away
     assert other.device.state is DeviceState.SAFE
     while other.device.state is not DeviceState.RUNNING and time.perf_counter_ns() < until:
-        second.turn(time.perf_counter_ns(), waits=True)
+        second.exchange(time.perf_counter_ns(), waits=True)
     assert other.device.state is DeviceState.RUNNING
     second.finish()
     second.close()
