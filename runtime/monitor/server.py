@@ -78,7 +78,7 @@ class LivePage:
     def __init__(self, host: str, port: int, history: History) -> None:
         self._events = Events(history)
         self._events.renew()
-        self._server = PageServer(host, port, KIND, page, headers=policy(), feed=self._events)
+        self._server = PageServer(host, port, page, policy() | {"Content-Type": KIND}, self._events)
         self.port = self._server.port
 
     def draw(self) -> None:

@@ -1,9 +1,8 @@
-"""A small HTTP server for one page and its events, with few connections and little time for each.
+"""A small HTTP server for one page and its events (server-sent events, WHATWG HTML 9.2), with few connections and little time for each.
 
-A connection beyond MAX_CLIENTS takes the place of the oldest, so that those who open many and say nothing cannot shut out one who asks. A
-browser that follows the events (server-sent events, WHATWG HTML 9.2) is one of MAX_LISTENERS; one that does not read is dropped after
-LISTENER_STUCK_S. On a loopback address, requests that name another host are refused: a web page elsewhere could have made its own name
-point here (DNS rebinding).
+A connection beyond MAX_CLIENTS takes the place of the oldest, so that those who open many and say nothing cannot shut out one who asks. On
+a loopback address, requests that name another host are refused: a web page elsewhere could have made its own name point here (DNS
+rebinding).
 """
 
 from __future__ import annotations
@@ -50,9 +49,9 @@ class Feed(Protocol):
 
 
 class PageServer(ThreadingTCPServer):
-    """Serves what `page` returns, text in UTF-8 of the type `kind`, at `host`, until `close`; OSError if it cannot listen there.
+    """Serves what `page` returns, with these `headers`, at `host`, until `close`; OSError if it cannot listen there.
 
-    `headers` are further headers of its answers. With `feed` its events are served at `/events`.
+    With `feed` its events are served at `/events`.
     """
 
     daemon_threads = allow_reuse_address = True
@@ -62,13 +61,11 @@ class PageServer(ThreadingTCPServer):
         self,
         host: str,
         port: int,
-        kind: str,
         page: Callable[[], bytes],
-        *,
-        headers: dict[str, str] | None = None,
+        headers: dict[str, str],
         feed: Feed | None = None,
     ) -> None:
-        self.kind, self.headers, self.feed, self.local = kind, headers or {}, feed, is_loopback(host)
+        self.headers, self.feed, self.local = headers, feed, is_loopback(host)
         self.ending, self.listeners = threading.Event(), threading.BoundedSemaphore(MAX_LISTENERS)
         self._page, self._made_s, self._made, self._alone = page, -PAGE_KEPT_S, b"", threading.Lock()
         self._clients: dict[socket.socket, None] = {}  # the oldest first
@@ -138,20 +135,15 @@ class _Handler(BaseHTTPRequestHandler):
             except Exception:  # figures that change while they are read: the next scrape has them
                 self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR)
                 return
-            self._begin(self.server.kind, self.server.headers | {"Content-Length": str(len(page))})
+            self._begin(self.server.headers | {"Content-Length": str(len(page))})
             if self.command != "HEAD":
                 self.wfile.write(page)
 
     do_HEAD = do_GET
 
-    def do_POST(self) -> None:
-        self.close_connection = True
-        self.send_error(HTTPStatus.METHOD_NOT_ALLOWED)
-
-    def _begin(self, kind: str, headers: dict[str, str]) -> None:
+    def _begin(self, headers: dict[str, str]) -> None:
         self.send_response(HTTPStatus.OK)
-        common = {"Content-Type": kind, "X-Content-Type-Options": "nosniff", "Connection": "close"}
-        for name, value in (common | headers).items():
+        for name, value in ({"X-Content-Type-Options": "nosniff", "Connection": "close"} | headers).items():
             self.send_header(name, value)
         self.end_headers()
 
@@ -168,7 +160,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self.server.forget(self.connection)
             self.connection.settimeout(LISTENER_STUCK_S)
-            self._begin("text/event-stream", {"Cache-Control": "no-store"})
+            self._begin({"Content-Type": "text/event-stream", "Cache-Control": "no-store"})
             gone = selectors.DefaultSelector()
             gone.register(self.connection, selectors.EVENT_READ)
             seen, moved_s, ended = -1, time.monotonic(), False

@@ -108,7 +108,9 @@ class MetricsServer:
         registry = CollectorRegistry(auto_describe=False)
         registry.register(Collector(lambda: self.look()))
         try:
-            self._server = PageServer(host, port, CONTENT_TYPE_LATEST, lambda: generate_latest(registry))
+            self._server = PageServer(
+                host, port, lambda: generate_latest(registry), {"Content-Type": CONTENT_TYPE_LATEST}
+            )
         except OSError as error:
             raise UsageError(
                 f"--metrics {address}: cannot listen there: {error.strerror or error}", remedy="choose another port"

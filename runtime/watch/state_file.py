@@ -1,7 +1,7 @@
-"""A run as one flat picture: what it has done, what went wrong last, what it uses; and the file that shows it to others.
+"""A run as one flat picture: what it has done, what went wrong last, what it uses; and the file that holds it, written each second.
 
 Whether the loop turns is judged by its own stamp: it sets `LiveRun.turned_s` at each iteration, and while it looks for a lost device at
-each attempt. The file is written anew once per second, by a thread of its own.
+each attempt.
 """
 
 from __future__ import annotations
@@ -17,6 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime.container import canonical_json
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
+from pans.runtime.errors import UsageError
+from pans.runtime.outputs import replace_file
+
+from .repeated import Repeated
 
 if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
@@ -26,9 +30,7 @@ FORMAT = "pans-state 1"
 EVERY_S = 1.0
 GOODBYE_S = 5.0
 OTHER_WRITER_S = 1.0
-STALLED_AFTER_S = (
-    0.75  # an iteration waits 20 ms at most; the state file, written each second, says "stalled" within 2 s
-)
+STALLED_AFTER_S = 0.75  # an iteration waits 20 ms at most; the file, written each second, says "stalled" within 2 s
 LOST_STALLED_AFTER_S = 15.0  # while a lost device is looked for: pauses of 2 s, a handshake of 5 s, the upload
 
 
@@ -58,7 +60,8 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
     if run is None:
         return picture
     timing, stream, tallies = run.timing, run.core.tracker.counters, run.core.tallies
-    incidents, trouble = run.lateness.incidents, run.journal.trouble
+    incidents, trouble = run.lateness.incidents, run.journal.trouble or {}
+    reason = next((trouble[key] for key in ("why", "reason", "message", "text") if trouble.get(key)), "")
     return picture | {
         "state": state_of(run),
         "loop_age_s": round(loop_age_s(run), 3),
@@ -76,7 +79,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         "dark_exposures": int(tallies[DARK_EXPOSURES]),
         "dark_clicks": int(tallies[DARK_CLICKS]),
         "reconnects": run.reconnects,
-        "last_error": "" if trouble is None else f"{trouble.get('kind')}: {_reason(trouble)}",
+        "last_error": f"{trouble.get('kind')}: {reason}" if trouble else "",
     }
 
 
@@ -87,10 +90,6 @@ def state_of(run: LiveRun) -> str:
     if is_stalled(run):
         return "stalled"
     return "running" if run.outage_ns is None else "device lost"
-
-
-def _reason(event: dict[str, Any]) -> str:
-    return str(event.get("why") or event.get("reason") or event.get("message") or event.get("text") or "")
 
 
 def resources_used() -> dict[str, int]:
@@ -105,22 +104,18 @@ def resources_used() -> dict[str, int]:
 
 
 class StateFile:
-    """Writes what `look` returns to `path`, now, once per second and at the end."""
+    """Writes what `look` returns to `path`, now, once per second and at the end; `trouble` says why that failed last."""
 
     def __init__(self, path: Path, look: Callable[[], dict[str, Any]]) -> None:
-        self.path = path
         self.trouble = ""
-        self._look, self._beside = look, path.with_name(f".{path.name}.{os.getpid()}.partial")
-        self._ending, self._alone = threading.Event(), threading.Lock()
+        self._path, self._look, self._alone = path, look, threading.Lock()
         self._left: dict[str, Any] = {}
         self._write()
-        self._thread = threading.Thread(target=self._keep, name="pans-state", daemon=True)
-        self._thread.start()
+        self._thread = Repeated("pans-state", EVERY_S, self._write)
 
     def close(self) -> None:
         """Write once more and stop."""
-        self._ending.set()
-        self._thread.join(GOODBYE_S)
+        self._thread.close(GOODBYE_S)
         self._write()
 
     def leave(self, facts: dict[str, Any]) -> None:
@@ -128,22 +123,12 @@ class StateFile:
         self._left = facts
         self._write()
 
-    def _keep(self) -> None:
-        while not self._ending.wait(EVERY_S):
-            self._write()
-
     def _write(self) -> None:
         if not self._alone.acquire(timeout=OTHER_WRITER_S):
             return  # the other thread hangs in the file system
         try:
-            with open(self._beside, "wb") as file:
-                file.write(canonical_json(self._look() | self._left) + b"\n")
-                file.flush()  # buffered, because one write may take only a part
-                os.fsync(file.fileno())  # or a power cut leaves an empty file in place of the latest state
-            os.replace(self._beside, self.path)
-        except OSError as error:  # a run does not end because nobody can watch it
-            self.trouble = str(error)
-            with suppress(OSError):
-                os.unlink(self._beside)
+            replace_file(self._path, canonical_json(self._look() | self._left) + b"\n")
+        except UsageError as error:  # a run does not end because nobody can watch it
+            self.trouble = error.message
         finally:
             self._alone.release()

@@ -83,7 +83,8 @@ class Watchdog:
         if self._is_done_by(asked_s + LIGHT_OFF_AFTER_S):
             return
         if self.run is not None and not self.run.stops:
-            self._turn_light_off(self.run)
+            link, session, receiver = self.run.connection.link, self.run.connection.session, self.run.receiver
+            _within(STEP_S, lambda: link.write(session.stop_frames(receiver.next_id())))  # in the loop's place
         if self._is_done_by(asked_s + END_AFTER_S):
             return
         while self._is_closing and time.monotonic() < asked_s + CLOSING_END_AFTER_S:
@@ -99,19 +100,12 @@ class Watchdog:
     def _is_done_by(self, at_s: float) -> bool:
         return self._done.wait(max(0.0, at_s - time.monotonic()))
 
-    def _turn_light_off(self, run: LiveRun) -> None:
-        """Send STOP in the loop's place."""
-        connection = run.connection
-
-        def speak() -> None:
-            connection.link.write(connection.session.stop_frames(run.receiver.next_id()))
-
-        _within(STEP_S, speak)
-
     def _end_process(self, signum: int) -> None:
         asked = ASKED_TO_STOP if self._continuous and signum == signal.SIGTERM else INTERRUPTED
         stack = _stack_of(self._main)
-        why = f"{asked}: the run did not end by itself; it was in {_place(stack)}"
+        code = stack[0].f_code
+        place = f"{code.co_qualname}, line {stack[0].f_lineno} of {os.path.basename(code.co_filename)}"
+        why = f"{asked}: the run did not end by itself; it was in {place}"
         # The main thread is not in the recorder, and is not expected back: what is buffered can be written from here.
         modules = [str(frame.f_globals.get("__name__", "")) for frame in stack]
         if self._recorder is not None and not any(name.startswith("pans.runtime.record") for name in modules):
@@ -136,17 +130,8 @@ def _within(seconds: float, call: Callable[[], object]) -> None:
 
 
 def _stack_of(thread_id: int) -> list[FrameType]:
-    """Return the frames of a thread, the innermost first."""
-    frame, stack = sys._current_frames().get(thread_id), []
-    while frame is not None:
+    """Return the frames of a thread that lives, the innermost first."""
+    stack = [sys._current_frames()[thread_id]]
+    while (frame := stack[-1].f_back) is not None:
         stack.append(frame)
-        frame = frame.f_back
     return stack
-
-
-def _place(stack: list[FrameType]) -> str:
-    """Return where the main thread is: its innermost function."""
-    if not stack:
-        return "an unknown place"
-    code = stack[0].f_code
-    return f"{code.co_qualname}, line {stack[0].f_lineno} of {os.path.basename(code.co_filename)}"

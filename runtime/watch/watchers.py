@@ -1,4 +1,4 @@
-"""What watches one run from beside its loop: state file, metrics, messages to systemd, the computer around it, the watchdog's facts.
+"""What watches one run alongside its loop: state file, metrics, messages to systemd, the computer around it, the watchdog's facts.
 
 All of it is started before the loop asks for real-time privileges, so that none of its threads inherits them.
 """
@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import os
 import socket
-import threading
 import time
 from contextlib import ExitStack, suppress
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from .host import HostWatch
+from .repeated import Repeated
 from .state_file import StateFile, is_stalled, picture_of
 
 if TYPE_CHECKING:
@@ -37,9 +36,9 @@ class Watchers:
         self,
         wanted: RunOptions,
         recorder: Recorder | None,
-        watchdog: Watchdog | None = None,
-        stop: Stop | None = None,
-        metrics: MetricsServer | None = None,
+        watchdog: Watchdog | None,
+        stop: Stop,
+        metrics: MetricsServer | None,
     ) -> None:
         self._wanted, self._recorder, self._watchdog, self._stop = wanted, recorder, watchdog, stop
         self._metrics = metrics
@@ -52,8 +51,7 @@ class Watchers:
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
-            ask = (lambda why: None) if self._stop is None else self._stop.request
-            self._host = HostWatch(self._recorded, self._wanted.stop_below, ask, self._is_deleted)
+            self._host = HostWatch(self._recorder, self._wanted.stop_below, self._stop.request)
             opening.callback(self._host.close)
             if self._metrics is not None:
                 self._metrics.look = self.look
@@ -91,22 +89,13 @@ class Watchers:
 
     def look(self) -> dict[str, Any]:
         """Return the picture as it is now."""
-        facts = {} if self._host is None else self._host.facts()
+        facts = {} if self._host is None else self._host.facts
         return picture_of(self._run, self._recorder, self._started_s) | facts
 
     def note_news(self, run: LiveRun) -> None:
         """Note in the journal of `run` what was found about the computer; called by the loop."""
-        if self._host is not None:
-            for event in self._host.news():
-                run.journal.note(**event)
-
-    def _recorded(self) -> Path | None:
-        """Return the file that is being written."""
-        recorder = self._recorder
-        return None if recorder is None else recorder.open_path
-
-    def _is_deleted(self) -> bool:
-        return self._recorder is not None and self._recorder.is_deleted
+        while self._host is not None and self._host.news:
+            run.journal.note(**self._host.news.popleft())
 
     def _note_end(self, why: str) -> None:
         """The watchdog ends the process."""
@@ -125,8 +114,7 @@ class Notifier:
         self._every_s = every_s
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._ending = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread: Repeated | None = None
 
     @classmethod
     def of_environment(cls) -> Notifier | None:
@@ -140,23 +128,20 @@ class Notifier:
     def begin(self, run: LiveRun) -> None:
         """Say that the service is ready, and from here on that the loop of `run` turns."""
         self._send("READY=1")
-        self._thread = threading.Thread(target=self._keep, args=(run,), name="pans-systemd", daemon=True)
-        self._thread.start()
+
+        def speak() -> None:
+            if run.ended or not is_stalled(run):
+                self._send("WATCHDOG=1")
+
+        speak()
+        self._thread = Repeated("pans-systemd", self._every_s, speak)
 
     def close(self) -> None:
         """Say that the service stops."""
-        self._ending.set()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.close()
         self._send("STOPPING=1")
         self._socket.close()
-
-    def _keep(self, run: LiveRun) -> None:
-        while True:
-            if run.ended or not is_stalled(run):
-                self._send("WATCHDOG=1")
-            if self._ending.wait(self._every_s):
-                return
 
     def _send(self, message: str) -> None:
         with suppress(OSError):  # nobody listens: a run does not end because of that

@@ -119,13 +119,15 @@ class Hanging:
 
     def __init__(self, bundle: Any) -> None:
         self.name, self.n_features, self.n_classes = "hanging", bundle.n_features, len(bundle.classes)
-        self._left = HANGS_AFTER + 64 + 16  # those that it is tried with
+        self._left, self._due_s = HANGS_AFTER + 64 + 16, 0.0  # and those that it is tried with
 
     def decide(self, counts: Any, shots: int) -> Verdict:
-        """Answer, or hang."""
+        """Answer, or hang: half a second later, since one call of the loop may hold many decisions, and is accounted for at its end."""
         self._left -= 1
         if self._left < 0:
-            _hang(os.environ["HANG"])
+            self._due_s = self._due_s or time.monotonic() + 0.5
+            if time.monotonic() >= self._due_s:
+                _hang(os.environ["HANG"])
         return Verdict(0, 1.0)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from commands import json_of
 
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
@@ -14,7 +16,7 @@ from pans.runtime.cli import main
 from pans.runtime.live.run_options import RunOptions
 from pans.runtime.record import read_recording
 from pans.runtime.watch import host
-from pans.runtime.watch.host import ClockSteps, DiskTrend, HostWatch
+from pans.runtime.watch.host import DiskTrend, HostWatch
 
 Usage = namedtuple("Usage", "total used free")
 MIB = 1 << 20
@@ -23,15 +25,10 @@ MIB = 1 << 20
 def test_time_left_at_the_present_rate() -> None:
     trend = DiskTrend()
     for second in range(0, 30, 5):
-        trend.add(second, 10**9 - 10**6 * second)
-        assert trend.left_s() is None  # too short to tell
-    trend.add(30.0, 10**9 - 30 * 10**6)
-    assert trend.left_s() == pytest.approx(970)
-    trend.add(35.0, 2 * 10**9)  # something was deleted
-    assert trend.left_s() is None
-    for second in range(40, 80, 5):
-        trend.add(second, 2 * 10**9)
-    assert trend.left_s() is None  # nobody writes
+        assert trend.left_s(second, 10**9 - 10**6 * second) is None  # too short to tell
+    assert trend.left_s(30.0, 10**9 - 30 * 10**6) == pytest.approx(970)
+    for second in range(35, 80, 5):  # something was deleted, and nobody writes
+        assert trend.left_s(second, 2 * 10**9) is None
 
 
 def test_the_rate_is_that_of_the_last_ten_minutes() -> None:
@@ -39,20 +36,21 @@ def test_the_rate_is_that_of_the_last_ten_minutes() -> None:
     free = 10**12
     for second in range(0, 2400, 5):
         free -= 5 * (10**6 if second < 1200 else 10**3)
-        trend.add(second, free)
-    assert trend.left_s() == pytest.approx(free / 10**3, rel=1e-6)
+        left_s = trend.left_s(second, free)
+    assert left_s == pytest.approx(free / 10**3, rel=1e-6)
 
 
-def test_a_clock_that_is_set_is_a_step_and_one_that_is_slewed_is_none() -> None:
-    steps = ClockSteps()
-    offset = 10**18
-    assert steps.step_ns(offset) == 0
-    for _ in range(1000):  # 500 ppm
-        offset += 2_500_000
-        assert steps.step_ns(offset) == 0
-    assert steps.step_ns(offset - 3_600_000_000_000) == -3_600_000_000_000
-    assert steps.step_ns(offset) == 3_600_000_000_000
-    assert steps.steps == 2
+def test_a_clock_that_is_set_is_a_step_and_one_that_is_slewed_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    offsets = [10**18 + 2_500_000 * step for step in range(100)]  # 500 ppm
+    offsets += [offsets[-1] - 3_600_000_000_000, offsets[-1]]
+    left = iter([offsets[0], *offsets])
+    monkeypatch.setattr(host, "clock_offset_ns", lambda: next(left))
+    watch = HostWatch(None, 0, list[str]().append)
+    watch.close()
+    for _ in offsets[1:]:
+        watch.look()
+    assert [one["step_s"] for one in watch.news] == [-3600.0, 3600.0]
+    assert watch.facts["host_clock_steps"] == 2
 
 
 def watch_of(
@@ -61,8 +59,8 @@ def watch_of(
     """A watch whose thread never looks, on a disk with these bytes free at each look."""
     left, asked = iter(free), list[str]()
     monkeypatch.setattr(host.shutil, "disk_usage", lambda path: Usage(0, 0, next(left)))
-    monkeypatch.setattr(host, "EVERY_S", 3600.0)
-    watch = HostWatch(lambda: tmp_path / "run.pansrec", reserve, asked.append)
+    recorder: Any = SimpleNamespace(open_path=tmp_path / "run.pansrec", is_deleted=False)
+    watch = HostWatch(recorder, reserve, asked.append)
     for _ in free[1:]:
         watch.look()
     watch.close()
@@ -73,18 +71,15 @@ def test_short_space_is_told_once_and_too_little_ends_the_run(tmp_path: Path, mo
     (tmp_path / "run.pansrec").write_bytes(bytes(7))
     free = [600 * MIB, 499 * MIB, 480 * MIB, 700 * MIB, 400 * MIB, 99 * MIB, 50 * MIB]
     watch, asked = watch_of(tmp_path, monkeypatch, free, 100 * MIB)
-    news = list(watch.news())
-    assert [one["kind"] for one in news] == ["disk_short", "disk_short", "disk_nearly_full"]
-    assert [one["free_bytes"] for one in news] == [499 * MIB, 400 * MIB, 99 * MIB]
+    told = [(one["kind"], one["free_bytes"] // MIB) for one in watch.news]
+    assert told == [("disk_short", 499), ("disk_short", 400), ("disk_nearly_full", 99)]
     assert asked == [host.DISK_NEARLY_FULL]
-    assert watch.facts()["disk_free_bytes"] == 50 * MIB
-    assert watch.facts()["recording_bytes"] == 7
-    assert list(watch.news()) == []
+    assert (watch.facts["disk_free_bytes"], watch.facts["recording_bytes"]) == (50 * MIB, 7)
 
 
 def test_without_a_reserve_nothing_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     watch, asked = watch_of(tmp_path, monkeypatch, [3, 2, 1, 0], 0)
-    assert (asked, list(watch.news())) == ([], [])
+    assert (asked, list(watch.news)) == ([], [])
 
 
 def test_parts_are_deleted_before_a_run_is_stopped() -> None:
@@ -110,16 +105,13 @@ def test_a_run_stops_in_order_before_its_disk_is_full(
 
     monkeypatch.setattr(host.shutil, "disk_usage", usage)
     monkeypatch.setattr(host, "EVERY_S", 0.1)
-    assert main([*words, "--seconds", "100000"]) == 1
-    summary = json.loads(capsys.readouterr().out)
-    assert summary["ended"] == host.DISK_NEARLY_FULL
-    assert summary["verdict"] == "FAIL"
+    summary = json_of(capsys, "", *words[:-1], "--seconds", "100000", code=1)
+    assert (summary["ended"], summary["verdict"]) == (host.DISK_NEARLY_FULL, "FAIL")
     assert host.DISK_NEARLY_FULL in summary["faults"]
     recording = read_recording(recorded)
     assert recording.complete
     assert recording.n_decisions == summary["decisions"] > 0
-    kinds = [event["kind"] for event in recording.events()]
-    assert kinds.count("disk_nearly_full") == 1
+    assert [event["kind"] for event in recording.events()].count("disk_nearly_full") == 1
 
 
 def test_a_run_does_not_begin_on_a_disk_that_is_nearly_full(

@@ -13,14 +13,14 @@ import pytest
 
 from pans.runtime.errors import UsageError
 from pans.runtime.watch.http import MAX_CLIENTS, REQUEST_S, PageServer
-from pans.runtime.watch.metrics import check_address, is_public
+from pans.runtime.watch.metrics import check_address, is_public, parse_address
 
 HALF_OPEN = 60
 
 
 @pytest.fixture
 def server() -> Iterator[PageServer]:
-    one = PageServer("127.0.0.1", 0, "text/plain", lambda: b"figures\n" * 2000)
+    one = PageServer("127.0.0.1", 0, lambda: b"figures\n" * 2000, {})
     yield one
     one.close()
 
@@ -65,7 +65,7 @@ def test_half_open_connections_are_few_and_shut_nobody_out(server: PageServer) -
     ("words", "status"),
     [
         (b"GET / HTTP/1.1\r\nX: " + b"x" * 100_000, b"431"),
-        (b"POST / HTTP/1.1", b"405"),
+        (b"POST / HTTP/1.1", b"501"),
         (b"GET /secret HTTP/1.1", b"404"),
         (b"GET /../../etc/passwd HTTP/1.1", b"404"),
         (b"HEAD /metrics HTTP/1.1\r\nHost: [::1]:8000", b"200"),
@@ -83,7 +83,7 @@ def test_requests(server: PageServer, words: bytes, status: bytes) -> None:
 
 def test_a_page_that_cannot_be_made_ends_nothing() -> None:
     pages = iter([b"one"])
-    server = PageServer("127.0.0.1", 0, "text/plain", lambda: next(pages))
+    server = PageServer("127.0.0.1", 0, lambda: next(pages), {})
     try:
         assert scrape(server) == b"one"
         time.sleep(0.3)
@@ -95,11 +95,22 @@ def test_a_page_that_cannot_be_made_ends_nothing() -> None:
         server.close()
 
 
-def test_only_this_machine_unless_it_is_said() -> None:
-    for text in ("9464", "127.0.0.1:1", "[::1]:1", "localhost:1", "127.8.8.8:1"):
-        assert check_address(text, public=False) == text
-        assert not is_public(text)
-    for text in ("0.0.0.0:1", "[::]:1", "192.168.1.2:1", "lab.example:1"):
-        with pytest.raises(UsageError, match="no password"):
-            check_address(text, public=False)
-        assert check_address(text, public=True) == text
+@pytest.mark.parametrize("text", ["9464", "127.0.0.1:1", "[::1]:1", "localhost:1", "127.8.8.8:1", ":5"])
+def test_an_address_is_on_this_machine(text: str) -> None:
+    assert check_address(text, public=False) == text
+    assert not is_public(text)
+
+
+@pytest.mark.parametrize("text", ["0.0.0.0:1", "[::]:1", "192.168.1.2:1", "lab.example:1"])
+def test_other_machines_may_read_only_if_it_is_said(text: str) -> None:
+    with pytest.raises(UsageError, match="no password"):
+        check_address(text, public=False)
+    assert check_address(text, public=True) == text
+
+
+def test_addresses() -> None:
+    read = [parse_address(text) for text in ("9464", "0.0.0.0:1", "[::1]:80", ":5")]
+    assert read == [("127.0.0.1", 9464), ("0.0.0.0", 1), ("::1", 80), ("127.0.0.1", 5)]
+    for text in ("", "host:", "host:x", "1.2.3.4:70000"):
+        with pytest.raises(UsageError):
+            parse_address(text)

@@ -26,11 +26,8 @@ from pans.runtime.watch.watchers import Notifier
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forkserver, signals and /proc")
 STALLED_S, ENDED_S = 2.0, 5.0  # the bars
 SLACK_S = 0.5  # two processors, many tests
-LEASE_MS = {
-    "python": 20_000,
-    "native": 500,
-    "file": 500,
-}  # the first is so long that the watchdog's STOP comes before it
+# the first is so long that the watchdog's STOP comes before it
+LEASE_MS = {"python": 20_000, "native": 500, "file": 500}
 
 
 def hang_and_end(folder: Path, how: str) -> dict[str, Any]:
@@ -64,7 +61,6 @@ def test_a_run_that_hangs_says_so_goes_dark_and_can_be_ended(tmp_path: Path) -> 
     with ThreadPoolExecutor(3) as pool:
         found = dict(zip(HANGS, pool.map(lambda how: hang_and_end(tmp_path / how, how), HANGS)))
     for how, one in found.items():
-        print(how, one)
         assert one["stalled_s"] < STALLED_S + SLACK_S, how
         assert one["ended_s"] < ENDED_S + SLACK_S, how
         assert one["code"] == (EXIT_INTERRUPTED if how == "native" else EXIT_TIMING), how
@@ -79,9 +75,7 @@ def test_a_run_that_hangs_says_so_goes_dark_and_can_be_ended(tmp_path: Path) -> 
         if how == "file":
             assert replay(recording, recording.bundle()).as_recorded
         else:
-            assert recording.n_decisions >= 1, (
-                "what was buffered is on record"
-            )  # how many a call holds depends on the load
+            assert recording.n_decisions >= 1, "what was buffered is on record"
 
 
 def test_the_loop_alone_is_spoken_for_to_systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
