@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import random
+from bisect import bisect_left
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,9 +29,14 @@ class Emitted(NamedTuple):
     """One block as it left the detector; `dropped` when the device's buffer was full."""
 
     first: int
-    stamps: Any
+    stamps: np.ndarray
     readings: np.ndarray
     dropped: bool
+
+
+def read_of(block: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is stamped on the exposures of a block, nothing on frames, and what was read in them."""
+    return (block.patterns, block.bits) if isinstance(block, ClickBlock) else (np.zeros(0), block.words)
 
 
 @dataclass(slots=True)
@@ -41,6 +48,12 @@ class DeviceLog:
     commands: list[tuple[int, int, int]] = field(default_factory=list)
     pulses: list[tuple[int, Gate, int]] = field(default_factory=list)
 
+    def block(self, session: int, first: int) -> Emitted | None:
+        """Return the block that a session's exposure `first` begins."""
+        blocks = self.blocks.get(session, [])
+        place = bisect_left(blocks, first, key=attrgetter("first"))
+        return blocks[place] if place < len(blocks) and blocks[place].first == first else None
+
 
 class _LoggedStream(StreamBuffer):
     log: DeviceLog
@@ -49,9 +62,8 @@ class _LoggedStream(StreamBuffer):
         dropped = len(self._held) >= self.capacity
         self.log.messages += not dropped
         if not isinstance(message, Mark):
-            of_clicks = isinstance(message, ClickBlock)
-            stamps, readings = (message.patterns, message.bits) if of_clicks else (None, message.words)
-            block = Emitted(message.exposure_index, None if stamps is None else stamps.copy(), readings.copy(), dropped)
+            stamps, readings = (part.copy() for part in read_of(message))
+            block = Emitted(message.exposure_index, stamps, readings, dropped)
             self.log.blocks.setdefault(session, []).append(block)
         return super().put(message, session)
 

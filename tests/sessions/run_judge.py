@@ -1,31 +1,30 @@
 """The books of one run compared: device, wire, host, recording and replay. Each disagreement is one sentence in `violations`.
 
-Checked are: every emitted exposure is delivered unchanged or reported lost, exactly once; a window with a missing exposure abstains and
-a whole one is decided from the clicks that were emitted, none skipped or decided twice; no command is executed twice or out of order;
-every gate is executed or its refusal reported, none late; all that came is on record; a replay gives the same decisions.
-The definitions are plain loops and share no code with the host's kernels.
+Checked are: every emitted exposure is delivered unchanged or reported lost, exactly once; the decisions are those that the independent
+reader (tests/independent) makes of the recorded messages; no command is executed twice or out of order; every gate is executed or its
+refusal reported, none late; all that came is on record; a replay gives the same decisions.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from run_books import STOPPED, DeviceLog, Emitted, Heard, ObservedLink
+from lab_automaton import read_automaton, walk_again
+from lab_bundle import read_bundle
+from lab_decisions import decide_again
+from lab_recording import read_recording as read_again
+from run_books import STOPPED, DeviceLog, Emitted, Heard, ObservedLink, read_of
 
-from pans.runtime.core.decision import NO_LABEL, DecisionFlag
-from pans.runtime.core.plan import Plan
+from pans.runtime.bundle.model import Bundle, bundle_bytes
 from pans.runtime.live import RunResult
-from pans.runtime.record import Recording
+from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.replaying import replay
 from pans.runtime.wire.messages import (
-    DARK_PATTERN,
     STREAM_DECODERS,
-    ClickBlock,
     Frame,
     Mark,
     unpack_body,
@@ -50,43 +49,32 @@ class Checked:
     streams: int = 0
 
 
-class Stream(NamedTuple):
-    """What became of one session's exposures: stamps, clicks as a word for each, whether it was delivered; up to `end` accounted for."""
-
-    stamps: np.ndarray
-    words: np.ndarray
-    delivered: np.ndarray
-    end: int
-
-
 class Judge:
     """Compares the books of one run."""
 
-    def __init__(self, plan: Plan, shots: int) -> None:
+    def __init__(self) -> None:
         self.violations: list[str] = []
         self.counts = Checked()
-        self.plan = plan
-        self._visit = plan.slots_per_cycle * plan.cycles_per_object
-        self._windows = list(_windows(plan, shots))
 
     def fail(self, text: str) -> None:
         """Keep one violation."""
         if len(self.violations) < MAX_VIOLATIONS:
             self.violations.append(text)
 
-    def judge(self, log: DeviceLog, wire: ObservedLink, result: RunResult, recording: Recording, bundle: Any) -> None:
+    def judge(self, log: DeviceLog, wire: ObservedLink, result: RunResult, path: Path, bundle: Bundle) -> None:
         """Compare everything; see the module."""
+        recording = read_recording(path)
         if result.ended not in ("completed", "the link was lost within the last object"):
             self.fail(f"the run did not complete: {result.ended}")
         self._wire(wire, result, recording)
         self._commands(log)
         self._gates(log, wire, recording)
-        streams = self._streams(log, wire, result, recording)
-        rows, at = recording.decisions(), 0
-        for stream in streams:
-            at += self.decisions(stream, rows[at:])
-        if at != len(rows):
-            self.fail(f"{len(rows)} decisions were made, due were {at}")
+        self._streams(log, wire, result, recording)
+        found, rows = read_again(path.read_bytes()), recording.decisions()
+        there = read_bundle(bundle_bytes(bundle))
+        made = decide_again(found, there) if bundle.automaton is None else walk_again(found, read_automaton(there))
+        if made.tobytes() != found.rows.tobytes():
+            self.fail("the independent reader makes other decisions of the recorded messages")
         self.counts.decisions, self.counts.decisions_flagged = len(rows), int(np.count_nonzero(rows["flags"]))
         again = replay(recording, bundle)
         if (again.decisions, again.sha256) != (recording.n_decisions, recording.decisions_sha256):
@@ -178,7 +166,7 @@ class Judge:
 
     # -- the exposures -------------------------------------------------------------------------------------------------
 
-    def _streams(self, log: DeviceLog, wire: ObservedLink, result: RunResult, recording: Recording) -> list[Stream]:
+    def _streams(self, log: DeviceLog, wire: ObservedLink, result: RunResult, recording: Recording) -> None:
         """Match the gaps that the host reported with what each session's messages left out; both in their order."""
         events = list(recording.events())
         gaps = [(event["first_exposure"], event["exposures"]) for event in events if event["kind"] == "gap"]
@@ -189,27 +177,23 @@ class Judge:
             frame = unpack_body(body)
             if frame.type in STREAM_TYPES:
                 self._accept(frame, log, accepted[frame.session], sequence)
-        streams, dropped = [], 0
+        dropped, accounted, open_ends = 0, 0, False
         for session, spans in accepted.items():
             blocks = log.blocks.get(session, [])
-            stream = self._stream(blocks, spans, gaps, unknown)
-            streams.append(stream)
+            emitted = sum(len(one.readings) for one in blocks)
+            delivered, end = self._stream(emitted, spans, gaps, unknown)
+            self.counts.delivered += delivered
+            accounted, open_ends = accounted + end, open_ends or end < emitted
             dropped += sum(len(one.readings) for one in blocks if one.dropped)
             self._claim(wire.heard[session], blocks, session)
         if gaps or unknown:
             self.fail(f"gaps {gaps[:3]} and unknown ends {unknown[:3]} were reported where none are")
-        self.counts.delivered = sum(int(one.delivered.sum()) for one in streams)
-        self.counts.lost = sum(one.end for one in streams) - self.counts.delivered
-        self.counts.streams = len(streams)
+        self.counts.lost, self.counts.streams = accounted - self.counts.delivered, len(accepted)
         found = result.stream["exposures"], result.stream["lost_exposures"]
         if found != (self.counts.delivered, self.counts.lost):
-            self.fail(
-                f"delivered and lost were {self.counts.delivered, self.counts.lost} exposures, the host says {found}"
-            )
-        open_ends = any(one.end < len(one.words) for one in streams)
+            self.fail(f"delivered and lost are {self.counts.delivered, self.counts.lost}, the host says {found}")
         if not result.stream["device_drops"] <= dropped or (not open_ends and result.stream["device_drops"] != dropped):
             self.fail(f"the device dropped {dropped} exposures, the host says {result.stream['device_drops']}")
-        return streams
 
     def _accept(self, frame: Frame, log: DeviceLog, spans: list[tuple[int, int]], sequence: dict[int, int]) -> None:
         """Take one message by the rule of the protocol: numbers go up, and what comes behind its time is useless."""
@@ -219,15 +203,20 @@ class Judge:
         sequence[frame.session] = message.seq + 1
         if isinstance(message, Mark):
             return
-        readings = message.bits if isinstance(message, ClickBlock) else message.words
+        stamps, readings = read_of(message)
         spans.append((message.exposure_index, message.exposure_index + len(readings)))
+        sent = log.block(frame.session, message.exposure_index)
+        if sent is None or not (np.array_equal(sent.readings, readings) and np.array_equal(sent.stamps, stamps)):
+            self.fail(f"the block of exposure {message.exposure_index} holds other clicks than were emitted")
 
     def _stream(
-        self, blocks: list[Emitted], spans: list[tuple[int, int]], gaps: list[tuple[int, int]], unknown: list[int]
-    ) -> Stream:
-        """Return what became of one session's exposures; takes its gaps from the front of `gaps` and `unknown`."""
-        emitted = sum(len(one.readings) for one in blocks)
-        delivered, end = np.zeros(emitted, bool), 0
+        self, emitted: int, spans: list[tuple[int, int]], gaps: list[tuple[int, int]], unknown: list[int]
+    ) -> tuple[int, int]:
+        """Return how many of a session's exposures were delivered, and up to which all are accounted for.
+
+        Its gaps are taken from the front of `gaps` and `unknown`.
+        """
+        delivered, end = 0, 0
         for first, stop in spans:
             if first > end:
                 if gaps and gaps[0] == (end, emitted - end):
@@ -238,7 +227,7 @@ class Judge:
                     del gaps[0]
             if first < end:
                 self.fail(f"exposure {first} was delivered again")
-            delivered[first:stop], end = True, stop
+            delivered, end = delivered + stop - first, stop
         if gaps and end < emitted and gaps[0] == (end, emitted - end):
             del gaps[0]
             end = emitted
@@ -246,14 +235,7 @@ class Judge:
             del unknown[0]
         elif end != emitted:
             self.fail(f"exposures {end} to {emitted} were never accounted for: skipped in silence")
-        stamps = [one.stamps for one in blocks if one.stamps is not None]
-        words = [_words(one.readings) for one in blocks]
-        return Stream(
-            np.concatenate(stamps) if stamps else np.zeros(0, np.uint16),
-            np.concatenate(words) if words else np.zeros(0, np.uint64),
-            delivered,
-            end,
-        )
+        return delivered, end
 
     def _claim(self, heard: Heard, blocks: list[Emitted], session: int) -> None:
         status = heard.last_status
@@ -264,89 +246,3 @@ class Judge:
             self.fail(
                 f"session {session:08x}: STATUS claims {status.next_exposure, status.drops}, the device made {made}"
             )
-
-    # -- decisions -----------------------------------------------------------------------------------------------------
-
-    def decisions(self, stream: Stream, rows: Any) -> int:
-        """Compare the decisions of one session, from the first of `rows` on; return how many those are."""
-        taken = 0
-        while True:
-            visit, window = divmod(taken, len(self._windows))
-            members = visit * self._visit + self._windows[window][0]
-            whole, row = bool(members[-1] < stream.end), rows[taken] if taken < len(rows) else None
-            begun = members[0] < stream.end or (row is not None and row["flags"] & DecisionFlag.INCOMPLETE)
-            if visit * self._visit >= stream.end or not begun:
-                return taken
-            if row is None or not self._is_of(row, members):
-                if whole:
-                    self.fail(f"the window of exposures {members[0]} to {members[-1]} is due, found {row}")
-                return taken
-            self._decision(stream, row, members, self._windows[window][1])
-            taken += 1
-
-    def _is_of(self, row: Any, members: np.ndarray) -> bool:
-        last = int(row["exposure_index"])
-        return last in members if self.plan.automaton is not None else last == members[-1]
-
-    def _decision(self, stream: Stream, row: Any, members: np.ndarray, features: np.ndarray) -> None:
-        there = members[members < len(stream.words)]
-        delivered = len(there) == len(members) and bool(stream.delivered[there].all())
-        flagged = bool(row["flags"] & DecisionFlag.ABSTAINED) and row["label"] == NO_LABEL
-        if self.plan.automaton is not None:
-            self._walk(stream, row, there, flagged)
-            return
-        if not delivered:
-            if not (flagged and row["flags"] & (DecisionFlag.GAP | DecisionFlag.INCOMPLETE)):
-                self.fail(f"decision {row['index']} was made from a window with a gap: flags {row['flags']}")
-            return
-        words, counts = stream.words[members].tolist(), np.zeros(self.plan.n_patterns, np.int64)
-        if self.plan.mode == "parallel":
-            for channel in range(len(counts)):
-                counts[channel] = sum(word >> channel & 1 for word in words)
-        else:
-            np.add.at(counts, features, np.array(words, np.int64))
-        if flagged or row["counts_crc"] != zlib.crc32(counts.tobytes()):
-            self.fail(f"decision {row['index']}: flags {row['flags']}, or other clicks than were emitted")
-
-    def _walk(self, stream: Stream, row: Any, members: np.ndarray, flagged: bool) -> None:
-        """Follow the automaton through the visit's slots: each with the state that was stamped, and what was read in it."""
-        automaton = self.plan.automaton
-        assert automaton is not None
-        counted = np.zeros((len(self._windows[0][0]), automaton.channels), np.int64)
-        node, taken = 0, 0
-        for stamp, word in zip(stream.stamps[members].tolist(), stream.words[members].tolist()):
-            if stamp != node:
-                break
-            bits = [word >> channel & 1 for channel in range(automaton.channels)]
-            counted[taken] = word if automaton.channels == 1 else bits
-            node, taken = int(automaton.successors[node, word]), taken + 1
-            if node >= automaton.n_states:
-                break
-        if not (node >= automaton.n_states and stream.delivered[members[:taken]].all()):
-            if not flagged:
-                self.fail(f"decision {row['index']} was made from a walk with a gap: flags {row['flags']}")
-            return
-        wanted = zlib.crc32(counted.ravel().tobytes()), taken, int(members[taken - 1])
-        found = int(row["counts_crc"]), int(row["exposures"]), int(row["exposure_index"])
-        if flagged or found != wanted:
-            self.fail(f"decision {row['index']}: clicks, exposures and the last are {found}, emitted were {wanted}")
-
-
-def _words(readings: np.ndarray) -> np.ndarray:
-    """Readings as a number each: a click, a photon number, or a bit for each channel."""
-    if readings.ndim == 1:
-        return readings.astype(np.uint64)
-    return readings.astype(np.uint64) @ (np.uint64(1) << np.arange(0, 8 * readings.shape[1], 8, dtype=np.uint64))
-
-
-def _windows(plan: Plan, shots: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The windows of a visit: their exposures, ascending, and the pattern of each; from the plan alone."""
-    for window in range(plan.shots_per_cycle * plan.cycles_per_object // shots):
-        places = [
-            (cycle * plan.slots_per_cycle + slot, int(plan.slot_pattern[slot]))
-            for cycle in range(plan.cycles_per_object)
-            for slot in range(plan.slots_per_cycle)
-            if plan.slot_pattern[slot] != DARK_PATTERN
-            and (cycle * plan.shots_per_cycle + int(plan.slot_shot[slot])) // shots == window
-        ]
-        yield np.array([place for place, _ in places]), np.array([pattern for _, pattern in places])

@@ -12,7 +12,7 @@ import pytest
 from bundles import automaton_bundle, six_states, two_states
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from instrument_bench import IDEAL, Bench, of_type, plan, run_hosted, show, stamps_and_readings
+from instrument_bench import IDEAL, Bench, of_type, plan, run_hosted, stamps_and_readings
 
 from pans.firmware_sim.device import readings
 from pans.firmware_sim.scene.moving import Change, SceneFile
@@ -127,35 +127,6 @@ def test_both_ways_of_driving_give_the_same_walks(automaton: Automaton) -> None:
     assert np.array_equal(clicks, hosted[1])
 
 
-def test_behind_a_leaf_the_slots_are_dark_and_click_as_in_the_dark() -> None:
-    quiet = instrument(dark_rate_hz=0.0, afterpulse_probability=0.0)
-    stamps, clicks, _ = run(*bright(two_states(), profile=quiet), cycles=200)
-    walks, bits = stamps.reshape(200, -1), clicks.reshape(200, -1)
-    slots = (walks[:, 0] == DARK_PATTERN).all(), (walks[:, 1] == 0).all()
-    assert slots == (True, True)
-    stopped = bits[:, 1] == 1  # a click in state 0 leads to a leaf
-    assert (walks[stopped, 2] == DARK_PATTERN).all()
-    assert (walks[~stopped, 2] == 1).all()
-    assert not bits[stopped, 2].any()
-    assert 0 < stopped.sum() < 200
-
-
-def test_light_is_on_for_the_dwell_and_dark_counts_for_the_whole_exposure() -> None:
-    """With a quarter of the exposure, the light alone is a quarter: clicks follow 1 - exp(-(light / 4 + dark))."""
-    quarter = Automaton([0], [1], 4, [[1, 1]], [[0.5, 0.5], [0.5, 0.5]])
-    profile = instrument(dark_rate_hz=5000.0, afterpulse_probability=0.0)
-    bench, made = bright(quarter, profile=profile, scene=scene_from_arrays("w", IMAGES[:1] * 0 + 255, None, ()))
-    stamps, clicks, messages = run(bench, made, 6000)
-    lit = stamps == 0
-    pixels = automaton_bundle(quarter).pattern_levels.sum()
-    seconds = made.exposure_us * 1e-6
-    light = bench.device.profile.projector.peak_photoelectrons_hz * seconds * pixels / 4
-    for chosen, mean in ((lit, light + 5000 * seconds), (~lit, 5000 * seconds)):
-        p = 1 - math.exp(-mean)
-        assert abs(clicks[chosen].mean() - p) < 5 * math.sqrt(p * (1 - p) / chosen.sum())
-    assert of_type(messages, wire.Mark)[0].photons == pytest.approx(light, rel=1e-6)
-
-
 def test_marks_tell_the_light_of_a_walk_in_expectation() -> None:
     automaton = six_states()
     bench, made = bright(automaton)
@@ -265,29 +236,6 @@ def test_the_kernels_walk_as_the_oracle_does() -> None:
         click = np.stack([p, p + p_ap * (1 - p)])
         expected = readings.expected_light(np.stack([1 - click, click], axis=1), light, successors)
         assert expected == pytest.approx(naive_walks.expected_light(states, lambda pattern: light[pattern], 0.0, p_ap))
-
-
-# -- what the host names -----------------------------------------------------------------------------------------------
-
-
-def hosted() -> tuple[Bench, Plan, int]:
-    """A bench that is armed and waits for SHOW; the run has two cycles of a dark and four adaptive slots."""
-    bench, made = bright(six_states(), "host")
-    start = bench.device.tick + 1000
-    bench.done(Opcode.ARM, pack_command(Arm(start, 2, 100_000)))
-    return bench, made, start
-
-
-def test_the_latest_name_of_an_exposure_counts() -> None:
-    bench, made, start = hosted()
-    for state in (0, 1, 4):
-        bench.done(Opcode.SHOW, pack_command(show(six_states(), state, 1)))
-    bench.run_to(start + made.cycle_ticks)
-    assert stamps_and_readings([message for _, message in bench.got])[0].tolist() == [
-        DARK_PATTERN,
-        4,
-        *[DARK_PATTERN] * 3,
-    ]
 
 
 # -- uploads -----------------------------------------------------------------------------------------------------------

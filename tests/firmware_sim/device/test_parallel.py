@@ -9,17 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from moving_scenes import CELLS, FLOW, PICTURES, TAPE, TICK_HZ, light_and_clicks, program, started, view_of
+from moving_scenes import CELLS, FLOW, PICTURES, TAPE, light_and_clicks, program, started, view_of
 
-from pans.firmware_sim.device import frame_writer
-from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device import frame_writer, parallel
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun, Stretch
 from pans.firmware_sim.device.sequential import Measurement
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
 from pans.firmware_sim.device.view import View
-from pans.firmware_sim.ports.faults import parse_faults
-from pans.firmware_sim.ports.faulty import FaultyDevice
 from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.marks import MARK_PHOTONS, Stamp
 from pans.firmware_sim.scene.moving import Cells, Change
@@ -84,7 +81,11 @@ def comparable(message: Any) -> Any:
 
 @pytest.mark.parametrize("changes", [(), CHANGES], ids=["steady", "changing"])
 @pytest.mark.parametrize("what", [CELLS, TAPE, PICTURES], ids=["cells", "tape", "still"])
-def test_stretches_hold_the_messages_of_plain_loops(what: Any, changes: tuple[Change, ...]) -> None:
+def test_stretches_hold_the_messages_of_plain_loops(
+    what: Any, changes: tuple[Change, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if changes:
+        monkeypatch.setattr(parallel, "STRETCH_EXPOSURES", 37)
     view = view_of(what, changes, profile=PROFILE)
     cut = replace(program(16, dark=(3,), gap=777), blocks=((0, 9), (9, 1), (10, 6)), cycles_per_object=3)
     for plan, cycles in ((cut, 400), (program(1), 1200)):
@@ -236,17 +237,3 @@ def test_made_ahead_or_one_by_one_the_stream_is_the_same(name: str, capacity: in
         assert len(wanted[0]) > 5000
     assert (dropped > 5) == (capacity < 256)
     assert refused > 10
-
-
-def test_faults_find_the_same_frames() -> None:
-    faults = parse_faults("loss:0.1,flip:0.1,reorder:0.1,late:1ms/5ms")
-    clock = DeviceClock(TICK_HZ, 0, 0)
-
-    def run(one_by_one: bool) -> tuple[bytes, Any]:
-        device = FaultyDevice(
-            lambda epoch, tick: instrument("clothes-in-flow", 256, one_by_one), clock, faults, 3, 1000
-        )
-        return story(device, 0, lambda: 1)[0], device.counters
-
-    assert run(True) == run(False)
-    assert run(True)[1].lost > 10

@@ -13,9 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import serial
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
@@ -24,16 +22,17 @@ from pans.firmware_sim.ports.serve import ChildLink, SimOptions, build_instrumen
 from pans.firmware_sim.ports.shell import Port, TcpPort, open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import load_scene
+from pans.firmware_sim.testing import small_setup
+from pans.runtime.core.still import Core
+from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import ConfigError, LinkError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link, open_link
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_command
-from pans.runtime.wire.messages import SLOT_DTYPE, DeviceState, MessageType, Opcode, StateReason
-from pans.runtime.wire.session import HostSession
+from pans.runtime.link.connection import Connection
+from pans.runtime.live import Observers, RunOptions, RunResult, run_live
+from pans.runtime.wire.messages import DeviceState
 
 PATIENCE_S = 20.0
-STREAM: dict[int, Any] = {MessageType.MARK: wire.decode_mark, MessageType.CLICKS: wire.decode_clicks}
 FAST = "sim:ideal?scene=uniform&pace=fast"
 needs_pty = pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
 
@@ -135,66 +134,6 @@ def test_the_clock_drifts_as_told() -> None:
 # -- virtual time ------------------------------------------------------------------------------------------------------
 
 
-def opened(link: Link, session: HostSession | None = None) -> tuple[HostSession, wire.FrameDecoder]:
-    """Do the handshake over `link` within PATIENCE_S of the link's own time."""
-    session = session or HostSession(0x5EED)
-    decoder = wire.FrameDecoder()
-    session.start(link.now_ns())
-    deadline = link.now_ns() + int(PATIENCE_S * 1e9)
-    while session.welcome is None and link.now_ns() < deadline:
-        session.poll(link.now_ns())
-        link.write(session.take_output())
-        for frame in decoder.feed(link.read(0.05)):
-            session.on_frame(frame, link.now_ns())
-    assert session.welcome is not None
-    return session, decoder
-
-
-def run_of(link: Link, n_cycles: int = 20, lease_ms: int = 60_000) -> tuple[list[Any], bytes]:
-    """Measure `n_cycles` cycles of three exposures; return the stream's messages and all bytes received after the handshake."""
-    session, decoder = opened(link)
-    slots = np.zeros(3, SLOT_DTYPE)
-    slots["offset_ticks"], slots["pattern"] = [0, 100, 200], [0, 1, wire.DARK_PATTERN]
-    for index in range(2):
-        levels = np.full(2, 2000 * (index + 1), np.uint16)
-        session.submit(Opcode.LOAD_PATTERN, pack_command(PatternChunk(index, 0, 2, levels)))
-    session.submit(Opcode.LOAD_PLAN, pack_command(PlanChunk(0, 2, 3, 0, 90, 100, 300, 16, 1, slots)))
-    session.grant(1 << 20, 0)
-    session.probe(link.now_ns())
-    raw, messages, armed = b"", [], False
-    deadline = link.now_ns() + int(PATIENCE_S * 1e9)
-    while link.now_ns() < deadline:
-        if session.pongs and session.settled and not armed:
-            armed = True
-            start_tick = session.pongs[-1][0].tx_tick + 200_000
-            session.submit(Opcode.ARM, pack_command(Arm(start_tick, n_cycles, lease_ms)))
-        session.poll(link.now_ns())
-        link.write(session.take_output())
-        data = link.read(0.05)
-        raw += data
-        for frame in decoder.feed(data):
-            session.on_frame(frame, link.now_ns())
-            if frame.type in STREAM:
-                messages.append(STREAM[frame.type](frame.payload))
-        if armed and session.status is not None and session.status.reason == StateReason.COMPLETED:
-            return messages, raw
-    raise AssertionError(f"the run did not complete within {PATIENCE_S} s: {session.status}")
-
-
-def check_run(messages: list[Any], n_cycles: int = 20) -> None:
-    assert [message.seq for message in messages] == list(range(2 * n_cycles))
-    blocks = [message for message in messages if isinstance(message, wire.ClickBlock)]
-    assert [block.exposure_index for block in blocks] == [3 * cycle for cycle in range(n_cycles)]
-    assert all(block.patterns.tolist() == [0, 1, wire.DARK_PATTERN] for block in blocks)
-
-
-def test_a_virtual_run_is_the_same_bit_for_bit() -> None:
-    runs = [run_of(open_sim(FAST + seed)) for seed in ("", "", "&seed=1")]
-    check_run(runs[0][0])
-    assert runs[0][1] == runs[1][1]
-    assert runs[0][1] != runs[2][1]
-
-
 def test_virtual_time_stops_at_each_emission() -> None:
     link = open_sim(FAST)
     assert isinstance(link, VirtualLink)
@@ -202,7 +141,7 @@ def test_virtual_time_stops_at_each_emission() -> None:
     assert link.now_ns() == START_NS
     assert link.read(0.5) == b""  # nothing to come before a session
     assert link.now_ns() == START_NS + 500_000_000
-    opened(link)
+    Connection(link).handshake()
     before = link.now_ns()
     status = link.read(10.0)
     assert len(status) > 20
@@ -212,44 +151,7 @@ def test_virtual_time_stops_at_each_emission() -> None:
     assert link.read(0.0) == b""
 
 
-def test_a_closed_virtual_link_is_gone() -> None:
-    link = open_sim(FAST)
-    link.close()
-    link.close()
-    for use in (lambda: link.read(0.1), lambda: link.write(b"\0")):
-        with pytest.raises(LinkError, match="is closed"):
-            use()
-
-
-def test_open_link_finds_the_simulator() -> None:
-    link = open_link(FAST)
-    assert link.simulated
-    link.close()
-
-
-# -- real pace, through pyserial ---------------------------------------------------------------------------------------
-
-
-class SerialClient:
-    """pyserial as the tests' own minimal link."""
-
-    name, simulated, virtual = "test", True, False
-
-    def __init__(self, url: str) -> None:
-        target = url.removeprefix("serial:")
-        self.port = serial.serial_for_url(target.removeprefix("//"), timeout=0.05)
-
-    def read(self, timeout_s: float) -> bytes:
-        return bytes(self.port.read(self.port.in_waiting or 1))
-
-    def write(self, data: bytes) -> None:
-        self.port.write(data)
-
-    def now_ns(self) -> int:
-        return time.perf_counter_ns()
-
-    def close(self) -> None:
-        self.port.close()
+# -- real pace -----------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -278,85 +180,27 @@ def serving(listen: str) -> Iterator[tuple[Port, Instrument]]:
     assert not died
 
 
-LISTEN = [pytest.param("pty", marks=needs_pty), "tcp:127.0.0.1:0"]
-
-
-@pytest.mark.parametrize("listen", LISTEN)
-def test_a_run_over_a_real_port(listen: str) -> None:
-    with serving(listen) as (port, _):
-        client = SerialClient(port.url)
-        try:
-            check_run(run_of(client)[0])
-        finally:
-            client.close()
-
-
-@pytest.mark.parametrize("listen", LISTEN)
+@pytest.mark.parametrize("listen", [pytest.param("pty", marks=needs_pty), "tcp:127.0.0.1:0"])
 def test_a_client_that_hangs_up_leaves_the_light_off_and_may_return(listen: str) -> None:
+    profile, bundle, plan = small_setup()
+
+    def run_on(link: Link, n_cycles: int, observers: Observers) -> RunResult:
+        core = Core(plan, make_decider(bundle), 1, n_cycles)
+        options = RunOptions(n_cycles=n_cycles, deadline_us=1e9, lease_ms=300, realtime=False)
+        return run_live(link, profile, bundle, plan, core, options, observers=observers)
+
     with serving(listen) as (port, device):
-        client = SerialClient(port.url)
-        with pytest.raises(AssertionError, match="did not complete"):
-            run_until_lit(client, device)
-        client.close()
+        link = open_link(port.url)
+        assert run_on(link, 0, Observers(lambda run, output: link.close())).link_lost
         wait_for(lambda: device.state is DeviceState.SAFE)
         assert not device.projector_lit
-        again = SerialClient(port.url)
-        try:
-            session, decoder = opened(again, HostSession(0xBEEF))
-            assert session.welcome is not None
-            session.submit(Opcode.RESET)
-            wait_for(lambda: exchange(again, session, decoder).settled)
-            check_run(run_of(again)[0])
-        finally:
-            again.close()
-
-
-def run_until_lit(client: SerialClient, device: Instrument) -> None:
-    """Start an endless run with a short lease, and give up on it as soon as the projector is lit."""
-    original = client.read
-
-    def read(timeout_s: float) -> bytes:
-        if device.projector_lit:
-            raise AssertionError("did not complete: hung up")
-        return original(timeout_s)
-
-    client.read = read  # type: ignore[method-assign]
-    run_of(client, n_cycles=0, lease_ms=300)
-
-
-def exchange(client: SerialClient, session: HostSession, decoder: wire.FrameDecoder) -> HostSession:
-    session.poll(client.now_ns())
-    client.write(session.take_output())
-    for frame in decoder.feed(client.read(0.05)):
-        session.on_frame(frame, client.now_ns())
-    return session
+        assert run_on(open_link(port.url), 20, Observers()).tally.decisions == 20
 
 
 def wait_for(condition: Any) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
-
-
-def test_bytes_cross_the_port_unchanged() -> None:
-    """All 256 values, so that no terminal mode translates, echoes or swallows any."""
-    listens = ["tcp:0", "pty"] if hasattr(os, "openpty") else ["tcp:0"]
-    for listen in listens:
-        port = open_port(listen)
-        client = SerialClient(port.url)
-        data = bytes(range(256)) * 3
-        client.write(data)
-        received = b""
-        deadline = time.monotonic() + PATIENCE_S
-        while len(received) < len(data) and time.monotonic() < deadline:
-            port.wait(0.05, False)
-            received += port.read()
-        assert received == data
-        assert port.write(data) == len(data)
-        client.port.timeout = PATIENCE_S
-        assert client.port.read(len(data)) == data
-        client.close()
-        port.close()
 
 
 def test_tcp_listens_on_loopback_unless_told_otherwise() -> None:
@@ -430,17 +274,11 @@ def test_the_loop_on_a_core_of_its_own_runs_and_gives_its_priority_back(monkeypa
 # -- processes of their own --------------------------------------------------------------------------------------------
 
 
-def test_real_pace_runs_in_a_process_that_ends_with_the_link() -> None:
+def test_the_process_of_real_pace_ends_with_the_link() -> None:
     link = open_sim("sim:ideal?scene=uniform")
     assert isinstance(link, ChildLink)
-    try:
-        assert (link.simulated, link.virtual) == (True, False)
-        child = link._child
-        assert child.pid != os.getpid()
-        check_run(run_of(link)[0])
-    finally:
-        link.close()
-    assert child.wait(60) == 0
+    link.close()
+    assert link._child.wait(60) == 0
     link.close()
 
 
@@ -485,11 +323,9 @@ def test_simulate_prints_its_url_and_serves_until_told_to_end(how: list[str], nu
         try:
             assert process.stdout is not None
             url = process.stdout.readline().decode().strip()
-            client = SerialClient(url)
-            session, _ = opened(client)
-            assert session.welcome is not None
-            assert session.welcome.facts["simulated"] is True
-            client.close()
+            link = open_link(url)
+            assert Connection(link).handshake().facts["simulated"] is True
+            link.close()
             process.send_signal(number)
             assert process.wait(PATIENCE_S) == code
         finally:

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from c_core import COMPILER, FOLDER, core_sources
 from c_device import needs_compiler
-from tree import ROOT
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZERS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -75,10 +74,3 @@ def test_the_core_allocates_nothing_and_calls_no_system() -> None:
         assert not ALLOCATORS.search(text), path
         headers = set(re.findall(r"#include <([^>]+)>", text))
         assert headers <= {"string.h", "stdbool.h", "stddef.h", "stdint.h"}, path
-
-
-def test_the_document_states_the_sizes() -> None:
-    text = (ROOT / "docs" / "how-to" / "reference-instrument.md").read_text()
-    for target, (_, words, _) in TARGETS.items():
-        assert target in text
-        assert all(word in text for word in words)

@@ -1,4 +1,4 @@
-"""Moving scenes: the light against slow oracles, the statistics of the flow, the truth in MARKs, and that nothing depends on batches."""
+"""Moving scenes: the light against slow oracles, the statistics of the flow, and the truth in MARKs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from moving_scenes import (
 )
 from naive_moving import mean_light, shifted, tape_field
 
-from pans.firmware_sim.device import parallel
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun
 from pans.firmware_sim.device.sequential import Measurement
@@ -295,54 +294,6 @@ def test_tape_marks_stand_where_the_window_is_aligned() -> None:
     assert light_of(run, marks[3].exposure_index, 1).sum() == pytest.approx(marks[3].photons, rel=1e-12)
 
 
-@pytest.mark.parametrize("what", [CELLS, TAPE], ids=["cells", "tape"])
-def test_batches_and_chunks_change_nothing(what: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    view = view_of(what, (Change("drift", 0.0, 1.0, -1, -50.0),))
-
-    def story(ahead: bool = False) -> list[Any]:
-        run = started(view, program(dark=(3,)), cycles=120)
-        messages = []
-        while run.next_tick is not None:
-            if ahead:
-                run.draw_ahead()
-            message = run.emit()
-            messages.append(
-                (*message[:6], message.words.tobytes()) if isinstance(message, wire.FrameBlock) else message
-            )
-        return messages
-
-    whole = story()
-    assert len(whole) > 120
-    for size in (1, 37, 10_000):
-        monkeypatch.setattr(parallel, "STRETCH_EXPOSURES", size)
-        assert story() == whole
-        assert story(ahead=True) == whole
-
-
-def test_messages_come_in_the_order_of_ticks() -> None:
-    run = started(view_of(), program(), cycles=200)
-    last, marks, next_exposure = 0, 0, 0
-    together: int | None = None
-    while run.next_tick is not None:
-        due, message = run.next_tick, run.emit()
-        assert due >= last
-        last = due
-        if isinstance(message, wire.Mark):
-            assert message.tick == 1000 + 250 * message.exposure_index
-            together = due
-            assert message.object_index == marks
-            assert next_exposure <= message.exposure_index < next_exposure + 16  # before the block that holds it
-            marks += 1
-        else:
-            assert message.object_index == wire.NO_OBJECT
-            assert message.exposure_index == next_exposure
-            assert together in (None, due)  # a mark leaves with the block that holds its exposure
-            together = None
-            next_exposure += len(message.words)
-    assert next_exposure == 200 * 16
-    assert marks > 300
-
-
 def test_another_run_meets_other_cells() -> None:
     first, again, later = (started(view_of(), program(), first_draw=draw) for draw in (0, 0, 5000))
     marks = [marks_of(run._light, 3) for run in (first, again, later)]
@@ -412,23 +363,6 @@ def test_bars_that_do_not_fit_the_patterns_are_refused() -> None:
 
 
 # -- the whole device --------------------------------------------------------------------------------------------------------
-
-
-def test_clicks_follow_the_light_that_the_scene_passes() -> None:
-    """Sums over 40 000 exposures, channel by channel, against the probabilities they were drawn with; 5 sigma."""
-    dim = replace(FLOW.projector, peak_photoelectrons_hz=4e4)
-    profile = replace(FLOW, projector=dim, detector=replace(FLOW.detector, crosstalk_probability=0.0))
-    view, plan = view_of(CELLS, (Change("dark", 0.02, 9.0, 1, 500.0),), profile=profile, seed=3), program()
-    run = started(view, plan)
-    words = np.concatenate([block.words for block in emitted(run, 5500) if isinstance(block, wire.FrameBlock)])[:40_000]
-    clicks = np.unpackbits(words, axis=1, bitorder="little")[:, :3]
-    exposures = Exposures(plan, None, TICK_HZ)
-    times_s = exposures.seconds(exposures.begins(0, len(words)))
-    light = light_of(light_and_clicks(view, plan)[0], 0, len(words))
-    probability = Changes(view.scene.changes, 3).probability(detector_model(profile, 2.0), light, times_s, 2e-6)
-    assert 0.01 < probability.mean() < 0.9
-    spread = np.sqrt((probability * (1 - probability)).sum(axis=0))
-    assert (np.abs(clicks.sum(axis=0) - probability.sum(axis=0)) < 5 * spread).all()
 
 
 def test_a_still_scene_changes_too_pattern_after_pattern() -> None:

@@ -35,17 +35,6 @@ def test_a_file_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     assert not scene.images.flags.writeable
 
 
-def test_labels_and_classes_may_be_missing(tmp_path: Path) -> None:
-    scene = load_scene(saved(tmp_path / "plain.npz", images=IMAGES))
-    assert scene.labels.tolist() == [-1, -1, -1]
-    assert scene.classes == ()
-
-
-def test_compressed_files_are_read(tmp_path: Path) -> None:
-    np.savez_compressed(tmp_path / "small.npz", images=IMAGES)
-    assert np.array_equal(load_scene(tmp_path / "small.npz").images, IMAGES)
-
-
 def test_targets_fit_any_shape() -> None:
     uniform, dark = load_scene("uniform"), load_scene("dark")
     assert uniform.any_shape
