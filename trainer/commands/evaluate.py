@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
@@ -18,7 +19,7 @@ from pans.runtime.bundle.optics import amplification
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, note, warn
 from pans.runtime.cli.option_fields import add_options, options_from
 from pans.runtime.errors import UsageError
-from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of, imaging_of, tolerance_of
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, bleaching_of, imaging_of, tolerance_of
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 from pans.runtime.safe_text import one_line
@@ -29,7 +30,6 @@ from .arguments import add_data_dir, displayed_progress, needing, usage_errors, 
 if TYPE_CHECKING:
     from pans.trainer.evaluate.accuracy import Measured, MeasuredPictures
     from pans.trainer.evaluate.held_out import HeldOut
-    from pans.trainer.evaluate.optics import OverOptics
     from pans.trainer.evaluate.walks import MeasuredWalks
 
 RECALLS_SHOWN = 10
@@ -104,13 +104,13 @@ def _evaluate(args: argparse.Namespace) -> int:
     bundle, digest = load_bundle(args.bundle)
     if args.exact and bundle.picture_shape is not None:
         raise UsageError("--exact: pictures are compared by trials", remedy="use --trials")
-    several, dosed = several_tables(args), is_dosed(args)
-    trials = args.trials
+    make_other, trials = other_answer(args), args.trials
     if trials is None and not args.exact and bundle.automaton is None:
         trials = h.default_trials(bundle)
     more: dict[str, Any] = {}
     with usage_errors():
-        imaging = None if several or args.optics is None else imaging_of(args.optics)
+        given = args.optics is not None and args.draws is None and args.optics != CURVES_WORD
+        imaging = imaging_of(args.optics) if given else None
         conditions = options_from(args, Conditions, imaging=imaging, bleaching=bleaching_given(args))
         task = args.task or remembered_task(bundle.provenance, bundle.task, bundle_path(args.bundle))
         held_out = h.held_out_of(bundle, task, args.objects, args.data_dir, conditions)
@@ -123,9 +123,8 @@ def _evaluate(args: argparse.Namespace) -> int:
             facts = {"task": held_out.task.name, "profile": held_out.profile.name, "sha256": digest}
             emit(args, {**answer, **facts, "seconds": time.perf_counter() - started, "simulated": True}, words)
 
-        if several or dosed:
-            make = _other_answer(args)
-            answered(*make(args, bundle, held_out, conditions))
+        if make_other is not None:
+            answered(*make_other(args, bundle, held_out, conditions))
             return EXIT_FINE
         if bundle.automaton is None:
             measured = h.measure(bundle, held_out, shots=args.shots, trials=trials, conditions=conditions)
@@ -216,27 +215,41 @@ def passive_light(bundle: Bundle, held_out: HeldOut) -> dict[str, Any]:
 def words_of(
     measured: Measured | MeasuredPictures | MeasuredWalks, more: Mapping[str, Any] = MappingProxyType({})
 ) -> str:
-    """Return the figures in words; `more` is `walk_payload` of an automaton."""
+    """Return the figures in words; `more` is `walk_payload` of an automaton, or `passive_light`."""
     figures: dict[str, Any] = asdict(measured)
-    if "exposures_mean" in figures:
-        return _walk_words(figures, more)
-    classes = "".join(f"\n{line}" for line in class_words(figures.get("by_class")))
-    light = _light_words(figures)
-    if "reaching_photons" in more:
-        light += f"\n  {_reaching_words(more)}"
+    walks = "exposures_mean" in figures
     if "ssim_mean" in figures:
-        return (
+        lines = [
             f"SIMULATED SSIM {figures['ssim_mean']:.4f}, mean squared error {figures['mse_mean']:.4f}  "
-            f"({measured.objects} objects, {measured.trials} trials, K = {measured.shots})\n"
-            f"  spread over trials      {figures['ssim_std']:.4f}\n"
-            f"  error from the objects  {figures['ssim_se_objects']:.4f}\n{light}"
-        )
-    how = _how(figures)
-    return (
-        f"SIMULATED accuracy {100 * figures['accuracy_mean']:.2f} %  ({measured.objects} objects, {how}, K = {measured.shots})\n"
-        f"  spread over trials      {100 * figures['accuracy_std']:.2f} points\n"
-        f"  error from the objects  {100 * figures['accuracy_se_objects']:.2f} points\n{light}{classes}"
-    )
+            f"({measured.objects} objects, {measured.trials} trials, K = {measured.shots})",
+            f"  spread over trials      {figures['ssim_std']:.4f}",
+            f"  error from the objects  {figures['ssim_se_objects']:.4f}",
+        ]
+    else:
+        lines = _accuracy_lines(figures, f"{_how(figures)}, {'automaton' if walks else f'K = {measured.shots}'}")
+    if walks:
+        lines.append(f"  calibration error       {_percent(figures['expected_calibration_error'])} points")
+    lines.append(_light_words(figures))
+    if "reaching_photons" in more:
+        lines.append(f"  {_reaching_words(more)}")
+    lines += class_words(figures.get("by_class"))
+    if figures.get("abstained"):
+        lines.append(f"  abstained {100 * figures['abstained']:.2f} %; the accuracy is that of what was decided")
+    for name, first in more.items():
+        if name.startswith("first_") and first is not None:
+            lines.append(f"  the first {first['objects']}: {_percent(first['accuracy_mean'])} %\n{_light_words(first)}")
+    return "\n".join(lines)
+
+
+def _accuracy_lines(
+    figures: Mapping[str, Any], which: str, over: str = "trials", spread: str = "accuracy_std", more: str = ""
+) -> list[str]:
+    """Accuracy with both of its errors; `spread` is the key of that over trials or tables."""
+    return [
+        f"SIMULATED accuracy {_percent(figures['accuracy_mean'])} %  ({figures['objects']} objects, {which})",
+        f"  spread over {over}      {_percent(figures[spread])} points{more}",
+        f"  error from the objects  {_percent(figures['accuracy_se_objects'])} points",
+    ]
 
 
 def class_words(found: Mapping[str, Any] | None) -> list[str]:
@@ -272,24 +285,6 @@ def _reaching_words(more: Mapping[str, Any]) -> str:
     return words
 
 
-def _walk_words(figures: Mapping[str, Any], more: Mapping[str, Any]) -> str:
-    how = _how(figures)
-    lines = [
-        f"SIMULATED accuracy {_percent(figures['accuracy_mean'])} %  ({figures['objects']} objects, {how}, automaton)",
-        f"  spread over trials      {_percent(figures['accuracy_std'])} points",
-        f"  error from the objects  {_percent(figures['accuracy_se_objects'])} points",
-        f"  calibration error       {_percent(figures['expected_calibration_error'])} points",
-        _light_words(figures),
-        *class_words(figures["by_class"]),
-    ]
-    if figures["abstained"]:
-        lines.append(f"  abstained {100 * figures['abstained']:.2f} %; the accuracy is that of what was decided")
-    for name, first in more.items():
-        if name.startswith("first_") and first is not None:
-            lines.append(f"  the first {first['objects']}: {_percent(first['accuracy_mean'])} %\n{_light_words(first)}")
-    return "\n".join(lines)
-
-
 def _points(difference: float) -> str:
     return f"{round(100 * difference, 2) + 0.0:+.2f}"  # no minus before a zero
 
@@ -313,30 +308,33 @@ def _light_words(figures: Mapping[str, Any]) -> str:
 # ---- several tables (--draws, --optics tolerance), a dose cap, samples that bleach ----
 
 Answer = tuple[dict[str, Any], str]  # as JSON and in words
+Row = tuple[str, str, float, str]  # of a small table: label, key of a point, factor, format
 
 
-def several_tables(args: argparse.Namespace) -> bool:
-    """Whether more than one table of optics is asked for; UsageError for options that contradict each other."""
-    if args.draws is not None and args.optics == CURVES_WORD:
-        raise UsageError("--draws takes a tolerance, not --optics tolerance", remedy="leave one of them out")
-    several = args.draws is not None or args.optics == CURVES_WORD
-    if several and (args.trials is not None or args.shots != 1):
-        raise UsageError(
-            "--draws and --optics tolerance are exact, of one shot", remedy="leave --trials and --shots out"
-        )
-    return several
-
-
-def is_dosed(args: argparse.Namespace) -> bool:
-    """Whether a cap or bleaching is asked for; UsageError for what contradicts it."""
-    asked = args.dose_cap is not None or args.bleach is not None
-    if asked and args.shots != 1:
-        raise UsageError("--dose-cap and --bleach are of one shot", remedy="leave --shots out")
-    if asked and args.draws is not None:
-        raise UsageError("--draws has no --dose-cap and no --bleach", remedy="--optics takes one table beside them")
-    if args.dose_cap == CURVE_WORD and (args.trials is not None or args.exact):
-        raise UsageError("--dose-cap curve takes as few trials as can be", remedy="leave --trials and --exact out")
-    return asked
+def other_answer(args: argparse.Namespace) -> Callable[..., Answer] | None:
+    """Return what makes the answer in place of plain figures, or None; UsageError for options that contradict each other."""
+    draws, curves, caps = args.draws is not None, args.optics == CURVES_WORD, args.dose_cap == CURVE_WORD
+    dosed, sampled = args.dose_cap is not None or args.bleach is not None, args.trials is not None
+    for wrong, words, remedy in (
+        (draws and curves, "--draws takes a tolerance, not --optics tolerance", "leave one of them out"),
+        (
+            (draws or curves) and (sampled or args.shots != 1),
+            "--draws and --optics tolerance are exact, of one shot",
+            "leave --trials and --shots out",
+        ),
+        (dosed and args.shots != 1, "--dose-cap and --bleach are of one shot", "leave --shots out"),
+        (dosed and draws, "--draws has no --dose-cap and no --bleach", "--optics takes one table beside them"),
+        (
+            caps and (sampled or args.exact),
+            "--dose-cap curve takes as few trials as can be",
+            "leave --trials and --exact out",
+        ),
+    ):
+        if wrong:
+            raise UsageError(words, remedy=remedy)
+    if draws or curves:
+        return _over_draws if draws else _misaligned
+    return (_dose_curve if caps else _within_dose) if dosed else None
 
 
 def bleaching_given(args: argparse.Namespace) -> Bleaching:
@@ -344,13 +342,11 @@ def bleaching_given(args: argparse.Namespace) -> Bleaching:
     return NO_BLEACHING if args.bleach is None else bleaching_of(args.bleach)
 
 
-def _other_answer(args: argparse.Namespace) -> Any:
-    """The answer that is asked for in place of plain figures."""
-    if args.draws is not None:
-        return _over_draws
-    if args.optics == CURVES_WORD:
-        return _misaligned
-    return _dose_curve if args.dose_cap == CURVE_WORD else _within_dose
+@contextmanager
+def _counted(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield a report of how many are done, of how many."""
+    with displayed_progress(f"{what}s") as show:
+        yield lambda n, of: show(f"{what} {n} of {of}", n, n, of, n == of)
 
 
 def _over_draws(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
@@ -364,52 +360,30 @@ def _over_draws(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, con
             remedy="--optics shift=1:rotate=2:psf=0.5..0.8:black=0.002, say",
         )
     tolerance = tolerance_of(text)
-    tables = drawn_tables(tolerance, args.draws, args.seed)
-    with displayed_progress("tables") as show:
-        found = over_optics(
-            bundle, held_out, tables, conditions, lambda n, of: show(f"table {n} of {of}", n, n, of, n == of)
-        )
-    words = _over_words(found, f"tables drawn within {tolerance.words()}")
-    return {"optics": tolerance.as_dict(), **asdict(found)}, words
-
-
-def _over_words(found: OverOptics, which: str) -> str:
-    return (
-        f"SIMULATED accuracy {100 * found.accuracy_mean:.2f} %  ({found.objects} objects, {found.tables} {which})\n"
-        f"  spread over tables      {100 * found.accuracy_std_optics:.2f} points (error of the mean"
-        f" {100 * found.accuracy_se_optics:.2f}), worst table {100 * found.accuracy_worst:.2f} %\n"
-        f"  error from the objects  {100 * found.accuracy_se_objects:.2f} points\n{_light_words(asdict(found))}"
-    )
+    with _counted("table") as report:
+        tables = drawn_tables(tolerance, args.draws, args.seed)
+        found = asdict(over_optics(bundle, held_out, tables, conditions, report))
+    which = f"{found['tables']} tables drawn within {tolerance.words()}"
+    more = f" (error of the mean {_percent(found['accuracy_se_optics'])}), worst table {_percent(found['accuracy_worst'])} %"
+    lines = _accuracy_lines(found, which, "tables", "accuracy_std_optics", more)
+    return {"optics": tolerance.as_dict(), **found}, "\n".join([*lines, _light_words(found)])
 
 
 def _misaligned(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
     from pans.trainer.evaluate.optics import misalignment_curves
 
-    about = conditions.imaging_on(held_out.profile)
-    with displayed_progress("tables") as show:
-        curves = misalignment_curves(
-            bundle, held_out, about, conditions, lambda n, of: show(f"table {n} of {of}", n, n, of, n == of)
-        )
-    payload: dict[str, Any] = {"about": about.numbers(), "objects": len(held_out.objects), "curves": curves}
+    about, objects = conditions.imaging_on(held_out.profile), len(held_out.objects)
+    with _counted("table") as report:
+        curves = misalignment_curves(bundle, held_out, about, conditions, report)
+    payload: dict[str, Any] = {"about": about.numbers(), "objects": objects, "curves": curves}
     if args.pictures is not None:
         from pans.trainer.evaluate.pictures import draw_optics
 
         payload["pictures"] = [str(draw_optics(args.pictures, {bundle.name: curves}, force=args.force))]
-    return payload, optics_curve_words(bundle.name, len(held_out.objects), about, curves)
-
-
-def optics_curve_words(
-    name: str, objects: int, about: Imaging, curves: Mapping[str, Sequence[Mapping[str, Any]]]
-) -> str:
-    """Return the curves as a small table."""
-    lines = [
-        f"SIMULATED accuracy of {name} (%), {objects} objects, exact expectation, one misalignment beside {about.words()}"
-    ]
-    for key, points in curves.items():
-        lines.append(f"  {key:13s}" + "".join(f"{point['value']:>9g}" for point in points))
-        lines.append(f"  {'':13s}" + "".join(f"{100 * (point['accuracy_mean'] or 0.0):>9.2f}" for point in points))
-        lines.append(f"  {'photons':13s}" + "".join(f"{point['photons_mean']:>9.2f}" for point in points))
-    return "\n".join(lines)
+    head = f"SIMULATED accuracy of {bundle.name} (%), {objects} objects, exact expectation, one misalignment beside {about.words()}"
+    rows: tuple[Row, ...] = (("accuracy (%)", "accuracy_mean", 100.0, ".2f"), ("photons", "photons_mean", 1.0, ".2f"))
+    lines = [line for key, points in curves.items() for line in _point_lines(((key, "value", 1.0, "g"), *rows), points)]
+    return payload, "\n".join([head, *lines])
 
 
 def _within_dose(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
@@ -425,36 +399,32 @@ def _within_dose(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, co
         found = within_cap(bundle, args.dose_cap, held_out, Knowledge(bundle, held_out), args.eta)
     measured = asdict(figures_of(found, held_out, conditions, args.trials))
     measured["accuracy_se_trials"] = trial_error(measured)
-    accuracy, spread, error = (
-        100 * (measured[name] or 0.0) for name in ("accuracy_mean", "accuracy_std", "accuracy_se_objects")
-    )
-    words = (
-        f"SIMULATED accuracy {accuracy:.2f} %  ({measured['objects']} objects, {_how(measured)}, {conditions.bleaching.words()})\n"
-        f"  spread over trials      {spread:.2f} points (error of the mean {100 * measured['accuracy_se_trials']:.2f})\n"
-        f"  error from the objects  {error:.2f} points\n{_light_words(measured)}"
-    )
+    which = f"{_how(measured)}, {conditions.bleaching.words()}"
+    more = f" (error of the mean {_percent(measured['accuracy_se_trials'])})"
+    lines = [*_accuracy_lines(measured, which, more=more), _light_words(measured)]
     answer = measured | {"bleaching": conditions.bleaching.spelled() or None}
     if args.dose_cap is not None:
         answer |= found.facts()
-        words += f"\n  dose cap {found.cap:g}: at most {found.exposures_most} exposures"
-    return answer, words
+        lines.append(f"  dose cap {found.cap:g}: at most {found.exposures_most} exposures")
+    return answer, "\n".join(lines)
 
 
 def _dose_curve(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
     from pans.trainer.evaluate.dose import dose_curve
 
-    with displayed_progress("caps") as show:
-        points = dose_curve(bundle, held_out, conditions, lambda n, of: show(f"cap {n} of {of}", n, n, of, n == of))
-    bleaching = conditions.bleaching
-    payload = {"objects": len(held_out.objects), "curve": points, "bleaching": bleaching.spelled() or None}
+    with _counted("cap") as report:
+        points = dose_curve(bundle, held_out, conditions, report)
+    bleaching, objects = conditions.bleaching, len(held_out.objects)
+    payload = {"objects": objects, "curve": points, "bleaching": bleaching.spelled() or None}
     if args.pictures is not None:
         from pans.trainer.evaluate.pictures import draw_dose
 
         payload["pictures"] = [str(draw_dose(args.pictures, {bundle.name: points}, force=args.force))]
-    return payload, dose_curve_words(bundle.name, len(held_out.objects), bleaching, points)
+    head = f"SIMULATED accuracy of {bundle.name} against dose, {objects} objects, {bleaching.words()}"
+    return payload, "\n".join([head, *_point_lines(_DOSE_ROWS, points)])
 
 
-_ROWS = (
+_DOSE_ROWS: tuple[Row, ...] = (
     ("dose cap", "dose_cap", 1.0, ".6g"),
     ("accuracy (%)", "accuracy_mean", 100.0, ".2f"),
     ("  unbleached", "accuracy_unbleached", 100.0, ".2f"),
@@ -466,15 +436,13 @@ _ROWS = (
 )
 
 
-def dose_curve_words(name: str, objects: int, bleaching: Bleaching, points: Sequence[Mapping[str, Any]]) -> str:
-    """Return accuracy against dose as a small table."""
-    lines = [f"SIMULATED accuracy of {name} against dose, {objects} objects, {bleaching.words()}"]
-    for label, key, factor, form in _ROWS:
+def _point_lines(rows: Iterable[Row], points: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """The points of a curve as a small table, one column each; rows that no point has are left out."""
+    for label, key, factor, form in rows:
         values = [point[key] for point in points]
         if any(value is not None for value in values):
             cells = ("-" if value is None else format(factor * value, form) for value in values)
-            lines.append(f"  {label:21s}" + "".join(f"{cell:>9s}" for cell in cells))
-    return "\n".join(lines)
+            yield f"  {label:21s}" + "".join(f"{cell:>9s}" for cell in cells)
 
 
 EVALUATE = Command(

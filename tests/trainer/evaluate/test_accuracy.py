@@ -11,15 +11,10 @@ import pytest
 from bundles import made_bundle
 
 from pans.runtime.bundle.model import write_bundle
+from pans.runtime.decide import make_decider
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate import evaluate
-from pans.trainer.evaluate.accuracy import (
-    among_classes,
-    evaluate_exactly,
-    evaluate_sampled,
-    light_of,
-    outcome_probabilities,
-)
+from pans.trainer.evaluate.accuracy import among_classes, evaluate_exactly, evaluate_sampled, light_of
 from pans.trainer.evaluate.held_out import held_out_of
 from pans.trainer.options import Conditions
 
@@ -54,35 +49,19 @@ def head_bundle():
     return made_bundle(**facts, pattern_levels=levels, photons_per_level=1e-3, head_onnx=graph)
 
 
-def test_outcomes_are_binomial_products():
-    p = RNG.uniform(size=(3, 2))
-    found = outcome_probabilities(p, 2)
-    for row, (first, second) in itertools.product(range(3), itertools.product(range(3), repeat=2)):
-        chances = [math.comb(2, k) * q**k * (1 - q) ** (2 - k) for k, q in zip((first, second), p[row])]
-        assert found[row, first + 3 * second] == pytest.approx(math.prod(chances), rel=1e-12)
-
-
-def test_exact_accuracy_is_the_sum_over_all_words():
-    model = bundle()
-    light = light_of(model, PROFILE, IMAGES)
+@pytest.mark.parametrize("shots", [1, 2])
+def test_exact_accuracy_is_the_sum_over_all_counts(shots):
+    model = head_bundle()
+    light, decider = light_of(model, PROFILE, IMAGES), make_decider(model, shots=shots)
     right = 0.0
-    for p, label in zip(light.probability, LABELS):
-        for word in range(16):
-            chance = math.prod(p[i] if word >> i & 1 else 1 - p[i] for i in range(4))
-            right += chance * (int(model.table[word].argmax()) == label)
-    found = evaluate_exactly(model, light, LABELS)
+    for counts in itertools.product(range(shots + 1), repeat=3):
+        ways = [math.comb(shots, k) * p**k * (1 - p) ** (shots - k) for k, p in zip(counts, light.probability.T)]
+        right += float((math.prod(ways) * (decider.decide(np.array(counts), shots).label == LABELS)).sum())
+    found = evaluate_exactly(model, light, LABELS, shots=shots)
     assert found.accuracy_mean == pytest.approx(right / 60, rel=1e-10)
-    assert found.clicks_mean == pytest.approx(light.probability.sum(axis=1).mean())
-    assert found.photons_mean == pytest.approx(light.photoelectrons.sum(axis=1).mean())
-    assert found.illumination == pytest.approx(model.illumination())
-    assert found.trials == 0
-
-
-def test_light_is_pattern_times_transmission():
-    model = bundle()
-    floor = PROFILE.min_transmission
-    shown = floor + (1 - floor) * IMAGES.reshape(60, -1) / 255
-    assert light_of(model, PROFILE, IMAGES).photoelectrons == pytest.approx(shown @ model.patterns().T, rel=1e-10)
+    assert found.clicks_mean == pytest.approx(shots * light.probability.sum(axis=1).mean())
+    assert found.photons_mean == pytest.approx(shots * light.photoelectrons.sum(axis=1).mean())
+    assert (found.illumination, found.trials) == (pytest.approx(shots * model.illumination()), 0)
 
 
 @pytest.mark.parametrize("shots", [1, 3])
@@ -98,8 +77,10 @@ def test_sampled_agrees_with_exact(shots):
     assert sampled.accuracy_std == pytest.approx(exact.accuracy_std, rel=5 / math.sqrt(2 * 400))
 
 
-def test_light_and_dark_options():
-    model = bundle()
+def test_light_is_pattern_times_transmission_and_follows_its_options():
+    model, floor = bundle(), PROFILE.min_transmission
+    shown = floor + (1 - floor) * IMAGES.reshape(60, -1) / 255
+    assert light_of(model, PROFILE, IMAGES).photoelectrons == pytest.approx(shown @ model.patterns().T, rel=1e-10)
     plain, double = light_of(model, PROFILE, IMAGES), light_of(model, PROFILE, IMAGES, eta=2.0)
     assert double.photoelectrons == pytest.approx(2 * plain.photoelectrons)
     assert double.illumination == pytest.approx(2 * plain.illumination)

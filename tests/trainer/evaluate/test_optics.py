@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import IDENTITY, Imaging, imaging_of, tolerance_of
 from pans.runtime.instrument.profile import Optics, load_profile
-from pans.trainer.commands.evaluate import optics_curve_words, several_tables
+from pans.trainer.commands.evaluate import other_answer
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.held_out import HeldOut, held_out_of
 from pans.trainer.evaluate.optics import CURVES, drawn_tables, figures_under, misalignment_curves, over_optics
@@ -77,30 +78,34 @@ def test_curves_start_from_the_table_that_they_are_about() -> None:
     bundle = fixed()
     curves = misalignment_curves(bundle, HELD_OUT, TABLE)
     there = figures_under(bundle, HELD_OUT, TABLE, Conditions()).accuracy_mean
-    assert {name: [point["value"] for point in points] for name, points in curves.items()} == {
-        name: list(values) for name, values in CURVES.items()
-    }
-    for points in curves.values():
-        assert points[0]["accuracy_mean"] == there
+    assert {name: tuple(point["value"] for point in points) for name, points in curves.items()} == CURVES
+    assert {points[0]["accuracy_mean"] for points in curves.values()} == {there}
     shifted = figures_under(bundle, HELD_OUT, Imaging(0.0, 2.0), Conditions()).accuracy_mean
     assert curves["shift_px"][4]["accuracy_mean"] == shifted
-    assert "shift_px" in optics_curve_words("toy", 30, TABLE, curves)
 
 
 def test_without_optics_a_table_is_as_the_profile_states() -> None:
     stated = replace(IDEAL, optics=Optics(right_px=-1.0, down_px=1.0))
-    held_out = HeldOut(TASK, TASK.test, stated)
-    assert Conditions().imaging_on(held_out.profile).numbers() == TABLE.numbers()
-    assert Conditions(imaging=IDENTITY).imaging_on(held_out.profile).is_identity
+    assert Conditions().imaging_on(stated).numbers() == TABLE.numbers()
+    assert Conditions(imaging=IDENTITY).imaging_on(stated).is_identity
 
 
-def test_options_that_contradict_each_other_are_refused() -> None:
-    plain = {"optics": None, "draws": None, "trials": None, "shots": 1}
-    assert not several_tables(argparse.Namespace(**plain))
-    assert several_tables(argparse.Namespace(**plain | {"draws": 2}))
-    for wrong in ({"draws": 2, "optics": "tolerance"}, {"optics": "tolerance", "shots": 2}):
-        with pytest.raises(UsageError):
-            several_tables(argparse.Namespace(**plain | wrong))
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"draws": 2, "optics": "tolerance"},
+        {"optics": "tolerance", "shots": 2},
+        {"draws": 2, "trials": 3},
+        {"dose_cap": 3.0, "shots": 2},
+        {"bleach": "40", "draws": 2},
+        {"dose_cap": "curve", "exact": True},
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(wrong: dict[str, Any]) -> None:
+    plain = dict.fromkeys(("optics", "draws", "trials", "dose_cap", "bleach")) | {"shots": 1, "exact": False}
+    assert other_answer(argparse.Namespace(**plain)) is None
+    with pytest.raises(UsageError):
+        other_answer(argparse.Namespace(**plain | wrong))
 
 
 @pytest.mark.data

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,7 @@ from pans.runtime.instrument.click_law import CountLaw, click_probability, count
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate import evaluate
 from pans.trainer.evaluate.accuracy import law_of
-from pans.trainer.evaluate.walks import (
-    calibration_bins,
-    confusion_of,
-    expected_differences,
-    measured_walks,
-    walks_of,
-)
+from pans.trainer.evaluate.walks import calibration_bins, confusion_of, expected_differences, measured_walks, walks_of
 from pans.trainer.options import Conditions
 
 RNG = np.random.default_rng(0)
@@ -70,13 +64,10 @@ def test_exact_figures_are_sums_over_all_words(dark: float, eta: float, confiden
     assert found.accuracy_mean == pytest.approx(wanted["right"] / wanted["decided"], rel=1e-9)
     assert found.abstained == pytest.approx(1 - wanted["decided"] / 60, abs=1e-9)
     assert (found.abstained > 0.01) == (confidence > 0)
-    for name, value in (
-        ("clicks", found.clicks_mean),
-        ("photons", found.photons_mean),
-        ("illumination", found.illumination),
-    ):
-        assert value == pytest.approx(wanted[name] / 60, rel=1e-9)
-    assert found.exposures_mean == pytest.approx(wanted["exposures"] / 60, rel=1e-9)
+    means = (found.clicks_mean, found.photons_mean, found.illumination, found.exposures_mean)
+    assert [60 * mean for mean in means] == pytest.approx(
+        [wanted[name] for name in ("clicks", "photons", "illumination", "exposures")], rel=1e-9
+    )
     assert confusion_of(walks).sum() == pytest.approx(wanted["decided"], rel=1e-9)
     assert np.trace(confusion_of(walks)) == pytest.approx(wanted["right"], rel=1e-9)
 
@@ -86,9 +77,9 @@ def test_trials_agree_with_the_expectation_within_their_error(afterpulse: float)
     """400 walks of each object; 5 standard errors, seed fixed."""
     model, trials = bundle(), 400
     profile = replace(PROFILE, detector=replace(PROFILE.detector, afterpulse_probability=afterpulse))
-    exact = measured_walks(walks_of(model, profile, IMAGES, LABELS, Conditions(dark=0.02, confidence=0.7)))
-    sampled = measured_walks(
-        walks_of(model, profile, IMAGES, LABELS, Conditions(dark=0.02, confidence=0.7, seed=4), trials=trials)
+    conditions = Conditions(dark=0.02, confidence=0.7, seed=4)
+    exact, sampled = (
+        measured_walks(walks_of(model, profile, IMAGES, LABELS, conditions, number)) for number in (None, trials)
     )
     assert abs(sampled.accuracy_mean - exact.accuracy_mean) < 5 * exact.accuracy_std / math.sqrt(trials)
     n = len(LABELS) * trials
@@ -134,16 +125,8 @@ def test_the_command_gives_all_figures(own_task: str, tmp_path: Path, capsys: py
     model = bundle()
     write_bundle(model, tmp_path / "a.pans")
     found = json_of(capsys, "evaluate", tmp_path / "a.pans", "--task", own_task, "--profile", "ideal")
-    names = (
-        "accuracy_mean",
-        "clicks_mean",
-        "photons_mean",
-        "illumination",
-        "exposures_mean",
-        "expected_calibration_error",
-    )
-    for name in names:
-        assert found[name] == getattr(evaluate(model, task=own_task, conditions=Conditions("ideal")), name)
+    figures = evaluate(model, task=own_task, conditions=Conditions("ideal"))
+    assert {name: found[name] for name in asdict(figures)} == asdict(figures)
     assert (found["trials"], found["objects"], found["shots"], found["exposures_longest"]) == (0, 230, 1, 6)
     assert found["first_200"]["objects"] == 200
     assert sum(one["share"] for one in found["calibration"]) == pytest.approx(1.0)
@@ -170,13 +153,12 @@ def test_expected_figures_are_held_against_what_is_found(
     }
     write_bundle(with_expected(model, named | figures), tmp_path / "true.pans")
     words = ("--task", own_task, "--profile", "ideal")
-    right = json_of(capsys, "evaluate", tmp_path / "true.pans", *words)
-    assert right["expected_differences"] == []
+    assert json_of(capsys, "evaluate", tmp_path / "true.pans", *words)["expected_differences"] == []
     write_bundle(with_expected(model, named | figures | {"accuracy": 0.999}), tmp_path / "false.pans")
     wrong = json_of(capsys, "evaluate", tmp_path / "false.pans", *words, code=1)
     assert "expected accuracy is 0.999 in the bundle" in wrong["expected_differences"][0]
-    other = json_of(capsys, "evaluate", tmp_path / "false.pans", *words, "--dark", "0.1")
-    assert other["expected_differences"] is None
+    other = ("evaluate", tmp_path / "false.pans", *words, "--dark", "0.1")
+    assert json_of(capsys, *other)["expected_differences"] is None
     assert expected_differences(named | figures, named | figures | {"objects": 3, "accuracy": 0.0}) == []
 
 
