@@ -17,7 +17,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.pages.rates import count_rates
 from pans.runtime.record import exposures
 from pans.runtime.record.exposures import iter_exposures
-from pans.runtime.wire.framing import FrameDecoder, Messages, pack_body, unpack_body
+from pans.runtime.wire.framing import FrameDecoder, pack_body, unpack_body
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
     ClickBlock,
@@ -98,17 +98,9 @@ def spoilt(bodies: list[bytes], dice: random.Random) -> list[bytes]:
     return found
 
 
-def recording_of(bodies: list[bytes], at_once: int) -> Any:
-    """What `iter_exposures` asks of a recording, with blocks of `at_once` messages."""
-
-    def messages() -> Iterator[Messages]:
-        for first in range(0, len(bodies), at_once):
-            some = bodies[first : first + at_once]
-            ends = np.cumsum([len(one) for one in some])
-            spans = np.stack([ends - [len(one) for one in some], ends], axis=1).astype(np.int64)
-            yield Messages(np.frombuffer(b"".join(some), np.uint8), spans)
-
-    return SimpleNamespace(iter_messages=messages)
+def recording_of(bodies: list[bytes]) -> Any:
+    """What `iter_exposures` asks of a recording."""
+    return SimpleNamespace(messages=lambda: ((0, body) for body in bodies))
 
 
 def one_by_one(bodies: list[bytes], plan: Plan) -> list[tuple[Any, ...]]:
@@ -145,42 +137,28 @@ def in_arrays(recording: Any, plan: Plan) -> list[tuple[Any, ...]]:
     return rows
 
 
-@pytest.mark.parametrize("at_once", [1, 37, 5000])
 @pytest.mark.parametrize("kind", ["clicks", "frames", "counts"])
-def test_exposures_are_those_of_the_messages_one_by_one(
-    kind: str, at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(exposures, "BYTES_AT_ONCE", 4000)
+def test_exposures_are_those_of_the_messages_one_by_one(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exposures, "EXPOSURES_AT_ONCE", 200)
     plan = parallel(N, 3) if kind == "frames" else replace(shot_major(N, 2), largest=3 if kind == "counts" else 1)
     dice, rng = random.Random(kind), np.random.default_rng(3)
     clean = list(stream(kind, 600, rng))
     again = list(stream(kind, 600, rng, session=9))  # the device was lost and armed again
     bodies = [*spoilt(clean, dice), *spoilt(again, dice)]
-    assert in_arrays(recording_of(clean, at_once), plan) == one_by_one(clean, plan)
-    found = in_arrays(recording_of(bodies, at_once), plan)
+    assert in_arrays(recording_of(clean), plan) == one_by_one(clean, plan)
+    found = in_arrays(recording_of(bodies), plan)
     assert found == one_by_one(bodies, plan)
     assert {row[0] for row in found} == {0, 1}
 
 
-def test_ordinary_messages_are_not_taken_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tracker is asked for a few of them: of a stretch without faults for the first alone."""
-    asked = []
-    accept = StreamTracker.accept
-    monkeypatch.setattr(StreamTracker, "accept", lambda self, frame: (asked.append(frame), accept(self, frame))[1])
-    bodies = list(stream("clicks", 3000, np.random.default_rng(4)))
-    rows = in_arrays(recording_of(bodies, 50), shot_major(N, 2))
-    assert len(rows) > 10_000
-    assert len(asked) == 1
-
-
-def test_memory_for_the_rates_does_not_grow_with_the_messages() -> None:
-    """Four times the messages, a few per block as at real pace: the same memory, not four times as much."""
+def test_memory_for_the_rates_does_not_grow_with_the_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four times the messages: the same memory, not four times as much."""
+    monkeypatch.setattr(exposures, "EXPOSURES_AT_ONCE", 4000)
     plan = shot_major(N, 2)
-    bodies = list(stream("clicks", 48_000, np.random.default_rng(5)))
+    bodies = list(stream("clicks", 12_000, np.random.default_rng(5)))
     peaks = []
-    for n in (12_000, 48_000):
-        recording = recording_of(bodies[:n], 40)
+    for n in (3_000, 12_000):
+        recording = recording_of(bodies[:n])
         tracemalloc.start()
         rates = count_rates(recording, plan, 3)
         peaks.append(tracemalloc.get_traced_memory()[1])
