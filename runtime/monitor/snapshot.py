@@ -188,7 +188,7 @@ class Snapshots:
         now_s = time.monotonic()
         if now_s >= self._disk_due_s:
             self._disk_due_s = now_s + DISK_EVERY_S
-            path = recorder.open_path
+            path = recorder.open_file.path
             with suppress(OSError):
                 self._disk = {"disk_free_bytes": shutil.disk_usage(path.parent).free, "recording": path.name}
                 self._disk["recording_bytes"] = os.stat(path).st_size

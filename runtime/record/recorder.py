@@ -11,10 +11,10 @@ import secrets
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
@@ -50,7 +50,6 @@ RETRY_S = 5.0  # after a part could not be made
 _MESSAGE_BUFFER_BYTES = MIB // 4
 _EVENT_BUFFER_BYTES = MIB // 16
 _FIRST_KINDS = (Kind.MESSAGES, Kind.DECISIONS, Kind.END)  # with them a run has begun
-_COPIED_BYTES = MIB // 4  # of a block that is put together before it is written, in one call
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,73 +69,31 @@ class PartLimits:
             )
 
 
-@dataclass(frozen=True, slots=True)
-class PartFacts:
-    """What the next part says of the one before."""
-
-    name: str
-    bytes: int
-    first_decision: int
-    decisions: int
-    decisions_sha256: str
-    chain_sha256: str
-
-
 def repeated_setup(plan: Plan, arm: Arm, nonce: int) -> list[bytes]:
     """Return plan, states and ARM as frames of session `nonce`: with them at its beginning a part can be replayed by itself."""
     bodies = [*plan_commands(plan), (Opcode.ARM, pack_command(arm))]
     return [encode_command(number, opcode, body, nonce) for number, (opcode, body) in enumerate(bodies, 1)]
 
 
-class _RowBuffer:
-    """A preallocated table of `BUFFER_ROWS` rows that is emptied into a block."""
-
-    def __init__(self, kind: Kind, dtype: np.dtype[np.void]) -> None:
-        self.kind = kind
-        self.rows = np.full(BUFFER_ROWS, 0, dtype=dtype)  # touched, which np.zeros leaves to the first use
-        self.used = 0
-
-    def room(self) -> int:
-        return len(self.rows) - self.used
-
-    def add(self, row: Sequence[Any]) -> bool:
-        """Store one row; True when the table is full."""
-        self.rows[self.used] = row
-        self.used += 1
-        return not self.room()
-
-    def add_many(self, rows: NDArray[np.void]) -> int:
-        """Store as many rows as there is room for; return how many."""
-        n = min(len(rows), self.room())
-        self.rows[self.used : self.used + n] = rows[:n]
-        self.used += n
-        return n
-
-    def empty(self) -> bytes:
-        data = self.rows[: self.used].tobytes()
-        self.used = 0
-        return data
-
-
-class _ByteBuffer:
-    """A preallocated byte buffer that is emptied into a block."""
+class _Buffer:
+    """Preallocated bytes that are emptied into a block."""
 
     def __init__(self, kind: Kind, size: int) -> None:
         self.kind = kind
-        self.data = bytearray(size)
-        self.array = np.frombuffer(self.data, np.uint8)  # the same bytes
-        self.array[:] = 0  # touched
+        self.data = np.full(size, 0, np.uint8)  # touched, which np.zeros leaves to the first use
         self.used = 0
 
+    @property
     def room(self) -> int:
         return len(self.data) - self.used
 
-    def add(self, piece: bytes | bytearray | memoryview) -> None:
-        self.data[self.used : self.used + len(piece)] = piece
-        self.used += len(piece)
+    def add(self, *pieces: bytes | bytearray | memoryview) -> None:
+        for piece in pieces:
+            self.data.data[self.used : self.used + len(piece)] = piece
+            self.used += len(piece)
 
     def empty(self) -> bytes:
-        data = bytes(memoryview(self.data)[: self.used])
+        data = self.data[: self.used].tobytes()
         self.used = 0
         return data
 
@@ -163,22 +120,24 @@ class Recorder:
         `bundle_sha256` are added where they are missing.
         """
         self.path, self.limits = Path(path), limits
-        self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
+        self.watch_write: Callable[[int, int], None] | None = (
+            None  # called with when a write began and ended, perf_counter_ns
+        )
         self.parts = 0  # 0: one file
         self._header = {"created_utc": datetime.now(UTC).isoformat(timespec="seconds"), **header}
-        self._messages = _ByteBuffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
-        self._commands = _ByteBuffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
-        self._answers = _ByteBuffer(Kind.ANSWERS, _EVENT_BUFFER_BYTES)
-        self._events = _ByteBuffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
-        self._decisions = _RowBuffer(Kind.DECISIONS, DECISION_DTYPE)
-        self._timings = _RowBuffer(Kind.TIMINGS, TIMING_RUN_DTYPE)
+        self._messages = _Buffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
+        self._commands = _Buffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
+        self._answers = _Buffer(Kind.ANSWERS, _EVENT_BUFFER_BYTES)
+        self._events = _Buffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
+        self._decisions = _Buffer(Kind.DECISIONS, BUFFER_ROWS * DECISION_DTYPE.itemsize)
+        self._timings = _Buffer(Kind.TIMINGS, BUFFER_ROWS * TIMING_RUN_DTYPE.itemsize)
         self._timed = 0  # decisions in these
         # A decision is written behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
         self._first = (self._commands, self._answers, self._messages, self._decisions)
         self._in_order = (*self._first, self._timings)
         self._pack = _packing()
         self._replaced = self._files_in_the_way(overwrite)
-        self._closed: deque[PartFacts] = deque()
+        self._closed: deque[dict[str, Any]] = deque()  # what the next part says of each
         self._deleted = {"parts": 0, "bytes": 0, "decisions": 0}
         self._chain = self._trouble = ""
         self._news: list[dict[str, Any]] = []
@@ -211,31 +170,16 @@ class Recorder:
             self._abandon()
 
     @property
-    def open_path(self) -> Path:
-        """The file that is being written."""
-        return self.open_file.path
-
-    @property
-    def written(self) -> tuple[int, str]:
-        """Number of the decisions in the open file and the SHA-256 (hex) of their log; all of them after `flush`."""
-        return self.open_file.n_decisions, self.open_file.log.hexdigest()
-
-    @property
     def n_written(self) -> int:
         """Number of the decisions on disk, for another thread too."""
         return self.open_file.first_decision + self.open_file.n_decisions
-
-    @property
-    def is_deleted(self) -> bool:
-        """Whether somebody has deleted the open file; for another thread too."""
-        return self.open_file.is_deleted
 
     def keep_deleted(self) -> Path | None:
         """Continue in a copy beside the folder of a file that was deleted; return its path, None where nothing was deleted.
 
         Parts that were closed before cannot be kept.
         """
-        if not self.is_deleted:
+        if not self.open_file.is_deleted:
             return None
         self._replaced = []
         self.flush()
@@ -249,17 +193,6 @@ class Recorder:
         """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
         self._add_bytes(self._messages, host_ns, data)
 
-    def add_stamped(self, kind: Kind, data: NDArray[np.uint8], spans: NDArray[np.int64]) -> None:
-        """Keep many MESSAGES, COMMANDS or ANSWERS: `spans` int64 (n, 4) are where each begins and ends in `data`, and its time in ns."""
-        buffer = {Kind.MESSAGES: self._messages, Kind.COMMANDS: self._commands, Kind.ANSWERS: self._answers}[kind]
-        first = 0
-        while first < len(spans):
-            first, buffer.used = self._pack(data, spans, first, buffer.array, buffer.used)
-            if first < len(spans):
-                begin, end, host_ns, _ = spans[first].tolist()
-                self._add_bytes(buffer, host_ns, data[begin:end].tobytes())  # makes room
-                first += 1
-
     def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep the bytes of one command to the device and the host time at which it was sent, in ns."""
         self._add_bytes(self._commands, host_ns, data)
@@ -268,36 +201,36 @@ class Recorder:
         """Keep one decoded WELCOME, ACK or PONG of at most 1 MiB and the host time at which it arrived, in ns."""
         self._add_bytes(self._answers, host_ns, data)
 
-    def add_decision(self, record: Sequence[Any]) -> None:
-        """Keep one decision: a tuple in the order of DECISION_DTYPE."""
-        if self._decisions.add(record):
-            self._write_up_to(self._decisions)
+    def add_stamped(self, kind: Kind, data: NDArray[np.uint8], spans: NDArray[np.int64]) -> None:
+        """Keep many MESSAGES, COMMANDS or ANSWERS: `spans` int64 (n, 4) are where each begins and ends in `data`, and its time in ns."""
+        buffer = next(one for one in self._first if one.kind == kind)
+        first = 0
+        while first < len(spans):
+            first, buffer.used = self._pack(data, spans, first, buffer.data, buffer.used)
+            if first < len(spans):
+                begin, end, host_ns, _ = spans[first].tolist()
+                self._add_bytes(buffer, host_ns, data[begin:end].tobytes())  # makes room
+                first += 1
 
     def add_decisions(self, many: NDArray[np.void]) -> None:
-        """Keep many decisions, rows DECISION_DTYPE (n,); more than a buffer holds go out at once."""
-        if len(many) < self._decisions.room():
-            self._decisions.add_many(many)
+        """Keep decisions, rows DECISION_DTYPE (n,); more than a buffer holds are written at once."""
+        if many.nbytes < self._decisions.room:
+            self._decisions.add(many.tobytes())
             return
-        n, blocks = self._decisions.used + len(many), self._blocks_of(*self._first)
+        n, blocks = self._decisions.used // DECISION_DTYPE.itemsize + len(many), self._blocks_of(*self._first)
         for payload in self.open_file.log.blocks(many):
             blocks += self._framed(Kind.DECISIONS, payload)
         self._write(b"".join(blocks))  # a few long writes take half the time of many short ones
         self.open_file.n_decisions += n
 
-    def add_timing(self, record: Sequence[Any]) -> None:
-        """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
-        self._timed += 1
-        if self._timings.add((*record, 1)):
-            self._write_up_to(self._timings)
-
     def add_timing_runs(self, runs: NDArray[np.void]) -> None:
-        """Keep the host times of many decisions, TIMING_RUN_DTYPE (n,), at most 2^16 of each run."""
-        self._timed += int(runs["count"].sum())
-        done = 0
-        while done < len(runs):
-            done += self._timings.add_many(runs[done:])
-            if not self._timings.room():
+        """Keep the host times of decisions, TIMING_RUN_DTYPE (n,), at most 2^16 of each run; not part of the log's hash."""
+        for start in range(0, len(runs), BUFFER_ROWS):
+            some = runs[start : start + BUFFER_ROWS]
+            if some.nbytes > self._timings.room:
                 self._write_up_to(self._timings)
+            self._timings.add(some.tobytes())
+            self._timed += int(some["count"].sum())
         if self._timed > TIMING_ROWS_MAX // 2:
             self._write_up_to(self._timings)
 
@@ -306,7 +239,7 @@ class Recorder:
         line = canonical_json(event) + b"\n"
         if len(line) > len(self._events.data):
             raise UsageError(f"an event of {len(line)} bytes, allowed at most {len(self._events.data)}")
-        if len(line) > self._events.room():
+        if len(line) > self._events.room:
             self._write_up_to(self._events)
         self._events.add(line)
 
@@ -314,7 +247,7 @@ class Recorder:
         """Write clock samples, CLOCK_DTYPE (n,) of clock.py; rare, hence not buffered."""
         for start in range(0, len(samples), BUFFER_ROWS):
             part = np.ascontiguousarray(samples[start : start + BUFFER_ROWS], dtype=CLOCK_DTYPE)
-            self._write_block(Kind.CLOCK, part.tobytes())
+            self._write(b"".join(self._framed(Kind.CLOCK, part.tobytes())))
 
     def flush(self) -> None:
         """Write everything that is buffered to the file, in one call; it then survives the death of this process."""
@@ -374,10 +307,17 @@ class Recorder:
         self.replace_old()
         self.flush()
         full, made = self.open_file, self._next.result()
-        decisions, digest = self.written
-        chain = chained(self._chain, digest)
-        facts = PartFacts(full.path.name, full.size_bytes, full.first_decision, decisions, digest, chain)
-        made.first_decision, self._chain, self.open_file = full.first_decision + decisions, chain, made
+        digest = full.log.hexdigest()
+        self._chain = chained(self._chain, digest)
+        facts = {
+            "name": full.path.name,
+            "bytes": full.size_bytes,
+            "first_decision": full.first_decision,
+            "decisions": full.n_decisions,
+            "decisions_sha256": digest,
+            "chain_sha256": self._chain,
+        }
+        made.first_decision, self.open_file = self.n_written, made
         self._closed.append(facts)
         struck = self._strike_oldest()
         self._begin_part(place, commands, host_ns, facts)
@@ -432,7 +372,7 @@ class Recorder:
             raise
 
     def _begin_part(
-        self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int, before: PartFacts | None
+        self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int, before: Mapping[str, Any] | None
     ) -> None:
         self.parts += 1
         self.add_event(
@@ -441,7 +381,7 @@ class Recorder:
                 "number": self.parts,
                 "utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
                 "first_decision": self.open_file.first_decision,
-                "before": None if before is None else asdict(before),
+                "before": before,
                 "deleted": dict(self._deleted),
                 "place": dict(place),
             }
@@ -468,7 +408,7 @@ class Recorder:
         needed = RESERVE_PARTS * self.limits.rotate_bytes
         free = shutil.disk_usage(self.path.parent).free
         while len(self._closed) > 1:
-            kept = sum(part.bytes for part in self._closed) + self.limits.rotate_bytes
+            kept = sum(part["bytes"] for part in self._closed) + self.limits.rotate_bytes
             if self.limits.keep_bytes and kept > self.limits.keep_bytes:
                 why = "the cap"
             elif free < needed:
@@ -476,11 +416,12 @@ class Recorder:
             else:
                 break
             oldest = self._closed.popleft()
-            free += oldest.bytes
-            for key, value in (("parts", 1), ("bytes", oldest.bytes), ("decisions", oldest.decisions)):
-                self._deleted[key] += value
-            self._news.append({"kind": "part_deleted", "name": oldest.name, "bytes": oldest.bytes, "why": why})
-            struck.append(self.path.with_name(oldest.name))
+            free += oldest["bytes"]
+            self._deleted = {
+                key: n + oldest.get(key, 1) for key, n in self._deleted.items()
+            }  # one part, its bytes and decisions
+            self._news.append({"kind": "part_deleted", "name": oldest["name"], "bytes": oldest["bytes"], "why": why})
+            struck.append(self.path.with_name(oldest["name"]))
         return struck
 
     def _note_finished(self) -> None:
@@ -503,51 +444,42 @@ class Recorder:
 
     # -- blocks --------------------------------------------------------------------------------------------------------
 
-    def _add_bytes(self, buffer: _ByteBuffer, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+    def _add_bytes(self, buffer: _Buffer, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         if len(data) > MESSAGE_MAX_BYTES:
             raise UsageError(f"a message of {len(data)} bytes, allowed at most {MESSAGE_MAX_BYTES}")
-        needed = MESSAGE.size + len(data)
-        if needed > buffer.room():
+        head = MESSAGE.pack(host_ns, len(data))
+        if (needed := len(head) + len(data)) > buffer.room:
             self._write_up_to(buffer)
-        if needed > buffer.room():
-            self._write_block(buffer.kind, MESSAGE.pack(host_ns, len(data)) + bytes(data))
-            return
-        MESSAGE.pack_into(buffer.data, buffer.used, host_ns, len(data))
-        buffer.used += MESSAGE.size
-        buffer.add(data)
+        if needed > buffer.room:
+            self._write(*self._framed(buffer.kind, head + bytes(data)))
+        else:
+            buffer.add(head, data)
 
-    def _write_up_to(self, buffer: _RowBuffer | _ByteBuffer) -> None:
+    def _write_up_to(self, buffer: _Buffer) -> None:
         """Write a buffer to the file, and before it what must stand before it."""
         if buffer in self._in_order:
             self._flush(*self._in_order[: self._in_order.index(buffer) + 1])
         else:
             self._flush(buffer)
 
-    def _flush(self, *buffers: _RowBuffer | _ByteBuffer) -> None:
-        n_decisions = self._decisions.used if self._decisions in buffers else 0
+    def _flush(self, *buffers: _Buffer) -> None:
+        n_decisions = self._decisions.used // DECISION_DTYPE.itemsize if self._decisions in buffers else 0
         if blocks := self._blocks_of(*buffers):
             self._write(b"".join(blocks))
             self.open_file.n_decisions += n_decisions
 
-    def _blocks_of(self, *buffers: _RowBuffer | _ByteBuffer) -> list[bytes | memoryview]:
+    def _blocks_of(self, *buffers: _Buffer) -> list[bytes | memoryview]:
         """Empty buffers into the pieces of blocks, which must be written next."""
-        return [piece for buffer in buffers if buffer.used for piece in self._block_of(buffer)]
-
-    def _block_of(self, buffer: _RowBuffer | _ByteBuffer) -> tuple[bytes | memoryview, ...]:
-        if buffer is self._decisions:
-            rows = self._decisions.rows[: self._decisions.used]
-            self._decisions.used = 0
-            return self._framed(Kind.DECISIONS, self.open_file.log.block(rows))
-        if buffer is self._timings:
-            self._timed = 0
-        return self._framed(buffer.kind, buffer.empty())
-
-    def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:
-        pieces = self._framed(kind, payload)
-        if len(payload) > _COPIED_BYTES:
-            self._write(*pieces)
-        else:
-            self._write(b"".join(pieces))
+        pieces: list[bytes | memoryview] = []
+        for buffer in buffers:
+            if buffer.used:
+                data = buffer.empty()
+                if buffer is self._decisions:
+                    data = self.open_file.log.block(np.frombuffer(data, DECISION_DTYPE))
+                elif buffer is self._timings:
+                    self._timed = 0
+                pieces += self._framed(buffer.kind, data)
+        return pieces
 
     def _framed(self, kind: Kind, payload: bytes | memoryview) -> tuple[bytes, bytes | memoryview, bytes]:
         if kind in _FIRST_KINDS:

@@ -69,14 +69,14 @@ class HostWatch:
             facts["host_clock_synchronised"] = synchronised
         if self._recorder is not None:
             with suppress(OSError):
-                facts |= self._look_at_disk(self._recorder.open_path)
+                facts |= self._look_at_disk(self._recorder.open_file.path)
         self.facts = facts
 
     def _look_for_file(self) -> None:
         assert self._recorder is not None
-        if self._is_deleted or not self._recorder.is_deleted:
+        if self._is_deleted or not self._recorder.open_file.is_deleted:
             return
-        self._is_deleted, path = True, self._recorder.open_path
+        self._is_deleted, path = True, self._recorder.open_file.path
         warn(f"{RECORDING_DELETED}: {path}; the run ends, and what can be kept is kept beside it")
         self.news.append({"kind": "recording_deleted", "path": str(path)})
         self._stop(RECORDING_DELETED)

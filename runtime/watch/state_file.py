@@ -55,7 +55,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         **resources_used(),
     }
     if recorder is not None:
-        picture["recording"] = str(recorder.open_path)
+        picture["recording"] = str(recorder.open_file.path)
         picture |= {"parts": recorder.parts} if recorder.parts else {}
     if run is None:
         return picture

@@ -16,7 +16,9 @@ from pans.runtime.bundle.automaton import reachable_automaton
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.container import FILE_MAX_BYTES, JSON_VALUES_MAX, MIB
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.record import Recorder
+from pans.runtime.record.format import TIMING_RUN_DTYPE
 
 ROOM = FILE_MAX_BYTES - MIB  # for the arrays, beside header and golden vectors
 LIGHT: dict[str, Any] = {"levels": 65536, "photons_per_level": 1e-5}
@@ -149,8 +151,9 @@ def long_recording(path: Path, decisions: int) -> Path:
     """A recording of many decisions with their timings."""
     with Recorder(path, {"config": {"shots": 1, "tick_hz": 1000}}) as recorder:
         for number in range(decisions):
-            recorder.add_decision((number, number, number, 0, 0, 1, 0, -1, 0, 0.5, 0, 0))
-            recorder.add_timing((number, number, number, number, number))
+            row = (number, number, number, 0, 0, 1, 0, -1, 0, 0.5, 0, 0)
+            recorder.add_decisions(np.array([row], DECISION_DTYPE))
+            recorder.add_timing_runs(np.array([(number,) * 5 + (1,)], TIMING_RUN_DTYPE))
         recorder.close({})
     return path
 

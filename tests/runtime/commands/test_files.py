@@ -18,8 +18,10 @@ from heads import affine_head
 from pans.runtime.bundle import Automaton, with_expected
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, write_bundle
 from pans.runtime.cli import main
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.instrument.profile import load_profile, shipped_profiles
 from pans.runtime.record import Recorder
+from pans.runtime.record.format import TIMING_RUN_DTYPE
 
 
 def toy_bundle(**changes: Any) -> Bundle:
@@ -48,9 +50,8 @@ def record(path: Path, decisions: list[tuple[Any, ...]], *, close: bool = True, 
     inner = {"name": profile.name, "sha256": profile.sha256, "toml": profile.text}
     header = {"simulated": True, "profile": inner, **changes}
     with Recorder(path, header, bundle=bundle_bytes(toy_bundle())) as recorder:
-        for row in decisions:
-            recorder.add_decision(row)
-            recorder.add_timing((row[0], 5, 10, 20, 30))
+        recorder.add_decisions(np.array(decisions, DECISION_DTYPE))
+        recorder.add_timing_runs(np.array([(row[0], 5, 10, 20, 30, 1) for row in decisions], TIMING_RUN_DTYPE))
         recorder.add_message(1, b"m")
         recorder.add_event({"kind": "gap"})
         if close:
@@ -149,7 +150,7 @@ def test_decisions_that_cannot_be_true(
 def test_timings_must_belong_and_be_in_order(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.pansrec"
     with Recorder(path, {}) as recorder:
-        recorder.add_timing((3, 0, 20, 10, 30))
+        recorder.add_timing_runs(np.array([(3, 0, 20, 10, 30, 1)], TIMING_RUN_DTYPE))
         recorder.add_message(5, b"")
         recorder.add_message(4, b"")
         recorder.close({})

@@ -21,7 +21,7 @@ from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
 from pans.runtime.errors import DamagedFileError, PansError, RecordingError, UsageError
 from pans.runtime.record import Recorder, Recording, read_recording
-from pans.runtime.record.format import TIMING_DTYPE, TIMING_RUN_DTYPE, Kind
+from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind
 from pans.runtime.record.log import decision_log_sha256
 from pans.runtime.record.sent_plan import automaton_of
 from pans.runtime.timing.clock import CLOCK_DTYPE
@@ -29,17 +29,19 @@ from pans.runtime.timing.clock import CLOCK_DTYPE
 HEADER = {"created_utc": "2025-01-01T00:00:00+00:00", "simulated": True, "seed": 7}
 
 
-def decision(index: int) -> tuple[Any, ...]:
-    return (index, 1000 * index, 9 * index + 8, index, 0, 4, index % 3, -1, 0, 0.5, 12345, 0)
+def decisions(count: int, first: int = 0) -> np.ndarray:
+    """Rows of decisions, from number `first` on."""
+    made = [(i, 1000 * i, 9 * i + 8, i, 0, 4, i % 3, -1, 0, 0.5, 12345, 0) for i in range(first, first + count)]
+    return np.array(made, DECISION_DTYPE)
 
 
-def write_recording(path: Path, decisions: int = 5, bundle: bytes = b"") -> str:
+def write_recording(path: Path, count: int = 5, bundle: bytes = b"") -> str:
     with Recorder(path, HEADER, bundle=bundle) as recorder:
         recorder.add_command(10, b"arm")
-        for index in range(decisions):
+        for index in range(count):
             recorder.add_message(100 + index, bytes([index % 256]) * (index % 7))
-            recorder.add_decision(decision(index))
-            recorder.add_timing((index, 1, 2, 3, 4))
+        recorder.add_decisions(decisions(count))
+        recorder.add_timing_runs(np.array([(index, 1, 2, 3, 4, 1) for index in range(count)], TIMING_RUN_DTYPE))
         recorder.add_clock(np.array([(5, 6, 7), (8, 9, 10)], dtype=CLOCK_DTYPE))
         recorder.add_event({"kind": "gap", "lost": 3})
         recorder.add_event({"kind": "late", "text": "a line\nof two"})
@@ -61,19 +63,14 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
     digest = write_recording(path)
     found = read_recording(path)
-    assert found.complete
-    assert found.damage == ""
-    assert found.header["seed"] == 7
-    assert found.header["format_version"] == 1
-    assert found.summary == {"accuracy": 0.75}
+    assert (*facts(found), found.damage, found.summary) == (5, True, "", {"accuracy": 0.75})
+    assert (found.header["seed"], found.header["format_version"]) == (7, 1)
     assert found.end_offset == found.size == path.stat().st_size
     assert list(found.messages()) == [(100 + i, bytes([i]) * i) for i in range(5)]
     assert list(found.commands()) == [(10, b"arm")]
-    wanted = np.array([decision(i) for i in range(5)], dtype=DECISION_DTYPE)
-    np.testing.assert_array_equal(found.decisions(), wanted)
-    assert digest == found.decisions_sha256 == decision_log_sha256(wanted)
-    assert found.timings()["index"].tolist() == [0, 1, 2, 3, 4]
-    assert found.timings().dtype == TIMING_DTYPE
+    np.testing.assert_array_equal(found.decisions(), decisions(5))
+    assert digest == found.decisions_sha256 == decision_log_sha256(decisions(5))
+    assert found.timings().tolist() == [(index, 1, 2, 3, 4) for index in range(5)]
     assert found.clock_samples().tolist() == [(5, 6, 7), (8, 9, 10)]
     assert list(found.events()) == [{"kind": "gap", "lost": 3}, {"kind": "late", "text": "a line\nof two"}]
     assert found.bundle_data() == b""
@@ -83,16 +80,12 @@ def test_everything_comes_back(tmp_path: Path) -> None:
 
 def test_times_that_decisions_share_stand_once(tmp_path: Path) -> None:
     """Between single ones, in the order of time."""
-    runs = np.array([(1, 10, 20, 30, 40, 3), (4, 11, 21, 31, 41, 1), (5, 12, 22, 32, 42, 9000)], TIMING_RUN_DTYPE)
-    single = [(0, 9, 19, 29, 39), (9005, 13, 23, 33, 43)]
-    shared = [(first + k, *times) for first, *times, count in runs.tolist() for k in range(count)]
+    runs = [(0, 9, 19, 29, 39, 1), (1, 10, 20, 30, 40, 3), (4, 11, 21, 31, 41, 1), (5, 12, 22, 32, 42, 9000)]
     with Recorder(tmp_path / "runs", {}) as recorder:
-        recorder.add_timing(single[0])
-        recorder.add_timing_runs(runs)
-        recorder.add_timing(single[1])
+        recorder.add_timing_runs(np.array(runs, TIMING_RUN_DTYPE))
         recorder.close({})
     found = read_recording(tmp_path / "runs")
-    assert found.timings().tolist() == [single[0], *shared, single[1]]
+    assert found.timings().tolist() == [(first + k, *times) for first, *times, count in runs for k in range(count)]
     assert found.size < 2000
 
 
@@ -136,7 +129,7 @@ def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
         data, chain = block(kind, index, chain, payload)
         wanted += data
     with Recorder(tmp_path / "a.pansrec", HEADER) as recorder:
-        recorder.add_decision(decision(0))
+        recorder.add_decisions(decisions(1))
         recorder.add_message(-5, b"hi")
         recorder.add_answer(-6, b"yes")
         recorder.close({})
@@ -152,7 +145,7 @@ def test_rows_are_packed_as_documented() -> None:
 
 def test_any_flipped_byte_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
-    write_recording(path, decisions=2)
+    write_recording(path, 2)
     data = path.read_bytes()
     for position in range(len(data)):
         for flip in (0x01, 0xFF):
@@ -297,7 +290,7 @@ def test_an_exception_leaves_an_incomplete_recording_with_all_that_was_added(tmp
 
     def broken_run() -> None:
         with recorder:
-            recorder.add_decision(decision(0))
+            recorder.add_decisions(decisions(1))
             raise RuntimeError("the run broke")
 
     with pytest.raises(RuntimeError, match="the run broke"):
@@ -310,11 +303,11 @@ def test_an_exception_leaves_an_incomplete_recording_with_all_that_was_added(tmp
 def test_what_is_flushed_is_readable_while_recording_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
     with Recorder(path, HEADER) as recorder:
-        recorder.add_decision(decision(0))
+        recorder.add_decisions(decisions(1))
         assert facts(read_recording(path)) == (0, False)
         recorder.flush()
         assert facts(read_recording(path)) == (1, False)
-        recorder.add_decision(decision(1))
+        recorder.add_decisions(decisions(1, 1))
         recorder.sync()
         assert facts(read_recording(path)) == (2, False)
 
@@ -324,8 +317,8 @@ def test_decisions_are_in_the_file_before_what_acts_upon_them(tmp_path: Path) ->
     path = tmp_path / "a.pansrec"
     with Recorder(path, HEADER) as recorder:
         recorder.add_message(1, b"hi")
-        recorder.add_decision(decision(0))
-        recorder.add_timing((0, 1, 2, 3, 4))
+        recorder.add_decisions(decisions(1))
+        recorder.add_timing_runs(np.ones(1, TIMING_RUN_DTYPE))
         recorder.flush_decisions()
         found = read_recording(path)
         assert facts(found) == (1, False)
@@ -352,12 +345,13 @@ def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
         for host_ns, data in messages:
             recorder.add_message(host_ns, memoryview(data))
         for index in range(10_000):
-            recorder.add_decision(decision(index))
             recorder.add_event({"kind": "x", "index": index})
+            if index % 50 == 49:
+                recorder.add_decisions(decisions(50, index - 49))
         recorder.close({})
     found = read_recording(path)
     assert list(found.messages()) == messages
-    assert found.kinds[Kind.DECISIONS] == 3
+    assert found.kinds[Kind.DECISIONS] == 5
     assert found.decisions()["index"].tolist() == list(range(10_000))
     assert [event["index"] for event in found.events()] == list(range(10_000))
     assert max(len(block.payload) for block in found.iter_blocks()) <= (1 << 20) + 12
@@ -371,7 +365,7 @@ def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
 def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.pansrec"
     recorder = Recorder(path, HEADER)
-    recorder.add_decision(decision(0))
+    recorder.add_decisions(decisions(1))
     recorder.flush()
 
     class FullDisk:
@@ -391,7 +385,7 @@ def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeyp
             return getattr(self.file, name)
 
     monkeypatch.setattr(recorder.open_file, "_file", FullDisk(recorder.open_file._file))
-    recorder.add_decision(decision(1))
+    recorder.add_decisions(decisions(1, 1))
     with pytest.raises(PansError, match="recording stops after"):
         recorder.flush()
     found = read_recording(path)
@@ -443,11 +437,10 @@ def test_a_header_that_json_cannot_hold_makes_no_file(tmp_path: Path) -> None:
 
 
 def test_decisions_in_bulk_make_the_same_log(tmp_path: Path) -> None:
-    wanted = np.array([decision(i) for i in range(50_000)], dtype=DECISION_DTYPE)
-    one, many = tmp_path / "one.pansrec", tmp_path / "many.pansrec"
+    wanted, one, many = decisions(50_000), tmp_path / "one.pansrec", tmp_path / "many.pansrec"
     with Recorder(one, HEADER) as recorder:
-        for row in wanted[:10].tolist():
-            recorder.add_decision(row)
+        for row in range(10):
+            recorder.add_decisions(wanted[row : row + 1])
         recorder.add_decisions(wanted[10:])
         digest = recorder.close({})
     with Recorder(many, HEADER) as recorder:

@@ -26,6 +26,7 @@ from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.commands.one_run import _exit_code
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import UsageError
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
 from pans.runtime.record import Recorder, read_recording
@@ -167,8 +168,7 @@ def test_the_state_names_only_what_is_written(tmp_path: Path) -> None:
         run.core.tallies = np.zeros(16, np.int64)
         run.timing.total.max_ns, run.timing.total.quantile_ns.return_value = 0, 0
         run.lateness.incidents.causes = run.lateness.incidents.missing = {}
-        for number in range(3):
-            recorder.add_decision((number, 0, 0, 0, 0, 0, 0, -1, 0, 0.5, 0, 0))
+        recorder.add_decisions(np.zeros(3, DECISION_DTYPE))
         assert picture_of(run, recorder, 0.0)["decisions"] == 0
         recorder.flush()
         assert picture_of(run, recorder, 0.0)["decisions"] == 3
