@@ -59,7 +59,7 @@ def watch_of(
     """A watch whose thread never looks, on a disk with these bytes free at each look."""
     left, asked = iter(free), list[str]()
     monkeypatch.setattr(host.shutil, "disk_usage", lambda path: Usage(0, 0, next(left)))
-    recorder: Any = SimpleNamespace(open_path=tmp_path / "run.pansrec", is_deleted=False)
+    recorder: Any = SimpleNamespace(open_file=SimpleNamespace(path=tmp_path / "run.pansrec", is_deleted=False))
     watch = HostWatch(recorder, reserve, asked.append)
     for _ in free[1:]:
         watch.look()
