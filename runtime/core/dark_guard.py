@@ -266,7 +266,6 @@ class DarkGuard:
         self._n_features = plan.n_patterns
         self.policy, self.watch, self.health = policy, watch, ChannelHealth(watch)
         self.lit = lit  # finds dead channels in lit exposures; None: dark ones alone tell
-        self._any_click = np.zeros(1, np.int64)
         self._news: list[Finding] = []
         self.findings: list[Finding] = []
         self.dropped_findings = 0
@@ -305,19 +304,22 @@ class DarkGuard:
 
         What it says holds from this decision on; `news` has the findings.
         """
-        if not self._parallel and self._at_once == 1:
-            self.take_clicks(int(counts.sum()), number)
-        elif self.lit is not None:
-            of_channels = counts if self._parallel else counts.reshape(-1, self._at_once).sum(axis=0)
-            self.lit.take_object(of_channels, -1 if number == NO_OBJECT else number)
-            self._look_for_dead()
+        of_channels = counts if self._parallel else counts.reshape(-1, self._at_once).sum(axis=0)
+        self.take_objects(of_channels[None] > 0, np.array([number]))
 
-    def take_clicks(self, clicks: int, number: int) -> None:
-        """As `take_object` with one detector, of which only the sum of its clicks counts."""
-        if self.lit is not None:
-            self._any_click[0] = clicks
-            self.lit.take_object(self._any_click, -1 if number == NO_OBJECT else number)
-            self._look_for_dead()
+    def take_objects(self, clicked: NDArray[np.bool_], numbers: NDArray[np.integer[Any]]) -> None:
+        """Take which channels clicked in windows that followed one another, bool (n, channels), and the objects in them, (n,)."""
+        if self.lit is None or not len(numbers):
+            return
+        objects: I64 = np.where(numbers == NO_OBJECT, -1, numbers.astype(np.int64))
+        waiting = [(0, len(numbers))]
+        while waiting:  # where something may be found, window by window
+            first, stop = waiting.pop()
+            if not self.lit.take_objects(clicked[first:stop], objects[first:stop], look_between=stop - first > 1):
+                middle = (first + stop) // 2
+                waiting += (middle, stop), (first, middle)
+            else:
+                self._look_for_dead()
 
     def news(self) -> list[Finding]:
         """Return what was found with objects, once."""
@@ -345,8 +347,8 @@ class DarkGuard:
         if isinstance(block, FrameBlock):
             if not self._any_dark:
                 return []
-            slots = (block.exposure_index + np.arange(len(block.words))) % len(self._dark_slot)
-            return self.take_dark_words(np.ascontiguousarray(block.words[self._dark_slot[slots]]))
+            dark = cut_out(self._dark_slot, block.exposure_index, len(block.words))
+            return self.take_dark_words(np.ascontiguousarray(block.words[dark]))
         words, dark = self._words(block), np.asarray(block.patterns) == DARK_PATTERN
         if not self._afterpulses:
             return self.take_dark_words(words[dark])
@@ -479,6 +481,14 @@ class DarkGuard:
             )
             for finding in self.health.present
         )
+
+
+def cut_out(pattern: NDArray[np.bool_], first: int, n: int) -> NDArray[np.bool_]:
+    """Return places `first` to `first` + `n` of `pattern`, bool (m,), repeated without end."""
+    begin = first % len(pattern)
+    if begin + n <= len(pattern):
+        return pattern[begin : begin + n]
+    return np.resize(np.concatenate([pattern[begin:], pattern[:begin]]), n)
 
 
 def recorded_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots: int) -> DarkGuard | None:

@@ -35,6 +35,7 @@ from pans.runtime.wire.schema import MAX_GAP_EXPOSURES
 from pans.runtime.wire.tracker import MEMORY_BYTES, StreamTracker
 
 from .decision import BeyondPlan, CoreEvent, Output, StreamEndUnknown, joined
+from .marks import Marks
 from .plan import Plan
 
 
@@ -121,7 +122,6 @@ class PlanRules:
         return None
 
 
-MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
 ANY_CLASS = 1 << 15  # where nothing is classified, every truth that fits its field is one
 PART_MARKS = 16  # of them that a part of a recording begins with
 
@@ -174,7 +174,7 @@ class Follower:
         self.start_tick = 0
         self.completed = False
         self.tracker = StreamTracker()
-        self.marks: dict[int, Mark] = {}
+        self.marks = Marks()
         self.n_decisions = 0
         self.n_abstained = 0
         self.last_tick = 0
@@ -250,9 +250,8 @@ class Follower:
         own = None if self.completed or stopped or not self._begun else self._place()
         if own is None:
             return None
-        for number in list(self.marks)[:-PART_MARKS]:
-            del self.marks[number]
-        marks = tuple(self.marks.values())
+        self.marks.keep(PART_MARKS)
+        marks = tuple(self.marks.latest())
         numbers = self.n_decisions, self.n_abstained, self.last_tick
         return Place(self.tracker.position, marks, *numbers, own, self.tracker.memory)
 
@@ -272,7 +271,7 @@ class Follower:
         if self._begun:
             output = joined(output, self._give_up())
             self.tracker.restart()
-            self.marks.clear()
+            self.marks.keep(0)
         self._begun, self.completed, self._told_end, self._told_wrong, self._status = True, False, None, False, None
         self.start_tick, self.end_exposure = start_tick, self._exposures_of(n_cycles)
         return output
@@ -385,9 +384,10 @@ class Follower:
             events.append(self._contradicts(wrong))
         return joined(Output([], events, None), self._skip_to(min(end, self.tracker.next_exposure), status.tick))
 
+    def remember_rows(self, rows: npt.NDArray[np.void]) -> None:
+        """Know marks that the kernel has taken, MARK_DTYPE (n,), from here on."""
+        self.marks.add_rows(rows)
+
     def remember(self, mark: Mark) -> None:
         """Know a mark from here on."""
-        self.marks.pop(mark.object_index, None)
-        self.marks[mark.object_index] = mark
-        if len(self.marks) > MAX_MARKS:
-            del self.marks[next(iter(self.marks))]  # the one that was set longest ago
+        self.marks.add(mark)

@@ -78,7 +78,7 @@ class CoreState:
         """Follow the stream of `session`, from where the core stands: its marks are known, others forgotten."""
         self._state[kernels.SESSION] = session
         self._marks.objects[:] = -1
-        for mark in self.core.marks.values():
+        for mark in self.core.marks.latest():
             self.remember(mark)
 
     def remember(self, mark: Mark) -> None:

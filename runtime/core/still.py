@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.decide.backends import Decider
-from pans.runtime.instrument.channel_health import Finding
+from pans.runtime.instrument.channel_health import Finding, any_click
 from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark
 
-from .dark_guard import DarkGuard
+from .dark_guard import DarkGuard, cut_out
 from .decision import NO_LABEL, Decision, DecisionFlag, Output
 from .follower import ANY_CLASS, Follower, Place
 from .kernel_state import CoreState, IdleSteps
@@ -92,26 +92,24 @@ class Core(Follower):
         block = ClickBlock(0, 0, 0, first, 0, self.windows.position[2], stamps, bits)
         events = self.guard.take(block)
         measured = rows[rows["flags"] & _NOT_MEASURED == 0]
-        for clicks, number in zip(measured["clicks"].tolist(), measured["object"].tolist()):
-            self.guard.take_clicks(clicks, number)
+        self.guard.take_objects(measured["clicks"][:, None] > 0, measured["object"])
         return events
 
-    def watch_frames(self, block: FrameBlock) -> list[Finding]:
-        """As `watch_blocks` for a block of frames: of its object the guard sees which channels have clicked in lit frames."""
-        assert self.guard is not None
-        events = self.guard.take(block)
-        self.watch_object(block)
-        return events
+    def watch_frames(self, words: NDArray[np.uint8], heads: NDArray[np.void]) -> list[Finding]:
+        """As `watch_blocks` for blocks of frames that follow one another: words uint8 (frames, bytes), heads BLOCK_DTYPE (blocks,).
 
-    def watch_object(self, block: FrameBlock) -> None:
-        """As `watch_frames`, of the object alone."""
+        Of each object the guard sees which channels have clicked in lit frames.
+        """
         assert self.guard is not None
-        first = block.exposure_index % self.windows.visit_exposures
-        lit = self.windows.lit[first : first + len(block.words)]
-        if lit.any():
-            seen = np.bitwise_or.reduce(block.words[lit], axis=0)
-            clicked = np.unpackbits(seen, count=self._plan.n_patterns, bitorder="little").astype(np.int64)
-            self.guard.take_object(clicked, block.object_index)
+        first = int(heads["exposure_index"][0])
+        events = self.guard.take(FrameBlock(0, 0, 0, first, 0, self.windows.position[2], words))
+        lit = cut_out(self.windows.lit, first, len(words))
+        begins = np.cumsum(heads["count"], dtype=np.int64) - heads["count"]
+        some = np.logical_or.reduceat(lit, begins)
+        seen = any_click(words, begins, lit)[some]
+        clicked = np.unpackbits(seen, axis=1, count=self._plan.n_patterns, bitorder="little").view(np.bool_)
+        self.guard.take_objects(clicked, heads["object_index"][some])
+        return events
 
     def cycles_left(self, n_cycles: int) -> int:
         """Return how many of a whole run's `n_cycles` cycles stand out when the visit under way is given up."""

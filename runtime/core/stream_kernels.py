@@ -111,7 +111,7 @@ LAST_TICK, JITTER, EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK = range(N_
 PERIOD_TICKS, CYCLE_TICKS, N_CLASSES, N_STATE = range(START_TICK + 1, START_TICK + 5)
 # what `take_frames` and `take_clicks` return; TOOK_URGENT is a block of which the caller must know at once
 ODD, TOOK_MARK, TOOK_BLOCK, TOOK_URGENT = range(4)
-MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
+MARK_SLOTS = 4096  # as many objects as marks.MAX_MARKS
 
 _U = np.uint64
 _ABSTAINED = int(DecisionFlag.ABSTAINED)

@@ -30,6 +30,7 @@ from pans.runtime.core.decision import (
 )
 from pans.runtime.core.follower import Follower
 from pans.runtime.core.kernel_state import decision_tables
+from pans.runtime.core.marks import mark_of
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.stream_kernels import DecisionTables
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
@@ -432,6 +433,11 @@ class FlowCore(Follower):
 
     def _nothing_left(self) -> bool:
         return self.tracker.next_exposure >= self.end_exposure
+
+    def remember_rows(self, rows: npt.NDArray[np.void]) -> None:
+        """See Follower."""
+        for row in rows:
+            self.remember(mark_of(row))
 
     def remember(self, mark: Mark) -> None:
         """See Follower."""

@@ -335,8 +335,11 @@ class DeadChannelTest:
 
         A channel that clicked in the block is silent for 0 exposures at its end: no silence is ever counted too long.
         """
-        clicked = np.unpackbits(np.bitwise_or.reduce(words, axis=0), count=self.n_channels, bitorder="little")
-        self.take_counts(len(words), clicked)
+        if len(words):
+            clicked = np.unpackbits(
+                any_click(words, np.zeros(1, np.int64))[0], count=self.n_channels, bitorder="little"
+            )
+            self.take_counts(len(words), clicked)
 
     def take_counts(self, exposures: int, clicks: NDArray[np.integer]) -> None:
         """Take exposures of which only the clicks of each channel are known, (n,)."""
@@ -351,26 +354,49 @@ class DeadChannelTest:
         """Whether `look` or `returned` may have something to tell; cheap."""
         return self._any_due or self._n_told > 0
 
-    def take_object(self, counts: I64, number: int) -> None:
-        """Take one window's clicks, int64 (n,); windows of the same object `number` are one object, -1 is always another."""
-        if self._open and (number < 0 or number != self._object):
-            self.end_object()
-        self._object, self._open = number, True
-        self._clicks |= counts > 0
+    def take_objects(self, clicked: NDArray[np.bool_], numbers: I64, *, look_between: bool = False) -> bool:
+        """Take which channels clicked in windows that followed one another, bool (m, n), of objects `numbers` int64 (m,).
+
+        Neighbours with the same number are one object, -1 is always another. With `look_between` nothing is done, and False returned,
+        where `look` might find something before the last window has been taken.
+        """
+        begins = np.flatnonzero((np.diff(numbers, prepend=self._object if self._open else -1) != 0) | (numbers < 0))
+        if not len(begins) or begins[0] > 0:  # the object under way goes on
+            begins = np.append(0, begins)
+            objects = np.logical_or.reduceat(clicked, begins)
+            objects[0] |= self._clicks
+        else:
+            objects = np.logical_or.reduceat(clicked, begins)
+            if self._open:
+                objects = np.concatenate([self._clicks[None], objects])
+        if not self._end_objects(objects[:-1], look_between):
+            return False
+        self._clicks, self._object, self._open = objects[-1], int(numbers[-1]), True
+        return True
 
     def end_object(self) -> None:
         """The object under way has gone: what comes next is another."""
         if self._open:
-            clicks = self._clicks
-            self.objects += 1
-            self.clicked += clicks
-            self._quiet += 1
-            self._quiet[clicks] = 0
-            self._due[clicks] = self._first[clicks]
-            self._then[clicks] = self.clicked[self._compared]
-            self._any_due |= bool((self._quiet >= self._due).any())
-            clicks[:] = False
+            self._end_objects(self._clicks[None], False)
             self._open = False
+
+    def _end_objects(self, clicked: NDArray[np.bool_], look_between: bool) -> bool:
+        """Account for objects that have gone, with the channels that clicked in each, bool (m, n); see `take_objects`."""
+        if not len(clicked):
+            return True
+        number = np.arange(1, len(clicked) + 1)[:, None]
+        last = np.maximum.accumulate(np.where(clicked, number, 0))  # the object of the last click, 0: before these
+        quiet = np.where(last > 0, number - last, self._quiet + number)
+        due = bool((quiet >= np.where(last > 0, self._first, self._due)).any())
+        if due and look_between:
+            return False
+        totals = self.clicked + np.cumsum(clicked, axis=0)
+        clicking = np.flatnonzero(last[-1])
+        self._then[clicking] = totals[last[-1][clicking] - 1][:, self._compared]
+        self._due[clicking] = self._first[clicking]
+        self.objects, self.clicked, self._quiet = self.objects + len(clicked), totals[-1], quiet[-1]
+        self._any_due |= due
+        return True
 
     def look(self) -> list[Silence]:
         """Return the channels that have been found dead since the last look; no work where none has been silent for long."""
@@ -427,6 +453,19 @@ class DeadChannelTest:
         error2 = (share * (1 - share) * (1 / before + 1 / quiet))[varies]
         z2 = (since[varies] / quiet - then[varies] / before) ** 2 / error2
         return bool(z2.mean() <= MEAN_Z2_MAX and z2.max() <= Z2_MAX)
+
+
+def any_click(words: U8, begins: I64, lit: NDArray[np.bool_] | None = None) -> U8:
+    """Return the channels that clicked in each run of exposures, uint8 (runs, bytes): words uint8 (n, bytes), runs from `begins` on.
+
+    `lit` bool (n,) leaves the others out.
+    """
+    kind = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.uint64}.get(words.shape[1])
+    if kind is None or not words.flags.c_contiguous:
+        return np.bitwise_or.reduceat(words if lit is None else np.where(lit[:, None], words, 0), begins)
+    whole = words.view(kind)[:, 0]
+    found = np.bitwise_or.reduceat(whole if lit is None else whole * lit, begins)
+    return found.view(np.uint8).reshape(-1, words.shape[1])
 
 
 def silence_limit(rate: float, n_channels: int, arl: float) -> int:

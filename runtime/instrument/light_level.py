@@ -61,18 +61,21 @@ class LightWatch:
 
     def take(self, clicks: npt.ArrayLike) -> list[dict[str, Any]]:
         """Take the clicks of decisions, whole numbers (n,), in the order of time; return the changes found with them."""
-        known, begun = len(self.found), self.decisions - len(self._unfinished)
+        known = len(self.found)
         waiting = np.append(self._unfinished, np.asarray(clicks, np.int64))
         whole = len(waiting) // self.batch * self.batch
-        for total in waiting[:whole].reshape(-1, self.batch).sum(axis=1).tolist():
-            begun += self.batch
-            self.decisions = begun
+        self.decisions -= len(self._unfinished)
+        totals = waiting[:whole].reshape(-1, self.batch).sum(axis=1).tolist()
+        done = 0
+        while done < len(totals):
             if self.baseline is None:
-                self._learn(total)
+                self.decisions += self.batch
+                self._learn(totals[done])
+                done += 1
             else:
-                self._compare(total, self.baseline)
+                done += self._compare(totals[done:], self.baseline)
         self._unfinished = waiting[whole:].copy()
-        self.decisions = begun + len(self._unfinished)
+        self.decisions += len(self._unfinished)
         return self.found[known:]
 
     def report(self) -> dict[str, Any]:
@@ -101,15 +104,26 @@ class LightWatch:
             self.baseline = make_baseline(mean, deviation, error, self.arl_batches)
             self._since = dict.fromkeys(self._since, (self.decisions, self._batches, self._total))
 
-    def _compare(self, total: int, base: Baseline) -> None:
-        self._batches, self._total = self._batches + 1, self._total + total
-        for side, sign in (("fall", -1), ("rise", 1)):
-            self._sums[side] = max(0.0, self._sums[side] + sign * (total - base.mean) - base.slack)
-            if self._sums[side] == 0.0:
-                self._since[side] = (self.decisions, self._batches, self._total)
-            elif self._sums[side] >= base.threshold:
-                self._report_change(side, base)
-                return
+    def _compare(self, totals: list[int], base: Baseline) -> int:
+        """Compare batches with the baseline until a change is found; return how many were compared."""
+        mean, slack, threshold, since = base.mean, base.slack, base.threshold, self._since
+        decisions, batches, clicks = self.decisions, self._batches, self._total
+        fall, rise, done = self._sums["fall"], self._sums["rise"], 0
+        for total in totals:
+            done, decisions, batches, clicks = done + 1, decisions + self.batch, batches + 1, clicks + total
+            fall = fall - (total - mean) - slack
+            rise = rise + (total - mean) - slack
+            if fall <= 0.0:
+                fall, since["fall"] = 0.0, (decisions, batches, clicks)
+            if rise <= 0.0:
+                rise, since["rise"] = 0.0, (decisions, batches, clicks)
+            if fall >= threshold or rise >= threshold:
+                break
+        self.decisions, self._batches, self._total = decisions, batches, clicks
+        self._sums = {"fall": fall, "rise": rise}
+        if max(fall, rise) >= threshold:
+            self._report_change("fall" if fall >= threshold else "rise", base)
+        return done
 
     def _report_change(self, side: str, base: Baseline) -> None:
         """Note the change, and begin a new baseline: from here on clicks are compared with the new mean."""

@@ -20,8 +20,8 @@ from pans.runtime.core.still import Core
 from pans.runtime.core.stream_kernels import DecisionTables
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.wire.framing import CHUNK_BYTES, Frame, FrameDecoder, Messages, unpack_body
-from pans.runtime.wire.messages import Mark, MessageType, decode_mark
-from pans.runtime.wire.schema import HEADER
+from pans.runtime.wire.messages import MessageType
+from pans.runtime.wire.schema import MARK_DTYPE
 from pans.runtime.wire.session import STREAM_TYPES
 
 from . import state as ring
@@ -85,7 +85,6 @@ class Steps(Protocol):
 
 NO_LIMITS = Limits()
 _NOTHING = Counts(*[0] * len(Counts._fields))
-_MARK = int(MessageType.MARK)
 
 
 class Kernel:
@@ -227,11 +226,15 @@ class Kernel:
         """Return what stands at one row of `messages`, `answers` or `shows`."""
         return self.kept[int(span[ring.BEGIN]) : int(span[ring.END])].tobytes()
 
-    def marks(self) -> list[Mark]:
-        """Return the marks among `messages`, in order."""
-        found = self.messages
-        spans = found[found[:, ring.WHAT] == _MARK, : ring.END + 1].tolist()
-        return [decode_mark(self.kept[begin + HEADER.size : end].tobytes()) for begin, end in spans]
+    def heads(self, kind: MessageType, dtype: npt.DTypeLike) -> tuple[I64, npt.NDArray[np.void]]:
+        """Return the spans of the messages of one kind, in order, and what each begins with: rows of `dtype`, BLOCK_DTYPE or MARK_DTYPE."""
+        spans = self.messages[self.messages[:, ring.WHAT] == int(kind)]
+        places = spans[:, : ring.END] + np.arange(np.dtype(dtype).itemsize)
+        return spans, self.kept[places].view(dtype)[:, 0]
+
+    def marks(self) -> npt.NDArray[np.void]:
+        """Return the marks among `messages`, MARK_DTYPE (n,), in order."""
+        return self.heads(MessageType.MARK, MARK_DTYPE)[1]
 
 
 _CORE_TYPES = STREAM_TYPES | {MessageType.STATUS}
@@ -308,8 +311,7 @@ class StreamCore:
         """Yield what a call of the kernel brought, and take what ended it, until nothing is left."""
         while True:
             rows = self.turn.rows
-            for mark in self.turn.marks():
-                self.core.remember(mark)
+            self.core.remember_rows(self.turn.marks())
             if len(rows):
                 yield Batch(rows)
             if ended == ring.ODD:

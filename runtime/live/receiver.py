@@ -29,8 +29,8 @@ from pans.runtime.link.reader import count_delimiters
 from pans.runtime.record.format import Kind
 from pans.runtime.timing.causes import INFERENCE, NS_PER_S
 from pans.runtime.timing.clock import STEP_MARGIN_NS
-from pans.runtime.wire.messages import MessageType, Opcode, decode_ack, decode_frames
-from pans.runtime.wire.schema import HEADER
+from pans.runtime.wire.messages import MessageType, Opcode, decode_ack
+from pans.runtime.wire.schema import BLOCK_DTYPE, HEADER
 from pans.runtime.wire.session import STREAM_TYPES, Refusal
 
 if TYPE_CHECKING:
@@ -291,8 +291,7 @@ class Receiver:
 
     def _settle_marks(self, kernel: Kernel) -> None:
         """Let the core know of the marks of a call."""
-        for mark in kernel.marks():
-            self._core.remember(mark)
+        self._core.remember_rows(kernel.marks())
 
     def _settle_commands(self, kernel: Kernel) -> None:
         """Bring the session and the driver to where the kernel has them."""
@@ -366,8 +365,16 @@ class StillReceiver(Receiver):
         if core.guard is None:
             return []
         if core.windows.parallel:
-            spans = kernel.messages[kernel.messages[:, ring.WHAT] == int(MessageType.FRAMES)]
-            blocks = (decode_frames(kernel.bytes_of(span)[HEADER.size :]) for span in spans)
-            return [event for block in blocks for event in core.watch_frames(block)]
+            spans, heads = kernel.heads(MessageType.FRAMES, BLOCK_DTYPE)
+            return core.watch_frames(_words_of(kernel.kept, spans, heads), heads)
         n = int(unpack_blocks(kernel.kept, kernel.messages, self._stamps, self._bits))
         return core.watch_blocks(self._stamps[:n], self._bits[:n], core.tracker.next_exposure - n, rows)
+
+
+def _words_of(kept: npt.NDArray[np.uint8], spans: I64, heads: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:
+    """Return the words of all FRAMES of a call behind one another, uint8 (frames, bytes), as wide as the narrowest."""
+    bodies = [kept[begin:end] for begin, end in (spans[:, : ring.END + 1] + [BLOCK_DTYPE.itemsize, 0]).tolist()]
+    width = int(heads["width"].min())
+    if width == heads["width"].max():
+        return np.concatenate(bodies).reshape(-1, width)
+    return np.concatenate([body.reshape(-1, wide)[:, :width] for body, wide in zip(bodies, heads["width"].tolist())])

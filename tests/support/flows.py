@@ -175,7 +175,7 @@ def state_of(core: FlowCore) -> dict[str, Any]:
     return {
         "counters": core.tracker.counters,
         "position": core.tracker.position,
-        "marks": core.marks,
+        "marks": core.marks.latest(),
         "last_tick": core.last_tick,
         "jitter": core.jitter_ticks,
         "tallies": core.tallies.tolist(),

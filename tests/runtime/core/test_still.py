@@ -7,7 +7,6 @@ import pytest
 from plans import parallel, shot_major
 
 from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
-from pans.runtime.core.follower import MAX_MARKS
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DecisionWindows
 from pans.runtime.decide.verdict import Verdict, softmax_winner
@@ -62,7 +61,7 @@ def test_decisions_carry_what_the_log_needs() -> None:
     assert decision._replace(counts_crc=0) == (0, 1360, 3, 0, 0, 2, 2, 2, 0, 0.5, 0, 0)
     assert decider.asked == [[1, 0, 1]]
     assert np.array([decision], DECISION_DTYPE)["label"][0] == 2
-    assert core.marks[0].photons == 4.5
+    assert core.marks.get(0) == Mark(0, 0, 2, 0, 1000, 4.5)
 
 
 def test_a_gap_abstains_and_the_next_window_is_whole_again() -> None:
@@ -194,24 +193,6 @@ def test_damaged_frames_change_nothing() -> None:
     assert core.step(Frame(wire.MessageType.CLICKS, 0, 1, b"xx")).decisions == []
     assert core.step(Frame(wire.MessageType.STATUS, 0, 1, b"xx")).decisions == []
     assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions[0].label == 1
-
-
-def test_marks_are_bounded() -> None:
-    core, _ = make()
-    for seq in range(MAX_MARKS + 10):
-        core.step(frame(wire.encode_mark(Mark(seq, seq, 0, 8 * seq, 0, 0.0), 1)))
-    assert len(core.marks) == MAX_MARKS
-    assert MAX_MARKS + 9 in core.marks
-    assert 0 not in core.marks
-
-
-def test_a_mark_that_comes_again_is_as_young_as_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of more marks than are remembered the one goes that was set longest ago."""
-    monkeypatch.setattr("pans.runtime.core.follower.MAX_MARKS", 2)
-    core, _ = make()
-    for number in (0, 1, 0, 2):
-        core.remember(Mark(0, number, 0, 0, 0, 0.0))
-    assert list(core.marks) == [0, 2]
 
 
 @pytest.mark.parametrize("off", [-3, 0, 3])

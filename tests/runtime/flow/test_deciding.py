@@ -45,8 +45,8 @@ def by_turn(core: FlowCore, data: bytes, cuts: list[int]) -> Output:
         while True:
             for came in settled_blocks(turn) if turn.counts.steps else ():
                 output = joined(output, came)
-            for mark in turn.marks() if not turn.counts.steps else ():
-                core.remember(mark)
+            if not turn.counts.steps:
+                core.remember_rows(turn.marks())
             if ended == ring.ALL_TAKEN:
                 break
             if ended == ring.ODD:

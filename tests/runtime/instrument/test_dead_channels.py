@@ -37,7 +37,7 @@ def watched(
     found = []
     for number, row in enumerate(rows):
         watch.take_exposures(words[number : number + 1])
-        watch.take_object(row, -1)
+        watch.take_objects(row[None] > 0, np.array([-1]))
         found += [(number, one.channel) for one in watch.look()]
         watch.returned()
     return watch, found
@@ -129,10 +129,32 @@ def test_windows_of_one_object_are_one_object() -> None:
     watch = DeadChannelTest(np.full(1, 1e-9), 1e12, 1e6)
     for number in range(100):
         for shot in range(5):
-            watch.take_object(np.array([shot == 3 and number % 2]), number)
+            watch.take_objects(np.array([[shot == 3 and number % 2 == 1]]), np.array([number]))
     watch.end_object()
     assert watch.objects == 100
     assert watch.clicked.tolist() == [50]
+
+
+def test_many_windows_at_once_are_found_dead_as_one_by_one() -> None:
+    """With objects of several windows, of which some are nobody's, and a channel that dies: the same findings, at the same window."""
+    rng, findings = np.random.default_rng(7), []
+    rows = objects(31, 3000) > 0
+    rows[1200:, 1] = False
+    numbers = np.where(rng.random(3000) < 0.1, NO_OBJECT, np.arange(3000) // 3)
+    for at_once in (1, 7, 640, 3000):
+        guard = DarkGuard(
+            parallel(N, 1),
+            ChannelWatch(N, np.full(N, 1e-4)),
+            lit=DeadChannelTest(np.full(N, 1e-4), 1e9, 1e4),
+        )
+        for first in range(0, 3000, at_once):
+            guard.take_objects(rows[first : first + at_once], numbers[first : first + at_once])
+        lit = guard.lit
+        assert lit is not None
+        state = (lit.objects, lit.clicked.tolist(), lit._quiet.tolist(), lit._due.tolist(), lit._then.tolist())
+        findings.append(([(one.channels, one.words) for one in guard.news()], state))
+    assert findings[0][0][0][0] == (1,)
+    assert all(one == findings[0] for one in findings)
 
 
 def test_a_channel_that_returns_is_alive() -> None:
