@@ -121,10 +121,8 @@ def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ig
     decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
     fed, reads, control, scratch = bare(fed), bare(reads), bare(control), bare(scratch)
     _begin(walk, control)
-    began_ns, shows = (
-        np.int64(-1),
-        np.int64(-1),
-    )  # before the first read: neither the clock nor what was shown is looked at
+    # before the first read neither the clock nor the blocks are looked at
+    began_ns, blocks = np.int64(-1), np.int64(-1)
     while True:
         ended = take_bodies(decoder, walk, drive, rings, control, scratch)
         if ended == ring.ALL_TAKEN and reads.shape[0]:
@@ -138,9 +136,9 @@ def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ig
         else:
             if began_ns < 0:
                 began_ns = np.int64(now_ns(scratch))
-            elif control[ring.N_SHOWS] > shows and now_ns(scratch) >= control[ring.DUE_NS]:
+            elif control[ring.N_STEPS] > blocks and now_ns(scratch) >= control[ring.DUE_NS]:
                 return ring.DUE
-            shows = control[ring.N_SHOWS]
+            blocks = control[ring.N_STEPS]
             ended = _await_bytes(decoder, rings, control, began_ns, scratch)
             if ended != ring.ALL_TAKEN:
                 return ended
@@ -151,10 +149,9 @@ def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ig
 @inner
 def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no-untyped-def]
     """Read as soon as something is there; ALL_TAKEN when it is decoded, or why the call ends."""
-    quiet_ns = QUIET_NS if control[ring.DRIVES] else 0  # the caller's work fits into the exposure behind a SHOW
     while True:
         now = now_ns(scratch)
-        due = control[ring.DUE_NS] + quiet_ns
+        due = control[ring.DUE_NS] + QUIET_NS  # better right behind a block: the caller's work then delays no other
         if control[ring.PATIENCE_NS]:
             due = min(due, max(control[ring.BLOCK_NS] + control[ring.PATIENCE_NS], began_ns + LEAST_WAIT_NS))
         overdue = now >= due  # what is there is read once even then

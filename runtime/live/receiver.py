@@ -150,7 +150,7 @@ class Receiver:
         run = self._run
         now_ns = run.now_ns()
         budget = 1 if self._prompt else max(run.messages_granted, 1)
-        due_ns = min(now_ns + CALL_NS - (QUIET_NS if run.driver is not None else 0), max(run.due_ns, now_ns + LEAST_NS))
+        due_ns = min(now_ns + CALL_NS - QUIET_NS, max(run.due_ns, now_ns + LEAST_NS))
         patience_ns = run.lateness.patience_ns
         return Limits(due_ns, patience_ns, EAGER_NS if eager else 0, budget, run.lateness.evidence.floor_ns)
 
