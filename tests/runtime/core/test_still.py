@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from plans import parallel, shot_major
 
+from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DecisionWindows
 from pans.runtime.decide.verdict import Verdict, softmax_winner
+from pans.runtime.instrument.channel_health import DeadChannelTest
+from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock, DeviceState, Frame, FrameDecoder, Mark, StateReason, Status
 
@@ -256,3 +259,16 @@ def test_blocks_that_do_not_fit_the_plan_are_counted_not_read() -> None:
         assert output.events[-1].event()["kind"] == "beyond_plan"
         assert all(d.flags & DecisionFlag.GAP for d in output.decisions)
     assert core.contradictions == {"beyond_plan": 3}
+
+
+def test_the_watch_for_dead_channels_sees_only_what_was_measured() -> None:
+    """Exposures that the kernel took, and its decisions: one with a gap or a wrong pattern says nothing about its object."""
+    plan = shot_major(N_FEATURES, 2)
+    lit = DeadChannelTest(np.full(1, 1e-4), 1e9, 1e6)
+    core = Core(plan, CountingDecider(), 1, 9, DarkGuard(plan, ChannelWatch(1, np.full(1, 1e-4)), lit=lit))  # type: ignore[arg-type]
+    rows = np.zeros(5, DECISION_DTYPE)
+    rows["object"], rows["clicks"] = range(5), (2, 0, 3, 1, 1)
+    rows["flags"][1:4] = [DecisionFlag.GAP | DecisionFlag.ABSTAINED, DecisionFlag.WRONG_PATTERN, DecisionFlag.AMBIGUOUS]
+    core.watch_blocks(np.zeros(20, np.uint16), np.ones(20, np.uint8), 0, rows)
+    lit.end_object()
+    assert (lit.objects, lit.clicked.tolist()) == (3, [3])
