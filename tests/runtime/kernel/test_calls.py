@@ -160,7 +160,7 @@ def test_a_core_alone_leaves_the_same(mode: str, acts: bool, tmp_path: Path, mon
     assert ours.stream == theirs.stream
     for name in ("total", *ours.timing.stages) if acts else ():
         one, other = (result.timing.stages.get(name, result.timing.total) for result in (ours, theirs))
-        assert (one.counts, one.total, one.max_ns) == (other.counts, other.total, other.max_ns)
+        assert (one.counts.tolist(), one.total, one.max_ns) == (other.counts.tolist(), other.total, other.max_ns)
     assert (ours.timing.late, ours.timing.blame) == (theirs.timing.late, theirs.timing.blame)
     assert (ours.slot_jitter_us, ours.dark) == (theirs.slot_jitter_us, theirs.dark)
     for which in ("decisions", "timings") if acts else ("decisions",):
