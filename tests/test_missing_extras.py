@@ -19,7 +19,6 @@ NEEDS = {  # command line: what it needs, and the extra that has it
     "baseline direct --task s.npz --method cnn": ("torch", "train"),
     "reproduce alpha --collect --cache new -o out": ("torch", "train"),
     "export r.pansrec --format photon-hdf5 -o new.h5": ("h5py", "export"),
-    "bench decide --quick --plot new.png": ("matplotlib", "plot"),
     "run fashion10 --device sim:ideal?pace=fast --decisions 3 --metrics 0 --out new": ("prometheus-client", "metrics"),
     "export r.pansrec --format parquet -o new.parquet": ("pyarrow", "parquet"),
     "evaluate fashion10 --task s.npz --objects 2 --pictures new": ("matplotlib", "plot"),

@@ -6,9 +6,7 @@ the inputs have labels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,35 +18,22 @@ from pans.runtime.bundle.automaton import log_scores, walk_nodes
 from pans.runtime.bundle.layers import read_layers, reference_scores
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.decide.automaton import AutomatonDecider
-from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.backends import BACKENDS, make_decider
 from pans.runtime.decide.mlp import SparseDecider, bundle_layers
 from pans.runtime.decide.onnx import PictureDecider
-from pans.runtime.decide.table import word_table
 from pans.runtime.decide.verdict import Decider, checked_counts
 from pans.runtime.errors import UsageError, as_usage_error
 
-from .rows import (
-    BenchOptions,
-    Row,
-    cpu_time,
-    cpu_times,
-    latencies_us,
-    mark_pareto,
-    per_item_ns,
-    repeated,
-)
+from .rows import BenchOptions, Row, cpu_time, latencies_us, per_item_ns
 from .streams import CLICK, made_automaton
 
 I64 = NDArray[np.int64]
 BATCH, PICTURES, WORDS = 20_000, 2_000, 20_000
 SINGLE_CALLS, WALK_CALLS = 20_000, 5_000
-STREAM_REPEATS = 15
-CACHED_WORDS, MEMORY_WORDS = 1 << 15, 1 << 24  # 64 kB of 16-bit words, as a block of a stream; 32 to 128 MB
-BACKENDS = ("table", "count-table", "sparse", "int8", "onnx", "int8-onnx", "float64")
 
 
 def bench_decide(options: BenchOptions) -> list[Row]:
-    """Return the rows of every bundle (the shipped one and a made-up automaton unless others are given), then of streams."""
+    """Return the rows of every bundle (the shipped one and a made-up automaton unless others are given)."""
     scale = 10 if options.quick else 1
     rows = [] if options.bundles else [walk_row(made_automaton(), WORDS // scale)]
     for number, path in enumerate(options.bundles or (options.first_bundle,)):
@@ -57,14 +42,12 @@ def bench_decide(options: BenchOptions) -> list[Row]:
         if bundle.automaton is not None:
             rows.append(walk_row(bundle, WORDS // scale))
         elif bundle.largest > 1:
-            raise UsageError(
-                f"{bundle.name} takes photon numbers, the benchmark draws clicks", remedy="name a bundle of clicks"
-            )
+            what = f"{bundle.name} takes photon numbers, the benchmark draws clicks"
+            raise UsageError(what, remedy="name a bundle of clicks")
         elif bundle.picture_shape is not None:
             rows.append(picture_row(bundle, PICTURES // scale))
         else:
             rows += bundle_rows(bundle, inputs, BATCH // scale)
-            rows += _stream_rows(bundle) if bundle.table is not None else []
     return rows
 
 
@@ -111,13 +94,12 @@ def bundle_rows(bundle: Bundle, inputs: Path | None, n: int) -> list[Row]:
     counts, shots, labels = _inputs(bundle, inputs, n)
     wanted = reference_scores(bundle_layers(bundle), counts / shots)
     rows: list[Row] = []
-    for name in BACKENDS:
+    for name in BACKENDS[1:]:  # but auto
         with suppress(UsageError):  # a back end that this bundle, or these shots, cannot have
             decider = make_decider(bundle, shots=shots, backend=name)
             rows.append(_backend_row(decider, bundle.name, (counts, shots), wanted, labels))
     with suppress(UsageError):
         rows += _limits(bundle, counts, shots)
-    mark_pareto(rows, "ns", "score_error")
     return rows
 
 
@@ -161,6 +143,8 @@ def _backend_row(
 
 def _limits(bundle: Bundle, counts: I64, shots: int) -> list[Row]:
     """The same decisions by others: our kernel alone, onnxruntime as one would call it, torch eager."""
+    import onnxruntime
+
     decider = SparseDecider(bundle)
     part = np.ascontiguousarray(counts[:BATCH])
     out = np.empty((len(part), decider.n_classes), np.float32), np.empty(len(part), np.uint16)
@@ -168,32 +152,25 @@ def _limits(bundle: Bundle, counts: I64, shots: int) -> list[Row]:
     spent = cpu_time(lambda: decider.kernel(part, shots, *decider.layers, decider.room, *out, probabilities))
     name = f"{bundle.name} sparse, called from compiled code, one at a time"
     ours: Row = {"name": name, **per_item_ns(spent, len(part))}
-    others = _onnx_rows(bundle, part, shots) + _torch_rows(bundle, part, shots)
+    means = (part / shots).astype(np.float32)
+    singles = [means[i % len(means)][None] for i in range(SINGLE_CALLS // 4)]
+    others = [_torch_row(bundle, means, singles)]
+    if bundle.head_onnx is not None:  # with the defaults and `session.run`, as the examples of onnxruntime have it
+        session = onnxruntime.InferenceSession(bundle.head_onnx, providers=["CPUExecutionProvider"])
+        name = session.get_inputs()[0].name
+        times = latencies_us(lambda one: session.run(None, {name: one})[0].argmax(), singles)
+        others.insert(0, {"name": f"{bundle.name} onnxruntime as a user calls it", **times})
     for row in others:
         if "p50_us" in row:
             row["p50_over_sparse"] = round(1000 * row["p50_us"] / ours["ns"], 1)
     return [ours, *others]
 
 
-def _onnx_rows(bundle: Bundle, counts: I64, shots: int) -> list[Row]:
-    """onnxruntime with its defaults and `session.run`, as its own examples have it."""
-    import onnxruntime
-
-    if bundle.head_onnx is None:
-        return []
-    session = onnxruntime.InferenceSession(bundle.head_onnx, providers=["CPUExecutionProvider"])
-    name = session.get_inputs()[0].name
-    means = (counts / shots).astype(np.float32)
-    singles = [means[i % len(means)][None] for i in range(SINGLE_CALLS // 4)]
-    row = {"name": f"{bundle.name} onnxruntime as a user calls it"}
-    return [row | latencies_us(lambda one: session.run(None, {name: one})[0].argmax(), singles)]
-
-
-def _torch_rows(bundle: Bundle, counts: I64, shots: int) -> list[Row]:
+def _torch_row(bundle: Bundle, means: NDArray[np.float32], singles: list[NDArray[np.float32]]) -> Row:
     try:
         torch = import_module("torch")  # to measure against, where somebody has installed it
     except ModuleNotFoundError:
-        return [{"name": f"{bundle.name} torch eager", "skipped": "torch is not installed"}]
+        return {"name": f"{bundle.name} torch eager", "skipped": "torch is not installed"}
     torch.set_num_threads(1)
     modules: list[Any] = []
     for layer in bundle_layers(bundle):
@@ -202,37 +179,8 @@ def _torch_rows(bundle: Bundle, counts: I64, shots: int) -> list[Row]:
             linear.weight.copy_(torch.from_numpy(layer.weights.T.copy()))
             linear.bias.copy_(torch.from_numpy(layer.bias.copy()))
         modules += [linear, torch.nn.ReLU()] if layer.relu else [linear]
-    head = torch.nn.Sequential(*modules).eval()
-    means = torch.from_numpy((counts / shots).astype(np.float32))
-    singles = [means[i % len(means)][None] for i in range(SINGLE_CALLS // 4)]
+    head, batch = torch.nn.Sequential(*modules).eval(), torch.from_numpy(means)
     with torch.inference_mode():
-        batch = per_item_ns(cpu_time(lambda: head(means).argmax(dim=1)), len(means))
-        alone = latencies_us(lambda one: int(head(one).argmax()), singles)
-    return [{"name": f"{bundle.name} torch eager, one thread", **batch, **alone}]
-
-
-def _stream_rows(bundle: Bundle) -> list[Row]:
-    """The table on streams of packed words against a copy of the same bytes, in the cache and out of memory."""
-    decider, rows = word_table(bundle), list[Row]()
-    dtypes: tuple[Any, ...] = (np.uint16, np.uint32, np.uint64)
-    for dtype in dtypes:
-        for n, place in ((CACHED_WORDS, "in the cache"), (MEMORY_WORDS, "from memory")):
-            words: NDArray[Any] = np.random.default_rng(2).integers(0, 1 << bundle.n_features, n).astype(dtype)
-            out, target, inner = np.empty(n, decider.labels.dtype), np.empty_like(words), max(1, MEMORY_WORDS // n)
-            decide, copy = partial(decider.decide_words, words, out), partial(np.copyto, target, words.copy())
-            works: list[Callable[[], Any]] = [repeated(decide, inner), repeated(copy, inner)]
-            spent, copied = cpu_times(works, STREAM_REPEATS)
-            figures = per_item_ns(spent, n * inner)
-            rows.append(
-                {
-                    "name": f"{bundle.name} table, {8 * words.itemsize}-bit words {place}",
-                    **figures,
-                    "rate": round(1e9 / figures["ns"]),
-                    "copy_ns": per_item_ns(copied, n * inner)["ns"],
-                    "of_copy_rate": round(copied.least_s / spent.least_s, 3),
-                    "of_copy_rate_median": round(copied.median_s / spent.median_s, 3),
-                    "changed_percent": 0.0 if (out == decider.labels[words]).all() else 100.0,
-                    "checksum": int(out.sum(dtype=np.int64)),
-                }
-            )
-    return rows
+        together = per_item_ns(cpu_time(lambda: head(batch).argmax(dim=1)), len(means))
+        alone = latencies_us(lambda one: int(head(one).argmax()), [torch.from_numpy(one) for one in singles])
+    return {"name": f"{bundle.name} torch eager, one thread", **together, **alone}

@@ -1,14 +1,11 @@
 """`pans bench ingest`: wire bytes to click words, and the whole way to recorded decisions, beside a copy of the same bytes.
 
-The whole way has everything switched on: CRC, loss accounting, dark-count monitoring, the decision log with its hash and checksums on disk.
-`--frames N` runs it long enough to show that a steady state allocates nothing.
+The whole way has CRC, loss accounting, dark-count monitoring, the decision log with its hash, and checksums on disk.
 """
 
 from __future__ import annotations
 
-import gc
 import tempfile
-import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -26,35 +23,18 @@ from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.recorder import repeated_setup
 from pans.runtime.record.replaying import replay
-from pans.runtime.watch.state_file import resources_used
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.framing import FrameDecoder, pack_body
 from pans.runtime.wire.messages import FrameBlock, encode_frames
 
+from . import streams
 from .rows import BenchOptions, Row, copy_ns, cpu_time
-from .streams import (
-    BLOCK_FRAMES,
-    DARK_CLICK,
-    SESSION,
-    TICK_HZ,
-    Rows,
-    decided_in_stream,
-    decided_one_by_one,
-    made_automaton,
-    parallel_plan,
-    parallel_visits,
-    percent_changed,
-    reads_of,
-    sequential_plan,
-    visits,
-)
+from .streams import Rows
 
 PAYLOAD_BYTES = 16_384
 STREAM_BYTES = 1 << 22
 ZEROS = (0.0, 0.5, 0.9, 0.97, 0.999, 1.0)
 WINDOWS = (1, 2, 5, 10, 20)
-STRETCH_VISITS = 64
-MIB = 1 << 20
 
 
 def bench_ingest(options: BenchOptions) -> list[Row]:
@@ -71,11 +51,11 @@ def bench_ingest(options: BenchOptions) -> list[Row]:
     rows += stream_rows(bundle, options.quick)
     if bundle.automaton is not None:
         return rows  # the rest is of parallel measurements
-    rows += [] if options.bundles else stream_rows(made_automaton(), options.quick)
+    rows += [] if options.bundles else stream_rows(streams.made_automaton(), options.quick)
     for shots in WINDOWS:
         backend = "table" if shots == 1 and bundle.table is not None else "auto"
         rows.append(_whole_row(bundle, shots, backend, options.quick))
-    return [*rows, _steady_row(bundle, options.frames)] if options.frames else rows
+    return rows
 
 
 def wire_stream(zeros: float) -> tuple[bytes, int]:
@@ -85,13 +65,13 @@ def wire_stream(zeros: float) -> tuple[bytes, int]:
     for seq in range(STREAM_BYTES // PAYLOAD_BYTES):
         words = rng.integers(1, 256, (PAYLOAD_BYTES // 8, 8), dtype=np.uint8)
         words[rng.random(words.shape) < zeros] = 0
-        blocks.append(encode_frames(FrameBlock(seq, 0, 1000 * seq, seq * len(words), 10, 0, words), SESSION))
+        blocks.append(encode_frames(FrameBlock(seq, 0, 1000 * seq, seq * len(words), 10, 0, words), streams.SESSION))
     return b"".join(blocks), len(blocks)
 
 
 def _decode_row(zeros: float) -> Row:
     data, n_frames = wire_stream(zeros)
-    reads = reads_of(data)
+    reads = streams.reads_of(data)
 
     def decode() -> None:
         decoder = FrameDecoder()
@@ -124,14 +104,18 @@ def stream_rows(bundle: Bundle, quick: bool) -> list[Row]:
         decider = make_decider(bundle, backend="auto" if bundle.table is None else "table")
     except UsageError as error:
         return [{"name": f"sequential, {bundle.name}", "skipped": str(error)}]
-    plan = sequential_plan(bundle, decider)
+    plan = streams.sequential_plan(bundle, decider)
     n_visits = 1_000 if quick else 20_000
-    frames = list(visits(plan, n_visits))
-    wanted, exposures = decided_one_by_one(plan, decider, frames), n_visits * plan.slots_per_cycle
-    core, reads, found = StreamCore(plan, decider, 1, 0, SESSION), reads_of(b"".join(frames)), list[Rows]()
-    decided_in_stream(core, reads, found)
-    spent = cpu_time(lambda: decided_in_stream(core, reads), 5)
-    bulk = _rates(spent, exposures, len(wanted)) | {"changed_percent": percent_changed(found, wanted)}
+    frames = list(streams.visits(plan, n_visits))
+    wanted, exposures = streams.decided_one_by_one(plan, decider, frames), n_visits * plan.slots_per_cycle
+    core, reads, found = (
+        StreamCore(plan, decider, 1, 0, streams.SESSION),
+        streams.reads_of(b"".join(frames)),
+        list[Rows](),
+    )
+    streams.decided_in_stream(core, reads, found)
+    spent = cpu_time(lambda: streams.decided_in_stream(core, reads), 5)
+    bulk = _rates(spent, exposures, len(wanted)) | {"changed_percent": streams.percent_changed(found, wanted)}
     name = f"sequential, {bundle.name}, {decider.name}"
     return [
         {"name": f"wire to decisions, {name}", **bulk},
@@ -153,11 +137,11 @@ def _rates(spent: Any, exposures: int, decisions: int) -> Row:
 def _replay_row(bundle: Bundle, plan: Plan, decider: Decider, frames: list[bytes], wanted: Rows) -> Row:
     """`pans replay` of a recording of the stream, whose decisions were made one by one."""
     drive = {} if plan.automaton is None else {"drive": plan.drive, "confidence": 0.0}
-    config = {"shots": 1, "tick_hz": TICK_HZ, "backend": decider.name, **drive}
+    config = {"shots": 1, "tick_hz": streams.TICK_HZ, "backend": decider.name, **drive}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.pansrec"
         with Recorder(path, {"simulated": True, "config": config}, bundle=bundle_bytes(bundle)) as recorder:
-            for command in repeated_setup(plan, Arm(0, 0, 1000), SESSION):
+            for command in repeated_setup(plan, Arm(0, 0, 1000), streams.SESSION):
                 recorder.add_command(0, command)
             decoder = FrameDecoder()
             for data in frames:
@@ -176,14 +160,14 @@ def _replay_row(bundle: Bundle, plan: Plan, decider: Decider, frames: list[bytes
 
 
 def _whole_row(bundle: Bundle, shots: int, backend: str, quick: bool) -> Row:
-    plan = parallel_plan(bundle.n_features, shots)
+    plan = streams.parallel_plan(bundle.n_features, shots)
     decider = make_decider(bundle, shots=shots, backend=backend)
     n_visits = 40 if quick else 240
-    reads = reads_of(b"".join(parallel_visits(plan, 0, n_visits, 0)))
+    reads = streams.reads_of(b"".join(streams.parallel_visits(plan, n_visits)))
     frames, decided = n_visits * plan.slots_per_cycle, n_visits * (plan.shots_per_cycle // shots)
 
     def run(path: Path | None) -> None:
-        core, monitor, rows = StreamCore(plan, decider, shots, 0, SESSION), DarkMonitor(DARK_CLICK), 0
+        core, monitor, rows = StreamCore(plan, decider, shots, 0, streams.SESSION), DarkMonitor(streams.DARK_CLICK), 0
         recorder = None if path is None else Recorder(path, {"simulated": True}, overwrite=True)
         for data in reads:
             for batch in core.feed(data):
@@ -211,47 +195,3 @@ def _whole_row(bundle: Bundle, shots: int, backend: str, quick: bool) -> Row:
         "frames": frames,
         "lost": 0,
     }
-
-
-def _steady_row(bundle: Bundle, wanted: int) -> Row:
-    """Run the whole way over `wanted` frames: memory and collections before and after, the counters at the end."""
-    shots = 1 if bundle.table is not None else 10
-    plan = parallel_plan(bundle.n_features, shots)
-    decider = make_decider(bundle, shots=shots)
-    core = StreamCore(plan, decider, shots, 0, SESSION)
-    messages = 1 + -(-plan.slots_per_cycle // BLOCK_FRAMES)
-    rows = labels = done = collections = 0
-    memory, spent_s = list[int](), 0.0
-    gc.collect()
-    while done < wanted:
-        gc.disable()  # making the stream allocates; only the way through it is looked at
-        visit = done // plan.slots_per_cycle
-        data = b"".join(parallel_visits(plan, visit, STRETCH_VISITS, visit * messages))
-        gc.enable()
-        before, start_s = _collections(), time.thread_time()
-        for batch in core.feed(data):
-            rows += len(batch.rows)
-            labels += int(batch.rows["label"].sum(dtype=np.int64))
-        spent_s += time.thread_time() - start_s
-        collections += _collections() - before
-        done += STRETCH_VISITS * plan.slots_per_cycle
-        memory.append(resources_used()["rss_bytes"])
-    counters = core.core.tracker.counters
-    settled = memory[min(len(memory) - 1, 8) :]
-    return {
-        "name": f"steady state over {done:.3g} frames, K = {shots}, {decider.name}",
-        "rate": round(done / spent_s),
-        "resident_MiB_after_start": round(settled[0] / MIB, 2),
-        "resident_MiB_largest": round(max(settled) / MIB, 2),
-        "resident_growth_kB": (settled[-1] - settled[0]) // 1024,
-        "collections": collections,
-        "decisions": rows,
-        "label_sum": labels,
-        "exposures": counters.exposures,
-        "lost": counters.lost_exposures,
-        "gaps": counters.gaps,
-    }
-
-
-def _collections() -> int:
-    return sum(generation["collections"] for generation in gc.get_stats())

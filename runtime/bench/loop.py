@@ -11,10 +11,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.cli import say
@@ -35,7 +34,6 @@ DEADLINE_US = 10_000.0
 BUSY_PROCESSES = 2
 RECOVER_S = 30.0
 UNKNOWN = "not told by this system"
-NO_TURNS: Mapping[str, float] = {}
 
 
 def bench_loop(options: BenchOptions) -> list[Row]:
@@ -44,35 +42,26 @@ def bench_loop(options: BenchOptions) -> list[Row]:
     """
     bundle, _ = load_bundle(options.first_bundle)
     walking = made_automaton() if bundle.automaton is None else bundle
-    runs = [_Asked(bundle, slot, realtime) for slot in SLOTS_US for realtime in (True, False)]
+    runs = [(bundle, slot, realtime, "auto") for slot in SLOTS_US for realtime in (True, False)]
     runs = runs if bundle.automaton is None else []
-    runs += [_Asked(walking, SLOTS_US[0], True, drive) for drive in ("device", "host")]
+    runs += [(walking, SLOTS_US[0], True, drive) for drive in ("device", "host")]
     rows = []
     with _busy(BUSY_PROCESSES if options.load else 0):
-        for asked in runs:
-            rows.append(_run(asked, options.seconds, options.load))
+        for run in runs:
+            rows.append(_row(*run, options))
             say(table_text(rows[-1:]))
     return rows
 
 
-class _Asked(NamedTuple):
-    """What one run is to be: exposures of `slot_us`, and who drives an automaton."""
-
-    bundle: Bundle
-    slot_us: float
-    realtime: bool
-    drive: str = "auto"
-
-
-def _run(asked: _Asked, seconds: float, load: bool) -> Row:
-    bundle, slot_us, realtime, drive = asked
+def _row(bundle: Bundle, slot_us: float, realtime: bool, drive: str, options: BenchOptions) -> Row:
+    """Run with exposures of `slot_us`, an automaton driven by `drive`."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.toml"
         profile = slot_profile(bundle, slot_us, path)
         plan = build_plan(profile, bundle, drive=drive)
         core = Core(plan, make_decider(bundle), 1, 0)
         link = open_link(f"sim:{path}?scene=fashion200&seed=1&pace=real")
-        config = RunOptions(seconds=seconds, deadline_us=DEADLINE_US, lease_ms=1000, realtime=realtime)
+        config = RunOptions(seconds=options.seconds, deadline_us=DEADLINE_US, lease_ms=1000, realtime=realtime)
         started, load_before, steal_before = time.process_time(), os.getloadavg()[0], steal_ms()
         with Recorder(Path(folder) / "loop.pansrec", {"simulated": True}) as recorder:
             # starved for a whole lease, the host finds its instrument dark
@@ -85,12 +74,12 @@ def _run(asked: _Asked, seconds: float, load: bool) -> Row:
         turns = {f"turn_{name}_us": round(value, 1) for name, value in result.turn_us.items()}
         budget_us = (plan.slot_period_ticks - plan.exposure_ticks) * plan.tick_us
         turns |= {"turn_budget_us": round(budget_us, 1), "late_slots": result.late_slots}
-    slots_hz = 1e6 / (plan.slot_period_ticks * plan.tick_us)
     wanted = "real time asked for" if realtime else "ordinary"
     driven = "" if plan.automaton is None else f", an automaton driven by the {drive}"
+    slots_hz = 1e6 / (plan.slot_period_ticks * plan.tick_us)
     granted = {name: value for name, value in result.realtime.items() if name in ("sched_fifo", "mlockall")}
     return {
-        "name": f"SIMULATED loop, {slots_hz:.0f} slots/s, {wanted}{driven}{', under load' if load else ''}",
+        "name": f"SIMULATED loop, {slots_hz:.0f} slots/s, {wanted}{driven}{', under load' if options.load else ''}",
         **{f"{name}_us": round(value, 1) for name, value in result.timing.total.summary().items()},
         "deadline_us": DEADLINE_US,
         "decisions": result.tally.decisions,
@@ -109,19 +98,11 @@ def _run(asked: _Asked, seconds: float, load: bool) -> Row:
     }
 
 
-def slot_profile(bundle: Bundle, slot_us: float, path: Path, turns_us: Mapping[str, float] = NO_TURNS) -> Profile:
-    """Return the ideal profile with the bundle's levels and with light that makes one exposure last `slot_us`; written to `path`.
-
-    `turns_us` are keys of [timing]: how long the host or the device has for its turn between two exposures.
-    """
+def slot_profile(bundle: Bundle, slot_us: float, path: Path) -> Profile:
+    """Return the ideal profile with the bundle's levels and with light that makes one exposure last `slot_us`; written to `path`."""
     peak_hz = bundle.photons_per_level * (bundle.levels - 1) / (slot_us * 1e-6)
-    text = load_profile("ideal").text
-    lines = "".join(f"{name} = {turn_us!r}\n" for name, turn_us in turns_us.items())
-    if "host_turn_us" in turns_us:
-        text = text.replace("host_turn_us = 1000.0\n", "", 1)
-    changes = (("10_000.0\n", f"{peak_hz!r}\n"), ("levels = 65_536", f"levels = {bundle.levels}"))
-    for old, new in (*changes, ("[timing]\n", f"[timing]\n{lines}")):
-        text = text.replace(old, new, 1)
+    text = load_profile("ideal").text.replace("10_000.0\n", f"{peak_hz!r}\n", 1)
+    text = text.replace("levels = 65_536", f"levels = {bundle.levels}", 1)
     path.write_text(text)
     return parse_profile(text, str(path))
 

@@ -1,4 +1,4 @@
-"""What every benchmark shares: its options, timing, the facts of the machine, the mark of the best trade-offs, table and plot.
+"""What every benchmark shares: its options, timing, the facts of the machine and the table.
 
 Throughput is in CPU time of the measuring thread, which a busy machine changes little; latencies are in wall time, with the load beside
 them. A row is a dict with a `name`; speed and error stand in the same row.
@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime import SHIPPED
-from pans.runtime.outputs import whole_file
-from pans.runtime.report.figures import pyplot
 
 Row = dict[str, Any]
 REPEATS = 7
@@ -35,7 +33,6 @@ class BenchOptions:
     bundles: tuple[Path, ...] = ()
     inputs: tuple[Path, ...] = ()
     seconds: float = 5.0
-    frames: int = 0
     load: bool = False
     quick: bool = False
 
@@ -65,36 +62,10 @@ def cpu_time(work: Callable[[], Any], repeats: int = REPEATS) -> Spent:
     return Spent(min(times), median(times), repeats)
 
 
-def cpu_times(works: Sequence[Callable[[], Any]], repeats: int = REPEATS) -> list[Spent]:
-    """As `cpu_time` for several works in turn, so that what else the machine does meets them alike: for ratios."""
-    times: list[list[float]] = [[] for _ in works]
-    for round_ in range(repeats + 1):
-        for work, taken in zip(works, times):
-            start = time.thread_time_ns()
-            work()
-            if round_:
-                taken.append((time.thread_time_ns() - start) / 1e9)
-    return [Spent(min(taken), median(taken), repeats) for taken in times]
-
-
-def repeated(work: Callable[[], Any], times: int) -> Callable[[], None]:
-    """Return a call that does `work` `times` times."""
-
-    def loop() -> None:
-        for _ in range(times):
-            work()
-
-    return loop
-
-
 def per_item_ns(spent: Spent, n: int) -> Row:
     """The figures of `n` items in ns each, with the number of runs."""
-    return {
-        "ns": round(spent.least_s / n * 1e9, 3),
-        "ns_median": round(spent.median_s / n * 1e9, 3),
-        "runs": spent.runs,
-        "n": n,
-    }
+    least, middle = (round(seconds / n * 1e9, 3) for seconds in (spent.least_s, spent.median_s))
+    return {"ns": least, "ns_median": middle, "runs": spent.runs, "n": n}
 
 
 def latencies_us(call: Callable[[Any], Any], inputs: Sequence[Any]) -> Row:
@@ -120,7 +91,12 @@ def copy_ns(n_bytes: int) -> float:
     source = np.random.default_rng(0).integers(0, 256, n_bytes, dtype=np.uint8)
     target = np.empty_like(source)
     inner = max(1, (1 << 26) // n_bytes)
-    return cpu_time(repeated(lambda: np.copyto(target, source), inner)).least_s / inner * 1e9
+
+    def copies() -> None:
+        for _ in range(inner):
+            np.copyto(target, source)
+
+    return cpu_time(copies).least_s / inner * 1e9
 
 
 def machine_facts() -> Row:
@@ -149,51 +125,16 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
 
 
-def mark_pareto(rows: list[Row], speed: str, error: str) -> None:
-    """Set `pareto` on rows that no other row beats in both figures (smaller is better); rows without either are left out."""
-    known = [row for row in rows if isinstance(row.get(speed), int | float) and isinstance(row.get(error), int | float)]
-    for row in known:
-        beaten = any(
-            other[speed] <= row[speed]
-            and other[error] <= row[error]
-            and (other[speed], other[error]) != (row[speed], row[error])
-            for other in known
-        )
-        row["pareto"] = not beaten
-
-
-def write_plot(rows: list[Row], path: Path, *, force: bool = False) -> None:
-    """Draw speed against error of the rows that have both (`ns`, `score_error`), and plain speed of the others."""
-    plt = pyplot("--plot")
-    points = [row for row in rows if "ns" in row and "score_error" in row]
-    others = [row for row in rows if "rate" in row]
-    figure, axes = plt.subplots(1, 2, figsize=(14, 6), layout="constrained")
-    for row in points:
-        kind = "o" if row.get("pareto") else "x"
-        axes[0].loglog(row["ns"], max(row["score_error"], 1e-9), kind)
-        axes[0].annotate(row["name"], (row["ns"], max(row["score_error"], 1e-9)), fontsize=7)
-    axes[0].set(xlabel="ns per decision", ylabel="largest score error against float64 (below 1e-9 drawn there)")
-    axes[1].barh([row["name"] for row in others], [row["rate"] for row in others])
-    axes[1].set(xscale="log", xlabel="items per second")
-    axes[1].tick_params(labelsize=7)
-    with whole_file(path, force=force) as beside:
-        figure.savefig(beside, dpi=120, format=path.suffix[1:] or "png")
-    plt.close(figure)
-
-
 def table_text(rows: list[Row]) -> str:
     """Rows for people: one line each, figures as they are."""
     width = max((len(str(row["name"])) for row in rows), default=0)
-    lines = []
-    for row in rows:
-        figures = "  ".join(f"{key} {_short(value)}" for key, value in row.items() if key not in ("name", "bench"))
-        lines.append(f"{row['name']:<{width}}  {figures}")
-    return "\n".join(lines)
+    figures = (
+        "  ".join(f"{key} {_short(value)}" for key, value in row.items() if key not in ("name", "bench"))
+        for row in rows
+    )
+    return "\n".join(f"{row['name']:<{width}}  {text}" for row, text in zip(rows, figures))
 
 
 def _short(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, int) and not isinstance(value, bool) and value >= 100_000:
-        return f"{value:.3e}"
-    return str(value)
+    is_large = type(value) is int and value >= 100_000
+    return f"{value:.3e}" if is_large else f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -128,20 +128,18 @@ def parallel_plan(n_patterns: int, shots: int) -> Plan:
     return Plan("parallel", n_patterns, np.arange(n) * TICKS, pattern, shot, *times)
 
 
-def parallel_visits(plan: Plan, first_visit: int, n_visits: int, first_seq: int) -> Iterator[bytes]:
+def parallel_visits(plan: Plan, n_visits: int) -> Iterator[bytes]:
     """Yield the frames of consecutive visits, each with its mark; clicks with fixed probabilities."""
-    rng = np.random.default_rng(first_visit)
-    seq, slots = first_seq, plan.slots_per_cycle
+    rng, seq, slots = np.random.default_rng(0), 0, plan.slots_per_cycle
     rate = np.where(plan.slot_pattern == DARK_PATTERN, DARK_CLICK, PARALLEL_CLICK)[:, None]
-    for visit in range(first_visit, first_visit + n_visits):
-        number, start = visit & 0xFFFFFFF, visit * slots
-        yield encode_mark(Mark(seq & 0xFFFFFFFF, number, visit % 10, start, visit * plan.cycle_ticks, 3.0), SESSION)
+    for visit in range(n_visits):
+        start = visit * slots
+        yield encode_mark(Mark(seq, visit, visit % 10, start, visit * plan.cycle_ticks, 3.0), SESSION)
         words = packed_words(rng.random((slots, plan.n_patterns)) < rate)
-        for exposure in range(start, start + slots, BLOCK_FRAMES):
+        for slot in range(0, slots, BLOCK_FRAMES):
             seq += 1
-            part = words[exposure - start : exposure - start + BLOCK_FRAMES]
-            facts = (seq & 0xFFFFFFFF, 0, TICKS * exposure, exposure, TICKS, number)
-            yield encode_frames(FrameBlock(*facts, part), SESSION)
+            facts = (seq, 0, TICKS * (start + slot), start + slot, TICKS, visit)
+            yield encode_frames(FrameBlock(*facts, words[slot : slot + BLOCK_FRAMES]), SESSION)
         seq += 1
 
 

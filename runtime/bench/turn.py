@@ -37,25 +37,9 @@ from pans.runtime.wire.framing import FrameDecoder, unpack_body
 from pans.runtime.wire.messages import Ack, ClickBlock, Opcode, encode_ack, encode_clicks, encode_command
 from pans.runtime.wire.schema import SCHEMA
 
+from . import streams
 from .rows import BenchOptions, Row, cpu_time, per_item_ns, percentiles_us
-from .streams import (
-    FLOW_BLOCK,
-    FLOW_DARK,
-    SESSION,
-    Rows,
-    decided_in_stream,
-    decided_one_by_one,
-    flow_blocks,
-    flow_plan,
-    host_driven,
-    made_automaton,
-    parallel_plan,
-    parallel_visits,
-    percent_changed,
-    reads_of,
-    sequential_plan,
-    visits,
-)
+from .streams import Rows
 
 NS_PER_S = WAIT_NS = 1_000_000_000
 PATIENCE_S = 20.0
@@ -70,7 +54,7 @@ def bench_turn(options: BenchOptions) -> list[Row]:
     if why := offered():
         return [{"name": "turn", "skipped": why}]
     bundle, _ = load_bundle(options.first_bundle)
-    rows = [block_row(made_automaton(), options.quick)]
+    rows = [block_row(streams.made_automaton(), options.quick)]
     if bundle.table is None:
         rows.append({"name": f"work per parallel frame, {bundle.name}", "skipped": "the bundle has no table"})
     else:
@@ -86,9 +70,9 @@ def bench_link(options: BenchOptions) -> list[Row]:
         device = built_device(Path(folder))
         if isinstance(device, str):
             return [{"name": "command to click block, decided and recorded", "skipped": device}]
-        bundle = made_automaton()
+        bundle = streams.made_automaton()
         decider = make_decider(bundle)
-        plan, n = host_driven(sequential_plan(bundle, decider)), 1000 if options.quick else 10_000
+        plan, n = streams.host_driven(streams.sequential_plan(bundle, decider)), 1000 if options.quick else 10_000
         return [trip_row(Trips(kind, plan, decider, device, n)) for kind in KINDS]
 
 
@@ -108,44 +92,48 @@ def built_device(folder: Path) -> Path | str:
 def block_row(bundle: Bundle, quick: bool) -> Row:
     """Return the row of a walk driven by the host, a mark and a block for each exposure."""
     decider = make_decider(bundle)
-    plan = host_driven(sequential_plan(bundle, decider))
-    frames = list(visits(plan, 100 if quick else 600))
-    core, name = StreamCore(plan, decider, 1, 0, SESSION), f"work per block of one exposure, {bundle.name}"
-    return _work_row(name, core, frames, len(frames), decided_one_by_one(plan, decider, frames))
+    plan = streams.host_driven(streams.sequential_plan(bundle, decider))
+    frames = list(streams.visits(plan, 100 if quick else 600))
+    core, name = StreamCore(plan, decider, 1, 0, streams.SESSION), f"work per block of one exposure, {bundle.name}"
+    return _work_row(name, core, frames, len(frames), streams.decided_one_by_one(plan, decider, frames))
 
 
 def frame_row(bundle: Bundle, quick: bool) -> Row:
     """Return the row of parallel frames, which a table decides."""
-    decider, plan = make_decider(bundle, backend="table"), parallel_plan(bundle.n_features, 1)
+    decider, plan = make_decider(bundle, backend="table"), streams.parallel_plan(bundle.n_features, 1)
     n_visits = 20 if quick else 120
-    frames = list(parallel_visits(plan, 0, n_visits, 0))
+    frames = list(streams.parallel_visits(plan, n_visits))
     few = frames[: 4 * len(frames) // n_visits]
-    core, name = StreamCore(plan, decider, 1, 0, SESSION), f"work per parallel frame, {bundle.name}, K = 1"
-    return _work_row(name, core, frames, n_visits * plan.slots_per_cycle, decided_one_by_one(plan, decider, few))
+    core, name = StreamCore(plan, decider, 1, 0, streams.SESSION), f"work per parallel frame, {bundle.name}, K = 1"
+    return _work_row(
+        name, core, frames, n_visits * plan.slots_per_cycle, streams.decided_one_by_one(plan, decider, few)
+    )
 
 
 def _work_row(name: str, core: StreamCore, frames: list[bytes], n: int, wanted: Rows) -> Row:
     """The work of all `frames`, which hold `n` items; the first decisions are compared with `wanted`."""
-    reads, found = reads_of(b"".join(frames), READ_BYTES), list[Rows]()
-    decided_in_stream(core, reads, found)
-    changed = percent_changed([np.concatenate(found)[: len(wanted)]], wanted)
-    return {"name": name, "changed_percent": changed} | per_item_ns(cpu_time(lambda: decided_in_stream(core, reads)), n)
+    reads, found = streams.reads_of(b"".join(frames), READ_BYTES), list[Rows]()
+    streams.decided_in_stream(core, reads, found)
+    changed = streams.percent_changed([np.concatenate(found)[: len(wanted)]], wanted)
+    return {"name": name, "changed_percent": changed} | per_item_ns(
+        cpu_time(lambda: streams.decided_in_stream(core, reads)), n
+    )
 
 
 def flow_row(bundle: Bundle, quick: bool) -> Row:
     """Return the row of objects in flow, from bytes to decisions with their passages."""
-    plan, n = flow_plan(bundle.n_features), 400 if quick else 4000
-    blocks = list(flow_blocks(bundle.n_features, n))
+    plan, n = streams.flow_plan(bundle.n_features), 400 if quick else 4000
+    blocks = list(streams.flow_blocks(bundle.n_features, n))
     reads = [b"".join(blocks[first : first + FLOW_READ_BLOCKS]) for first in range(0, n, FLOW_READ_BLOCKS)]
     core, plain, decoder = _flow_core(bundle, plan), _flow_core(bundle, plan), FrameDecoder()
     plain.begin(0, 0)
     wanted = np.array([one for data in reads for frame in decoder.feed(data) for one in plain.step(frame).decisions],
                       DECISION_DTYPE)  # fmt: skip
-    turn = Kernel(core.steps(SESSION), FrameDecoder())
+    turn = Kernel(core.steps(streams.SESSION), FrameDecoder())
 
     def compiled() -> Rows:
         core.begin(0, 0)
-        core.steps(SESSION)
+        core.steps(streams.SESSION)
         rows = [wanted[:0]]
         for data in reads:
             ended = turn.feed([(1, data)])
@@ -156,14 +144,14 @@ def flow_row(bundle: Bundle, quick: bool) -> Row:
         return np.concatenate(rows)
 
     found = compiled()
-    row: Row = {"name": f"work per block of {FLOW_BLOCK} frames in flow, {bundle.name}"}
-    row |= {"changed_percent": percent_changed([found], wanted), **per_item_ns(cpu_time(compiled), n)}
-    return row | {"decisions": len(wanted), "ns_per_frame": round(row["ns"] / FLOW_BLOCK, 3)}
+    row: Row = {"name": f"work per block of {streams.FLOW_BLOCK} frames in flow, {bundle.name}"}
+    row |= {"changed_percent": streams.percent_changed([found], wanted), **per_item_ns(cpu_time(compiled), n)}
+    return row | {"decisions": len(wanted), "ns_per_frame": round(row["ns"] / streams.FLOW_BLOCK, 3)}
 
 
 def _flow_core(bundle: Bundle, plan: Plan) -> FlowCore:
     settings, decider = FlowSettings("cells", fields_per_s=10_000.0), make_decider(bundle, backend="table")
-    core = make_flow_core(plan, decider, settings, bundle.classes, shots=1, dark_probability=FLOW_DARK)
+    core = make_flow_core(plan, decider, settings, bundle.classes, shots=1, dark_probability=streams.FLOW_DARK)
     core.warm_up()
     return core
 
@@ -184,7 +172,7 @@ class Trips:
     @contextmanager
     def other_end(self, mode: int, n_in: int, n_out: int) -> Iterator[Link]:
         """Start the device in `mode` and yield a link to it."""
-        facts = (mode, SESSION, SCHEMA, n_in, n_out, self.plan.slots_per_cycle)
+        facts = (mode, streams.SESSION, SCHEMA, n_in, n_out, self.plan.slots_per_cycle)
         words = [str(self.device), "pty" if self.kind == "pty" else "tcp", *map(str, facts)]
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as child:
             assert child.stdout is not None
@@ -259,13 +247,13 @@ def _framed(trips: Trips) -> tuple[NDArray[np.int64], int, int, float]:
     core = Core(plan, decider, 1, 0)
     core.warm_up()
     core.begin(0, 0)
-    steps = core.steps(SESSION)
+    steps = core.steps(streams.SESSION)
     assert plan.automaton is not None
     driver = HostDriver(core, WalkPlace(plan, plan.automaton))
-    turn = Kernel(steps, FrameDecoder(), driver.arrays(SESSION))
+    turn = Kernel(steps, FrameDecoder(), driver.arrays(streams.SESSION))
     turn.warm_up()
     control = turn.control
-    first = encode_command(1, Opcode.SHOW, driver.body(0, 0), SESSION)
+    first = encode_command(1, Opcode.SHOW, driver.body(0, 0), streams.SESSION)
     control[ring.DRIVES], control[ring.NEXT_ID], control[ring.OLDEST_ID] = 1, 2, 1
     control[ring.SENT_EXPOSURE], control[ring.SENT_STATE] = 0, 0
     times, bodies, rows = list[NDArray[np.int64]](), list[bytes](), list[Rows]()
@@ -279,10 +267,10 @@ def _framed(trips: Trips) -> tuple[NDArray[np.int64], int, int, float]:
     again = Core(plan, decider, 1, 0)
     again.begin(0, 0)
     wanted = [one for body in bodies for one in again.step(unpack_body(body)).decisions]
-    wrong = percent_changed(rows, np.array(wanted, DECISION_DTYPE))
+    wrong = streams.percent_changed(rows, np.array(wanted, DECISION_DTYPE))
     all_times = np.concatenate(times)
     one = ClickBlock(1, 0, 100, 1, 100, 0, np.zeros(1, np.uint16), np.zeros(1, np.uint8))
-    answer = len(encode_ack(Ack(1, 0, 0, ""), SESSION)) + len(encode_clicks(one, SESSION))
+    answer = len(encode_ack(Ack(1, 0, 0, ""), streams.SESSION)) + len(encode_clicks(one, streams.SESSION))
     return all_times[len(all_times) // 10 :], len(first), answer, wrong
 
 

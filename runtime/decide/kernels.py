@@ -8,32 +8,15 @@ the error below the bound that any order has. NaN and infinity keep their meanin
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from pans.runtime.wire.inner import inner, outer
 
 STEP = 8  # rows of the first matrix taken at once
 _U = np.uint64  # unsigned indices: a signed one is tested for being negative, and then nothing is vectorised
 LANES = 16  # hidden widths are padded to it: one vector of float32 or int32 at most
-
-
-@outer
-def label_words(labels: NDArray[Any], words: NDArray[Any], out: NDArray[Any]) -> int:
-    """Write labels[words[i]] to out[i]; return -1, or the first i whose word is beyond the table (the rest is untouched).
-
-    labels (2**d_f,) and out (n,) share uint8 or uint16; words (n,) is uint16, uint32 or uint64.
-    """
-    size = np.uint64(labels.size)
-    for i in range(words.size):
-        word = np.uint64(words[i])
-        if word >= size:
-            return i
-        out[i] = labels[word]
-    return -1
 
 
 # A chain of layers is two arrays. `meta` int64: number of layers L, then L + 1 sizes (d_f, then padded widths), then L flags

@@ -51,20 +51,6 @@ class TableDecider:
         row = int(counts @ self.radix)
         return Verdict(int(self.labels[row]), float(self.probabilities[row]))
 
-    def decide_words(self, words: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return the labels (n,), dtype of `labels`, of uint16, uint32 or uint64 click words (n,), written to `out` if given."""
-        if words.dtype not in (np.uint16, np.uint32, np.uint64) or words.ndim != 1:
-            raise ValueError(f"click words are {words.dtype} {words.shape}, allowed: uint16, uint32 or uint64 (n,)")
-        result = np.empty(len(words), dtype=self.labels.dtype) if out is None else out
-        if result.shape != words.shape or result.dtype != self.labels.dtype:
-            raise ValueError(f"out is {result.dtype} {result.shape}, allowed: {self.labels.dtype} {words.shape}")
-        from .kernels import label_words  # numba is loaded only for those who have words in bulk
-
-        bad = label_words(self.labels, words, result)
-        if bad >= 0:
-            raise ValueError(f"click word {int(words[bad])} at {bad}, allowed: below {len(self.labels)}")
-        return result
-
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
         """Return the table's rows, float32 (n, classes), for click counts (n, d_f)."""
         return self.scores[self._rows(counts, shots)]

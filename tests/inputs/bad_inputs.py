@@ -78,7 +78,7 @@ READS = {
     "task": "npz", "--scene": "npz", "--optics": "pans", "--patterns": "npy", "--table": "npy", "--head": "onnx", "--faults": "toml",
 }  # fmt: skip
 WRITES = {
-    "--out": "", "--record": "pansrec", "--trace": "txt", "--state": "json", "--pictures": "npz", "--plot": "png", "--storage": "log",
+    "--out": "", "--record": "pansrec", "--trace": "txt", "--state": "json", "--pictures": "npz", "--storage": "log",
 }  # fmt: skip
 FOLDERS = {
     *(("demo", "--out"), ("run", "--out"), ("export", "--out"), ("reproduce", "--out"), ("evaluate", "--pictures")),

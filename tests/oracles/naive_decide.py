@@ -28,15 +28,6 @@ def winner(scores: Sequence[float]) -> tuple[int, float]:
     return best, 1.0 / math.fsum(math.exp(score - scores[best]) for score in scores)
 
 
-def label_words(labels: Sequence[int], words: Sequence[int], out: list[int]) -> int:
-    """The kernel of the same name."""
-    for position, word in enumerate(words):
-        if word >= len(labels):
-            return position
-        out[position] = labels[word]
-    return -1
-
-
 def affine_scores(
     counts: Sequence[int], shots: int, weights: Sequence[Sequence[float]], bias: Sequence[float]
 ) -> list[float]:

@@ -11,15 +11,7 @@ from automata import automaton_bundle, random_automaton
 from heads import head_bundle, random_layers
 
 from pans.runtime.bench import decide, ingest, streams, turn
-from pans.runtime.bench.rows import (
-    BenchOptions,
-    Spent,
-    machine_facts,
-    mark_pareto,
-    percentiles_us,
-    repeated,
-    table_text,
-)
+from pans.runtime.bench.rows import BenchOptions, Spent, machine_facts, percentiles_us, table_text
 from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
@@ -32,22 +24,9 @@ from pans.runtime.wire.framing import FrameDecoder
 compiled = pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
 
 
-def test_the_best_trade_offs_are_marked() -> None:
-    rows = [
-        {"name": str(i), "ns": ns, "score_error": e}
-        for i, (ns, e) in enumerate([(1, 3), (2, 1), (2, 2), (3, 1), (1, 3)])
-    ]
-    rows.append({"name": "limit", "ns": 0})
-    mark_pareto(rows, "ns", "score_error")
-    assert [row.get("pareto") for row in rows] == [True, True, False, False, True, None]
-
-
 def test_figures_are_of_the_calls_and_read_as_text() -> None:
     found = percentiles_us(np.arange(1, 100_001) * 1000)
     assert (found["p50_us"], found["p999_us"], found["max_us"], found["calls"]) == (50_000.5, 99_900.001, 1e5, 100_000)
-    calls: list[int] = []
-    repeated(lambda: calls.append(1), 5)()
-    assert len(calls) == 5
     assert table_text([{"name": "a", "bench": "x", "ns": 1.23456, "n": 3_000_000}]) == "a  ns 1.235  n 3.000e+06"
     assert json.loads(json.dumps(machine_facts()))["cores"]
 
@@ -61,7 +40,6 @@ def test_every_back_end_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch
     assert rows["chain table"]["changed_percent"] == rows["chain sparse"]["changed_percent"] == 0
     assert 0 < rows["chain int8"]["score_error"] < 0.2
     assert rows["chain float64"]["score_error"] < 1e-5
-    assert any(row.get("pareto") for row in rows.values())
 
 
 def test_rows_of_walks_have_their_checks() -> None:
@@ -93,15 +71,10 @@ def test_parallel_visits_continue_the_stream(monkeypatch: pytest.MonkeyPatch, sh
     monkeypatch.setattr(streams, "VISIT_FRAMES", 12)
     monkeypatch.setattr(streams, "BLOCK_FRAMES", 5)
     plan = streams.parallel_plan(4, shots)
-    decider = make_decider(
-        head_bundle(random_layers([4, 5, 3])), shots=shots, backend="table" if shots == 1 else "sparse"
-    )
+    bundle = head_bundle(random_layers([4, 5, 3]))
+    decider = make_decider(bundle, shots=shots, backend="table" if shots == 1 else "sparse")
     core = StreamCore(plan, decider, shots, 0, streams.SESSION)
-    messages = 1 + -(-plan.slots_per_cycle // 5)
-    rows = 0
-    for visit in (0, 2, 4):
-        data = b"".join(streams.parallel_visits(plan, visit, 2, visit * messages))
-        rows += sum(len(batch.rows) for batch in core.feed(data))
+    rows = sum(len(batch.rows) for batch in core.feed(b"".join(streams.parallel_visits(plan, 6))))
     counters = core.core.tracker.counters
     assert (rows, counters.exposures, counters.lost_exposures, counters.lost_messages) == (72 // shots, 84, 0, 0)
 
@@ -133,19 +106,16 @@ def test_round_trips_are_decided_as_by_the_plain_core(
 
 
 def test_the_command_prints_one_object(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from pans.runtime.commands import bench as command
-
-    seen: list[BenchOptions] = []
-
     def bench(options: BenchOptions) -> list[dict[str, object]]:
-        seen.append(options)
-        return [{"name": "a", "ns": np.float32(2)}]
+        return [{"name": "a", "ns": np.float32(2), "quick": options.quick}]
 
-    monkeypatch.setattr(command, "_find", lambda name: bench if name != "link" else None)
-    assert main(["bench", "all", "--json", "--quick", "--frames", "7"]) == 0
+    monkeypatch.setattr("pans.runtime.commands.bench.load_offered", lambda point: bench)
+    assert main(["bench", "all", "--json", "--quick"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert [row["bench"] for row in found["rows"]] == ["decide", "loop", "ingest", "turn"]
-    assert (seen[0].quick, seen[0].frames) == (True, 7)
+    assert [(row["bench"], row["quick"]) for row in found["rows"]] == [
+        (name, True) for name in ("decide", "link", "loop", "ingest", "turn")
+    ]
     assert "processor" in found["machine"]
+    assert main(["bench", "turn", "--load"]) == 2
     with pytest.raises(SystemExit, match="2"):
         main(["bench", "loop", "--seconds", "0"])

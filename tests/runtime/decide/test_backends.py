@@ -16,9 +16,7 @@ from heads import affine_head
 
 from pans.runtime.bundle.model import Bundle, word_means
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.decide.kernels import label_words
 from pans.runtime.decide.onnx import OnnxDecider
-from pans.runtime.decide.table import word_table
 from pans.runtime.decide.verdict import choice_of, softmax_winner
 from pans.runtime.errors import DamagedFileError, UsageError
 
@@ -111,33 +109,6 @@ def test_the_winning_probability_is_stable(scores: list[float]) -> None:
 @pytest.mark.parametrize("score", [np.nan, np.inf])
 def test_scores_that_are_not_finite_have_no_probability(score: float) -> None:
     assert softmax_winner(np.array([0.0, score], dtype=np.float32)).probability == 0.0
-
-
-@pytest.mark.parametrize("classes", [3, 300])
-def test_words_in_bulk(classes: int) -> None:
-    rng = np.random.default_rng(9)
-    table = rng.normal(size=(64, classes)).astype(np.float32)
-    decider = word_table(made_bundle(6, classes, table=table))
-    for dtype in (np.uint32, np.uint64):
-        words = rng.integers(0, 64, size=500).astype(dtype)
-        out = np.empty(500, dtype=decider.labels.dtype)
-        assert decider.decide_words(words, out) is out
-        assert out.tolist() == [naive.winner(table[int(word)].tolist())[0] for word in words]
-        words[17] = 64
-        with pytest.raises(ValueError, match="click word 64 at 17, allowed: below 64"):
-            decider.decide_words(words)
-
-
-@pytest.mark.uncompiled
-@pytest.mark.parametrize("label_dtype", [np.uint8, np.uint16])
-def test_the_kernel_as_its_oracle(label_dtype: Any) -> None:
-    rng = np.random.default_rng(2)
-    labels = rng.integers(0, 250, size=32).astype(label_dtype)
-    for highest in (32, 40, 1 << 63):
-        words = rng.integers(0, highest, size=50).astype(np.uint64)
-        out, wanted = np.zeros(50, dtype=label_dtype), [0] * 50
-        assert label_words(labels, words, out) == naive.label_words(labels.tolist(), words.tolist(), wanted)
-        assert out.tolist() == wanted
 
 
 def test_the_table_refuses_what_it_cannot_answer() -> None:
