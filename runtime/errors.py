@@ -1,14 +1,4 @@
-"""The one exception tree. Each class knows the exit code that the command line returns for it.
-
-    PansError                 2   anything this project raises on purpose
-    ├── UsageError            2   a command or an argument that makes no sense
-    ├── ConfigError           2   a profile, calibration, scene or plan file that says something impossible
-    ├── PlanError             2   what is asked for cannot be done by this hardware (the numbers are in the message)
-    ├── DamagedFileError      2   a bundle or recording that is truncated, altered or inconsistent
-    ├── LinkError             3   the device cannot be reached, or went away
-    │   └── DeviceError       3   the device answered, and refused
-    ├── RecordingError        2   the recording cannot be written any further: the run ends, what was written is readable
-    └── TimingError           4   the timing contract was broken, so that results could no longer be trusted
+"""The one exception tree; each class knows the exit code that the command line returns for it: 2, or 3 of devices and links.
 
 A message says what, found, allowed and where; `remedy` is the next step. Damaged bytes, lost frames and late deadlines are
 measurements, not exceptions: they are counted, flagged and reported. Exceptions are raised only when results could no longer be trusted.
@@ -76,16 +66,9 @@ class DeviceError(LinkError):
     """The device answered, and refused."""
 
 
-class TimingError(PansError):
-    """The timing contract was broken, so that results could no longer be trusted."""
-
-    exit_code = 4
-    usual_remedy = "`pans doctor` checks this machine's timing"
-
-
 @contextmanager
 def as_usage_error() -> Iterator[None]:
-    """Kernel a ValueError of numeric code into a UsageError of the same words, where what a user gave is at fault.
+    """Turn a ValueError of numeric code into a UsageError of the same words, where what a user gave is at fault.
 
     >>> with as_usage_error():
     ...     raise ValueError("levels is 1, allowed: 2 to 65536")

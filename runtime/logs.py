@@ -15,7 +15,7 @@ import queue
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -55,15 +55,14 @@ def add_log_options(group: argparse._ActionsContainer) -> None:
 def logging_of(args: argparse.Namespace) -> Iterator[None]:
     """Log to the file that the options name until the block ends; UsageError for a file that is no log of ours."""
     path: Path | None = args.log_file
-    if path is None:
-        for option in ("log_format", "log_rotate_mb"):
-            if getattr(args, option) is not None:
-                name = option.replace("_", "-")
-                raise UsageError(f"--{name} has no effect without a log file", remedy="name one with --log-file")
+    for option in ("log_format", "log_rotate_mb"):
+        if path is None and getattr(args, option) is not None:
+            what = f"--{option.replace('_', '-')} has no effect without a log file"
+            raise UsageError(what, remedy="name one with --log-file")
     handlers: list[_FileHandler | _JournalHandler] = [_JournalHandler()] if _is_journal() else []
     if path is not None:
-        lines = _JsonLine() if args.log_format == "json" else _TextLine()
-        handlers.append(_FileHandler(path, lines, args.log_rotate_mb))
+        lines = _json_line if args.log_format == "json" else _text_line
+        handlers.append(_FileHandler(path, _Lines(lines), args.log_rotate_mb))
     if not handlers:
         yield
         return
@@ -122,34 +121,34 @@ def _time_of(record: logging.LogRecord) -> str:
 
 def _message(record: logging.LogRecord) -> str:
     facts = getattr(record, "facts", {})
-    return record.getMessage() + "".join(f" {key}={_plain(value)}" for key, value in facts.items())
+    return record.getMessage() + "".join(f" {key}={plain(value)}" for key, value in facts.items())
 
 
-class _TextLine(logging.Formatter):
+def _text_line(record: logging.LogRecord) -> str:
+    return one_line(f"{_time_of(record)} {record.levelname} {_message(record)}", LINE_MAX)
+
+
+def _journal_line(record: logging.LogRecord) -> str:  # the journal adds the time itself
+    return stderr_line(one_line(f"pans: {_message(record)}", LINE_MAX), record.levelno)
+
+
+def _json_line(record: logging.LogRecord) -> str:
+    line = {"time": _time_of(record), "level": record.levelname, "message": record.getMessage()[:LINE_MAX]}
+    facts = getattr(record, "facts", {})
+    return json.dumps({**line, "facts": facts} if facts else line, default=plain)
+
+
+class _Lines(logging.Formatter):
+    def __init__(self, line_of: Callable[[logging.LogRecord], str]) -> None:
+        super().__init__()
+        self._line_of = line_of
+
     def format(self, record: logging.LogRecord) -> str:
-        return one_line(f"{_time_of(record)} {record.levelname} {_message(record)}", LINE_MAX)
+        return self._line_of(record)
 
 
-class _EventLine(logging.Formatter):
-    """The journal adds the time itself."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return stderr_line(one_line(f"pans: {_message(record)}", LINE_MAX), record.levelno)
-
-
-class _JsonLine(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        line: dict[str, Any] = {
-            "time": _time_of(record),
-            "level": record.levelname,
-            "message": record.getMessage()[:LINE_MAX],
-        }
-        if facts := getattr(record, "facts", {}):
-            line["facts"] = facts
-        return json.dumps(line, default=_plain)
-
-
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return numpy's scalars and arrays as JSON has them, anything else as text: the `default` of json.dumps."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
@@ -161,14 +160,11 @@ class _BoundedQueue(logging.handlers.QueueHandler):
 
     lost = 0
 
-    def enqueue(self, record: logging.LogRecord) -> None:
-        try:
-            self.queue.put_nowait(record)
-        except queue.Full:
-            self.lost += 1
-
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
         return record  # it stays in this process
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        self.lost += 1
 
 
 class _Listener(logging.handlers.QueueListener):
@@ -189,11 +185,10 @@ class _KindLimit(logging.Filter):
         facts = getattr(record, "facts", None)
         if facts is None:
             return True
-        now_s = time.monotonic()
+        now_s, kind = time.monotonic(), record.msg
         if now_s - self._since_s > KIND_EVERY_S:
             self._since_s = now_s
             self._passed.clear()
-        kind = record.msg
         if self._passed[kind] >= KIND_MOST:
             self._left_out[kind] += 1
             return False
@@ -209,7 +204,7 @@ class _JournalHandler(logging.StreamHandler):  # type: ignore[type-arg]
     def __init__(self) -> None:
         super().__init__(sys.stderr)
         self.lost = 0
-        self.setFormatter(_EventLine())
+        self.setFormatter(_Lines(_journal_line))
         self.addFilter(lambda record: hasattr(record, "facts"))
 
     def handleError(self, record: logging.LogRecord) -> None:

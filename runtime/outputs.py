@@ -110,12 +110,17 @@ def _folder_of(path: Path, makes_folders: bool) -> Path:
 def _check_writable(folder: Path) -> None:
     """Make a file and remove it: permissions alone do not tell of read-only or full file systems."""
     probe = folder / f".pans-{secrets.token_hex(8)}.probe"
-    try:
+    with _refusing(f"{folder}: cannot be written to", "choose a folder that can be written to"):
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         os.unlink(probe)
+
+
+@contextmanager
+def _refusing(what: str, remedy: str) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
-        what = f"{folder}: cannot be written to: {error.strerror or error}"
-        raise UsageError(what, remedy="choose a folder that can be written to") from error
+        raise UsageError(f"{what}: {error.strerror or error}", remedy=remedy) from error
 
 
 # ---- creating ----
@@ -147,7 +152,7 @@ def whole_file(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     """Yield a name beside `path` to write to; what is there at the end is synced and becomes `path`, after an error nothing does."""
     target = Path(path)
     beside = beside_name(target)
-    try:
+    with _refusing(f"{target}: cannot be written", "make room on that disk, or choose another place"):
         try:
             yield beside
             _sync(beside, os.O_RDWR)  # Windows syncs only what is open for writing
@@ -155,14 +160,10 @@ def whole_file(path: str | Path, *, force: bool = False) -> Iterator[Path]:
                 os.replace(beside, target)
             else:
                 place_new(beside, target)
+        except FileExistsError as error:
+            raise refuse_existing(target) from error
         finally:
-            with suppress(OSError):
-                os.unlink(beside)
-    except FileExistsError as error:
-        raise refuse_existing(target) from error
-    except OSError as error:
-        what = f"{target}: cannot be written: {error.strerror or error}"
-        raise UsageError(what, remedy="make room on that disk, or choose another place") from error
+            beside.unlink(missing_ok=True)
     sync_folder(target.parent)
 
 
@@ -191,11 +192,8 @@ def place_new(beside: str | Path, target: str | Path) -> None:
 def make_folder(folder: Path) -> None:
     """Make `folder` and those above it where they are missing, so that they survive a power cut; UsageError if that fails."""
     made = [one for one in (folder, *folder.parents) if not one.exists()]
-    try:
+    with _refusing(f"{folder}: the folder cannot be made", "choose a place that can be written to"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        what = f"{folder}: the folder cannot be made: {error.strerror or error}"
-        raise UsageError(what, remedy="choose a place that can be written to") from error
     for one in reversed(made):
         sync_folder(one.parent)
 
@@ -221,21 +219,17 @@ def _sync(path: Path, mode: int) -> None:
 def new_run_folder(name: str, root: Path = RUNS) -> Path:
     """Make a folder of this minute's local time and `name` in `root`, as `pans-runs/2026-11-22T1412-fashion10`; `latest` points to it.
 
-    A second one of the same minute ends in `-2`. Whatever cannot stand in a file's name becomes `-`.
+    A second one of the same minute ends in `-2`; what cannot stand in a file's name becomes `-`. UsageError where none can be made.
     """
     make_folder(root)
+    _check_writable(root)
     plain = re.sub(r"[^A-Za-z0-9_.]+", "-", name)[:NAME_CHARACTERS].strip("-.") or "run"
     first = f"{datetime.now().strftime('%Y-%m-%dT%H%M')}-{plain}"
     for number in count(1):
         folder = root / (first if number == 1 else f"{first}-{number}")
-        try:
+        with suppress(FileExistsError):
             folder.mkdir()
             break
-        except FileExistsError:
-            continue
-        except OSError as error:
-            what = f"{folder}: the folder cannot be made: {error.strerror or error}"
-            raise UsageError(what, remedy="choose a place with --out") from error
     sync_folder(root)
     link, beside = root / LATEST, root / f".{LATEST}.{secrets.token_hex(4)}"
     if link.is_symlink() or not os.path.lexists(link):  # a file or folder of that name stays
@@ -249,8 +243,8 @@ def new_run_folder(name: str, root: Path = RUNS) -> Path:
 def locked(path: Path) -> Iterator[None]:
     """Hold the lock file `path` until the block ends; UsageError, which names the holder's process, if another run has it.
 
-    The kernel gives the lock back when a process dies; the file goes with the lock. On systems without flock nothing is held: there
-    exclusive creation alone keeps two runs apart.
+    The lock goes when its process dies, and the file goes with the lock. Systems without flock hold nothing: there exclusive creation
+    alone keeps two runs apart.
     """
     try:
         import fcntl
@@ -266,7 +260,7 @@ def locked(path: Path) -> Iterator[None]:
                 with suppress(FileNotFoundError):  # the holder before removed it between our two calls
                     if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
                         break
-            held.callback(_removed, path)
+            held.callback(path.unlink, missing_ok=True)
             file.truncate(0)
             file.write(f"{os.getpid()}\n".encode())
         except BlockingIOError as error:
@@ -276,8 +270,3 @@ def locked(path: Path) -> Iterator[None]:
         except OSError as error:
             raise UsageError(f"{path}: cannot be locked: {error.strerror or error}", remedy=remedy) from error
         yield
-
-
-def _removed(path: Path) -> None:
-    with suppress(OSError):
-        os.unlink(path)

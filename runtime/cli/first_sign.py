@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from .printing import has_said, say
+from .printing import say, state
 
 FIRST_AFTER_S = 0.35
 LOOK_EVERY_S = 0.05
@@ -35,8 +35,8 @@ def _look(text: str, ended: threading.Event) -> None:
     said, looked_s = False, 0.0
     while not (said and _listening) and looked_s < LOOK_FOR_S and not ended.wait(LOOK_EVERY_S):
         looked_s += LOOK_EVERY_S
-        if not said and (has_said() or looked_s >= FIRST_AFTER_S):
-            if not has_said():
+        if not said and (state.said or looked_s >= FIRST_AFTER_S):
+            if not state.said:
                 say(text)
             said = True
         if not _listening and "numba.core.dispatcher" in sys.modules:

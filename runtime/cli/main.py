@@ -20,7 +20,7 @@ from pans.runtime.logs import LOGGER, logging_of
 from .command import EXIT_FINE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_USAGE, Command, did_you_mean, parser_of
 from .finding import EXTRAS, find_commands, load_command, missing_extra, overview
 from .first_sign import first_sign
-from .printing import begin, fail, has_answered, note
+from .printing import begin, fail, note, state
 from .reading_bar import reading_bar
 
 _REMEDIES = {
@@ -66,10 +66,10 @@ def _main(words: list[str]) -> int:
         if "--debug" in words:
             raise
         known = _known(error)
-        if not has_answered() and isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+        if not state.answered and isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
             _silence()  # stdout itself is full: an error of a file names the file
         return fail(known, known.exit_code) if known is not None else fail(_internal(error), EXIT_INTERNAL)
-    if code == EXIT_INTERRUPTED and "--json" in words and not has_answered():
+    if code == EXIT_INTERRUPTED and "--json" in words and not state.answered:
         fail(PansError("interrupted"), code)
     return code
 

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from pans.runtime.errors import PansError
-from pans.runtime.logs import LOGGER, stderr_line
+from pans.runtime.logs import LOGGER, plain, stderr_line
 from pans.runtime.safe_text import lines, one_line
 
 _WHERE = re.compile(r"(?:argument (?P<option>[^:]{1,60})|(?P<place>[^\s:]{1,4096}(?::\d+)*)): ")
 
 
 @dataclass(slots=True)
-class _State:
-    """Of one call of `main`."""
+class State:
+    """What one call of `main` was asked for and has printed."""
 
     quiet: bool = False
     verbose: bool = False
@@ -30,43 +30,27 @@ class _State:
     command: str = ""
 
 
-_state = _State()
+state = State()
 
 
 def begin(words: list[str]) -> None:
     """Set what is printed from here on, by the command line's words."""
-    _state.quiet = bool({"-q", "--quiet"} & {*words})
-    _state.verbose = bool({"-v", "--verbose"} & {*words})
-    _state.as_json = "--json" in words
-    _state.said = _state.answered = False
-    _state.command = next((word for word in words if not word.startswith("-")), "")
-
-
-def is_quiet() -> bool:
-    """Return whether `--quiet` was given."""
-    return _state.quiet
-
-
-def has_said() -> bool:
-    """Return whether anything has been printed since `begin`."""
-    return _state.said
-
-
-def has_answered() -> bool:
-    """Return whether the answer has been printed since `begin`."""
-    return _state.answered
+    state.quiet, state.verbose = (bool(flags & {*words}) for flags in ({"-q", "--quiet"}, {"-v", "--verbose"}))
+    state.as_json = "--json" in words
+    state.said = state.answered = False
+    state.command = next((word for word in words if not word.startswith("-")), "")
 
 
 def say(text: str) -> None:
     """Print for people, on stderr: stdout belongs to the JSON object or the answer itself. Nothing with `--quiet`."""
     LOGGER.info("%s", text)
-    if not _state.quiet:
+    if not state.quiet:
         _print_error(text)
 
 
 def note(text: str) -> None:
     """Print for people who asked for more with `--verbose`."""
-    if _state.verbose:
+    if state.verbose:
         say(text)
 
 
@@ -79,18 +63,18 @@ def warn(text: str) -> None:
 def emit(args: argparse.Namespace, payload: Mapping[str, Any], text: str = "") -> None:
     """Print one JSON object when `--json` was given, else `text`; both on stdout."""
     if args.json:
-        _answer(json.dumps(payload, allow_nan=False, default=_plain))
+        _answer(json.dumps(payload, allow_nan=False, default=plain))
     elif text:
         _answer(lines(text))
 
 
 def fail(error: PansError, exit_code: int) -> int:
     """Print an error on stderr, with `--json` also as one object on stdout unless the answer is there; return `exit_code`."""
-    advice = error.remedy or error.usual_remedy.replace("COMMAND", one_line(_state.command, 20) or "COMMAND")
+    advice = error.remedy or error.usual_remedy.replace("COMMAND", one_line(state.command, 20) or "COMMAND")
     remedy = f"\n  remedy: {one_line(advice)}" if advice else ""
     # no line of a message can pass for one of ours
     _print_error(f"pans: {error.message}".replace("\n", "\n    ") + remedy, logging.ERROR)
-    if _state.as_json and not _state.answered:
+    if state.as_json and not state.answered:
         facts = {"message": error.message, "where": where_of(error), "remedy": advice, "exit": exit_code}
         _answer(json.dumps({"error": facts}))
     return exit_code
@@ -109,16 +93,10 @@ def where_of(error: PansError) -> str:
 
 
 def _answer(text: str) -> None:
-    _state.said = _state.answered = True
+    state.said = state.answered = True
     print(text, flush=True)
 
 
 def _print_error(text: str, level: int = logging.INFO) -> None:
-    _state.said = True
+    state.said = True
     print(stderr_line(lines(text), level), file=sys.stderr, flush=True)
-
-
-def _plain(value: Any) -> Any:
-    if hasattr(value, "tolist"):  # numpy scalars and arrays
-        return value.tolist()
-    return str(value)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from pans.runtime.container import watching_blocks
 
-from .printing import is_quiet
+from .printing import state
 
 if TYPE_CHECKING:  # a command that answers at once does not load it
     from rich.progress import Progress, TaskID
@@ -75,7 +75,7 @@ class ReadingBar:
 @contextmanager
 def reading_bar() -> Iterator[None]:
     """Show how far long files have been read within the block, where somebody looks."""
-    if is_quiet() or not sys.stderr.isatty():
+    if state.quiet or not sys.stderr.isatty():
         yield
         return
     bar = ReadingBar()
@@ -89,7 +89,7 @@ def reading_bar() -> Iterator[None]:
 @contextmanager
 def progress_bar(what: str, total: float, *, threaded: bool = True) -> Iterator[Callable[[float], None]]:
     """Yield a call that displays on a terminal how much of `total` is done; `threaded` draws in a thread of its own."""
-    if is_quiet() or not sys.stderr.isatty():
+    if state.quiet or not sys.stderr.isatty():
         yield lambda done: None
         return
     from rich.console import Console

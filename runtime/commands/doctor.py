@@ -1,7 +1,7 @@
 """`pans devices` and `pans doctor`: where instruments may be, and what in this machine helps or hurts; each finding with its remedy.
 
-No port is opened (that would reset some boards) and nothing is changed. Each check yields `Finding`s; a check that itself fails is a
-finding too. `needed` tells what stops a run from what only makes it slower.
+No port is opened (that would reset some boards) and nothing is changed. A check is a generator of `Finding`s; one that itself fails is a
+finding too.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
 from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import UsageError
 from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
+from pans.runtime.timing.realtime import first_line, isolated_cores
 
 if TYPE_CHECKING:
     from pans.runtime.timing.rehearsal import Rehearsal
@@ -42,7 +43,7 @@ AWAY_MS_PER_S, AWAY_US = 1.0, 200.0  # a fifth of the shortest deadline (1 ms)
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at; `remedy` is empty when nothing needs doing."""
+    """One thing that was looked at; `remedy` is empty when nothing needs doing. What is `needed` and missing stops a run."""
 
     check: str
     ok: bool
@@ -72,10 +73,9 @@ def serial_ports() -> list[PortState]:
 
     states = []
     for port in sorted(list_ports.comports(), key=lambda port: str(port.device)):
-        named = port.vid is not None
-        ids = f"{port.vid:04x}:{port.pid:04x}:{port.serial_number or ''}" if named else ""
+        ids = f"{port.vid:04x}:{port.pid:04x}:{port.serial_number or ''}" if port.vid is not None else ""
         state, remedy = port_state(str(port.device))
-        url = f"serial:{ids.rstrip(':')}" if named else f"serial:{port.device}"
+        url = f"serial:{ids.rstrip(':') or port.device}"
         states.append(PortState(url, "serial", f"{port.device}: {port.description}", ids, state, remedy))
     return states
 
@@ -165,14 +165,14 @@ def check_clock() -> Iterator[Finding]:
     """The clock is fine enough to time decisions."""
     readings = [time.perf_counter_ns() for _ in range(CLOCK_READS)]
     finest = min((after - before for before, after in itertools.pairwise(readings) if after > before), default=10**9)
-    source = _first_line("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "source unknown"
+    source = first_line(Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")) or "source unknown"
     ok = finest <= CLOCK_COARSE_NS
     remedy = "" if ok else "boot with clocksource=tsc; a virtual machine may hide it"
     yield Finding("clock resolution", ok, f"{finest} ns ({source})", remedy)
 
 
 # What a child process tries, each answer on a line: integers and floats in vectors, the golden scores of a shipped head, privileges.
-# An instruction that is announced and not granted ends the process, and what is locked must not stay so here.
+# A refused instruction ends the process, and what is locked must not stay so here.
 _TRIAL = """
 import numba, numpy
 @numba.njit
@@ -202,7 +202,7 @@ with locked_memory() as answer:
 
 
 def _tried(*names: str) -> dict[str, str]:
-    """Return what a child process answered for each name; how it ended, for those without an answer."""
+    """Return what a child process answered for each name; for those without an answer, how it ended."""
     try:
         done = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=TRIAL_PATIENCE_S)
         printed, reason = done.stdout, (done.stderr.strip().splitlines() or [""])[-1]
@@ -226,9 +226,8 @@ def check_processor() -> Iterator[Finding]:
     remedy = "export NUMBA_CPU_NAME=generic: kernels without the instructions that are refused here"
     yield Finding("numba's target", right, found, "" if right else remedy, needed=True)
     announced, right = ", ".join(onnxruntime.get_available_providers()), tried["onnxruntime"] == "right"
-    found = (
-        f"{onnxruntime.__version__}: announced {announced}; works {tried['onnxruntime']}; taken CPUExecutionProvider"
-    )
+    works = f"works {tried['onnxruntime']}; taken CPUExecutionProvider"
+    found = f"{onnxruntime.__version__}: announced {announced}; {works}"
     remedy = "pip install --force-reinstall onnxruntime; a bundle with a table decides without it"
     yield Finding("onnxruntime", right, found, "" if right else remedy, needed=True)
     if sys.platform == "win32":
@@ -236,13 +235,12 @@ def check_processor() -> Iterator[Finding]:
     import resource
 
     user = os.environ.get("USER", "$USER")
-    for check, name, key, line in (
-        ("SCHED_FIFO", "RLIMIT_RTPRIO", "sched_fifo", f"{user} - rtprio 20"),
-        ("locked memory", "RLIMIT_MEMLOCK", "mlockall", f"{user} - memlock unlimited"),
-    ):
-        limit = resource.getrlimit(getattr(resource, name))[0] if hasattr(resource, name) else None
+    settings = (("SCHED_FIFO", "RTPRIO", "sched_fifo", "20"), ("locked memory", "MEMLOCK", "mlockall", "unlimited"))
+    for check, name, key, wanted in settings:
+        number = getattr(resource, f"RLIMIT_{name}", None)
+        limit = resource.getrlimit(number)[0] if number is not None else None
         stated = "root" if os.geteuid() == 0 else "unlimited" if limit == resource.RLIM_INFINITY else f"limit {limit}"
-        ok, remedy = tried[key] == "granted", LIMITS.format(line=line)
+        ok, remedy = tried[key] == "granted", LIMITS.format(line=f"{user} - {name.lower()} {wanted}")
         if stated in ("root", "unlimited"):
             remedy += "; a container or virtual machine may refuse it all the same"
         taken = "asked for by each run" if ok else "runs go on without it"
@@ -251,7 +249,7 @@ def check_processor() -> Iterator[Finding]:
 
 def check_governor() -> Iterator[Finding]:
     """The processor does not slow down between decisions."""
-    governor = _first_line("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    governor = first_line(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"))
     ok = governor in ("", "performance")
     remedy = "" if ok else "for steadier latencies: sudo cpupower frequency-set -g performance"
     yield Finding("processor governor", ok, governor or "not offered by this system", remedy)
@@ -294,10 +292,8 @@ def check_others() -> Iterator[Finding]:
 
 
 Check = Callable[[], Iterator[Finding]]
-CHECKS: tuple[Check, ...] = (
-    *(check_python, check_numba, check_libusb, check_clock, check_processor, check_governor),
-    *(check_udev, check_ports, check_others),
-)
+LIBRARIES: tuple[Check, ...] = (check_python, check_numba, check_libusb, check_clock, check_processor)
+CHECKS = (*LIBRARIES, check_governor, check_udev, check_ports, check_others)
 
 
 def examine(checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
@@ -313,12 +309,6 @@ def examine(checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
         except Exception as error:
             findings.append(Finding(name, False, f"the check itself failed: {error!r}", "report this with its text"))
     return findings
-
-
-def _first_line(path: str) -> str:
-    from pans.runtime.timing.realtime import first_line
-
-    return first_line(Path(path))
 
 
 # -- what each real-time setting brings --------------------------------------------------------------------------------
@@ -345,14 +335,12 @@ COMPARED: tuple[tuple[str, str, str, float, dict[str, str]], ...] = (
 
 def settings_of(found: Rehearsal) -> list[dict[str, Any]]:
     """Return a row for each setting: what is in force, what was measured without and with it, and what to do."""
-    from pans.runtime.timing.realtime import isolated_cores
-
     isolated, cores = isolated_cores(), ", ".join(str(row["core"]) for row in found.cores) or "unknown"
     in_force = {
         "SCHED_FIFO": "granted" if found.fifo else "refused",
         "affinity": f"cores {cores} allowed",
         "core kept awake": "no: by --core N",
-        "C-states": _first_line("/sys/devices/system/cpu/cpuidle/current_driver") or "not told by this system",
+        "C-states": first_line(Path("/sys/devices/system/cpu/cpuidle/current_driver")) or "not told by this system",
     }
     rows = []
     for setting, before, after, q, do in COMPARED:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say, warn
 from pans.runtime.cli.option_fields import check_options, option_fields, refuse_without
-from pans.runtime.cli.printing import is_quiet
+from pans.runtime.cli.printing import state
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
 from pans.runtime.flow.settings import FlowSettings, read_flow, with_gate
 from pans.runtime.html_card import html_card
@@ -385,7 +385,7 @@ def _metrics_of(options: RunOptions) -> AbstractContextManager[MetricsServer | N
 def _monitor_of(options: RunOptions) -> Monitor:
     from pans.runtime.monitor import Monitor
 
-    panel = options.display and not is_quiet() and sys.stderr.isatty()
+    panel = options.display and not state.quiet and sys.stderr.isatty()
     return Monitor(panel=panel, address=options.serve, lines=options.display)
 
 
