@@ -24,7 +24,7 @@ FLOAT, INT64 = 1, 7  # TensorProto.DataType
 DTYPES = {FLOAT: "<f4", 2: "|u1", 3: "|i1", 6: "<i4", INT64: "<i8"}
 _STANDARD = ("", "ai.onnx")  # two names of the domain of the standard operators
 _CONTENT: dict[int, tuple[str, Any]] = {  # AttributeProto.AttributeType -> field, and what it is where it is left out
-    **{1: ("f", 0.0), 2: ("i", 0), 3: ("s", ""), 4: ("t", {"dims": []}), 6: ("floats", []), 7: ("ints", [])},
+    **{1: ("f", 0.0), 2: ("i", 0), 3: ("s", ""), 4: ("t", {"dims": []}), 6: ("floats", []), 7: ("ints", [])}
 }
 # message, then number:name:kind of its fields; * marks a list. Numbers alone are comments and metadata, which are read over.
 _FIELDS = {

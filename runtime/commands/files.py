@@ -325,10 +325,7 @@ INFO = Command(
     "show what a file holds",
     _configure_info,
     _info,
-    examples=(
-        "pans info fashion10",
-        "pans info pans-runs/latest/run.pansrec --json",
-    ),
+    examples=("pans info fashion10", "pans info pans-runs/latest/run.pansrec --json"),
 )
 BUNDLE = Command(
     "make a bundle from any trained model",

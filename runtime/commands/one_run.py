@@ -26,14 +26,7 @@ from pans.runtime.html_card import html_card
 from pans.runtime.instrument.calibration import MAX_AGE_H
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link
-from pans.runtime.live.continuous import (
-    DISK_NEARLY_FULL,
-    INTERRUPTED,
-    RECORDING_DELETED,
-    REFUSED,
-    Stop,
-    stop_signals,
-)
+from pans.runtime.live.continuous import DISK_NEARLY_FULL, INTERRUPTED, RECORDING_DELETED, REFUSED, Stop, stop_signals
 from pans.runtime.live.run_options import FLOW, RunOptions
 from pans.runtime.operate.warm import load_ahead
 from pans.runtime.timing.realtime import check_core

@@ -117,10 +117,7 @@ REPLAY = Command(
     "recompute a recording's decisions and compare",
     _configure_replay,
     _replay,
-    examples=(
-        "pans replay pans-runs/latest/run.pansrec",
-        "pans replay run.pansrec --bundle other.pans",
-    ),
+    examples=("pans replay pans-runs/latest/run.pansrec", "pans replay run.pansrec --bundle other.pans"),
 )
 
 
@@ -248,10 +245,7 @@ REPORT = Command(
     "one self-contained page of a recording or a bundle",
     _configure_report,
     _report,
-    examples=(
-        "pans report pans-runs/latest/run.pansrec -o run.html",
-        "pans report my.pans -o bundle.html",
-    ),
+    examples=("pans report pans-runs/latest/run.pansrec -o run.html", "pans report my.pans -o bundle.html"),
 )
 
 

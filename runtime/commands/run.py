@@ -97,8 +97,5 @@ DEMO = Command(
     "the main job with nothing but the package: a simulated instrument, real images, timed decisions",
     _configure_demo,
     _demo,
-    examples=(
-        "pans demo",
-        "pans demo --pace fast --seconds 2 --json",
-    ),
+    examples=("pans demo", "pans demo --pace fast --seconds 2 --json"),
 )

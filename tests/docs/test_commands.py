@@ -160,9 +160,7 @@ def status(words: list[str]) -> int:
 
 
 @pytest.mark.parametrize(
-    "page",
-    pages("tutorial", "how-to", "reference", "explanation"),
-    ids=lambda page: f"{page.parent.name}/{page.stem}",
+    "page", pages("tutorial", "how-to", "reference", "explanation"), ids=lambda page: f"{page.parent.name}/{page.stem}"
 )
 def test_no_sentence_of_a_page_is_too_long(page: Path) -> None:
     long = [sentence for sentence in sentences(page) if len(sentence.split()) > MOST_WORDS]

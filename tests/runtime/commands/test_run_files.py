@@ -74,11 +74,7 @@ def test_force_replaces_and_only_what_is_written(folder: Path, capsys: pytest.Ca
     assert read_recording("a/run.pansrec").decisions_sha256 != first
     parted = json_of(capsys, *words("--out", "a", "--force", "--rotate-mb", "0.3"))
     assert parted["recording"] == "a/run.pansrec"
-    assert sorted(os.listdir("a")) == [
-        "run-0001.pansrec",
-        "run-2notes.pansrec",
-        "summary.md",
-    ]
+    assert sorted(os.listdir("a")) == ["run-0001.pansrec", "run-2notes.pansrec", "summary.md"]
 
 
 def words(*more: str) -> tuple[str, ...]:
