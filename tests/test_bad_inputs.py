@@ -128,7 +128,8 @@ def faults_of(name: str) -> list[list[list[str]]]:
             values = [*NUMBERS[: -1 if flag in MAY_BE_NEGATIVE else None]]
         elif key in READS and (name, flag) != ("bundle", "--task"):
             kind, other = READS[key], "s.npz" if READS[key] == "pans" else "b.pans"
-            values = [value.format(kind) for value in INPUTS if value not in ("other", "half.{}")]
+            left_out = {"other", "half.{}", *({""} if flag == "--task" else ())}  # "": the bundle's own task
+            values = [value.format(kind) for value in INPUTS if value not in left_out]
             values += [other, f"half.{kind}"] if kind in KINDS else [other]
         elif key in WRITES:
             made = {"folder.{}", "", "no/such/new.{}"} if (name, key) in FOLDERS else set[str]()
