@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from commands import fixed_run
 
 from pans.runtime.cli import main
 
@@ -23,15 +24,8 @@ NEEDS = {  # command line: what it needs, and the extra that has it
     "export r.pansrec --format parquet -o new.parquet": ("pyarrow", "parquet"),
     "evaluate fashion10 --task s.npz --objects 2 --pictures new": ("matplotlib", "plot"),
 }
-WORK_WITHOUT = (
-    "",
-    "help run",
-    "profile list",
-    "verify r.pansrec",
-    "info fashion10",
-    "replay r.pansrec",
-    "evaluate fashion10 --task s.npz",
-)
+WORK_WITHOUT = ("", "help run", "profile list", "verify r.pansrec", "info fashion10", "replay r.pansrec")
+WORK_WITHOUT += ("evaluate fashion10 --task s.npz",)
 CHILD = """
 import contextlib, io, json, sys
 
@@ -63,34 +57,13 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str]
     folder = tmp_path_factory.mktemp("lean")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert (
-            main(
-                [
-                    "run",
-                    "fashion10",
-                    "--device",
-                    "sim:oled-qcmos?pace=fast",
-                    "--decisions",
-                    "3",
-                    "--record",
-                    "r.pansrec",
-                    "-q",
-                ]
-            )
-            == 0
-        )
+        assert main([*fixed_run(3), "--record", "r.pansrec", "-q"]) == 0
     images = np.random.default_rng(0).integers(0, 255, (200, 28, 28)).astype(np.uint8)
     names = ["T-shirt/top", "Trouser", "Pullover", "Dress", "Coat", "Sandal", "Shirt", "Sneaker", "Bag", "Ankle boot"]
     np.savez(folder / "s.npz", images=images, labels=np.arange(200) % 10, classes=np.array(names))
     before = sorted(folder.rglob("*"))
-    lines = json.dumps([*NEEDS, *WORK_WITHOUT])
-    done = subprocess.run(
-        [sys.executable, "-c", CHILD, json.dumps(BLOCKED), lines],
-        capture_output=True,
-        text=True,
-        cwd=folder,
-        check=True,
-    )
+    words = [sys.executable, "-c", CHILD, json.dumps(BLOCKED), json.dumps([*NEEDS, *WORK_WITHOUT])]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=folder, check=True)
     assert sorted(folder.rglob("*")) == before
     return {line: (code, err) for line, (code, err) in json.loads(done.stdout.splitlines()[-1]).items()}
 

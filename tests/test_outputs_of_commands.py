@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import fixed_run
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import main
@@ -40,19 +41,8 @@ COMMANDS = {  # words, what is there already, what else is read
     "order": ("order b.pans -o OUT", "OUT", "b.pans"),
     "tune": (f"tune b.pans --device {DEVICE} -o OUT", "OUT", "b.pans"),
 }
-WRITES_NO_FILE = {
-    "verify",
-    "info",
-    "simulate",
-    "devices",
-    "doctor",
-    "baseline",
-    "bench",
-    "completion",
-    "runs",
-    "conform",
-}
-CHECKED_ELSEWHERE = {"demo", "sweep"}  # tests/runtime/commands/test_run_files.py, and below
+WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "bench", "completion", "runs"}
+CHECKED_ELSEWHERE = {"demo", "sweep", "conform"}  # tests/runtime/commands/test_run_files.py, below; conform writes none
 
 
 @pytest.fixture
@@ -69,8 +59,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recording: Path) -> 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run") / "r.pansrec"
-    words = ["run", str(SHIPPED / "fashion10.pans"), "--device", "sim:oled-qcmos?pace=fast", "--decisions", "3"]
-    assert main([*words, "--record", str(path)]) == 0
+    assert main([*fixed_run(3), "--record", str(path)]) == 0
     return path
 
 
@@ -83,7 +72,7 @@ def refused(words: list[str], folder: Path, why: str, capsys: pytest.CaptureFixt
     """Run a command that must be refused for `why`, with a remedy, and leave the folder as it is."""
     if words[0] in ("train", "reproduce", "evaluate"):
         pytest.importorskip("torch", reason="needs the train extra")
-    if words[0] in ("bench", "evaluate"):
+    if words[0] == "evaluate":
         pytest.importorskip("matplotlib", reason="needs the plot extra")
     before = contents(folder)
     capsys.readouterr()

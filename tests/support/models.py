@@ -21,115 +21,86 @@ def model(nodes: list[Any], weights: dict[str, Any] | None = None, d_f: int = 4,
     results += [helper.make_empty_tensor_value_info(name) for name in more.get("outputs", ())]
     graph = helper.make_graph(nodes, "head", [source], results, tensors)
     opsets = [helper.make_opsetid("", more.get("opset", 17))]
-    return helper.make_model(graph, opset_imports=opsets, ir_version=8, functions=more.get("functions", ()))
+    return helper.make_model(graph, opset_imports=opsets, ir_version=8)
+
+
+def parsed(nodes: str, d_f: int = 4, n_out: int = 2, head: str = "", **weights: Any) -> Any:
+    """A model from `means` (n, d_f) to `scores` (n, n_out) whose nodes are written in ONNX's text form."""
+    from onnx import numpy_helper, parser
+
+    ends = f"(float[n, {d_f}] means) => (float[n, {n_out}] scores)"
+    made = parser.parse_model(f'<ir_version: 8, opset_import: ["": 17{head}]> head {ends} {{ {nodes} }}')
+    tensors = ((name, value) for name, value in weights.items() if not hasattr(value, "dims"))
+    made.graph.initializer.extend(numpy_helper.from_array(np.asarray(value), name) for name, value in tensors)
+    made.graph.initializer.extend(value for value in weights.values() if hasattr(value, "dims"))
+    return made
 
 
 def hostile_models() -> dict[str, tuple[bytes, str]]:
     """Models that would run away, or that readers take differently: name -> (bytes, pattern of the refusal)."""
     from onnx import TensorProto, helper, numpy_helper
 
-    node = helper.make_node
-    ones = np.ones((4, 2), np.float32)
-    last = node("MatMul", ["means", "w"], ["scores"])
-
-    def adding(*nodes: Any, **weights: Any) -> bytes:
-        """The plain head, plus `nodes` that make `b`, added to its scores."""
-        rows = [*nodes, node("MatMul", ["means", "w"], ["sums"]), node("Add", ["sums", "b"], ["scores"])]
-        return bytes(model(rows, {"w": ones, **weights}).SerializeToString())
-
-    def int64(*values: int) -> np.ndarray:
-        return np.array(values, np.int64)
-
-    body = helper.make_graph(
-        [node("Identity", ["go"], ["on"])],
-        "body",
-        [
-            helper.make_tensor_value_info("i", TensorProto.INT64, []),
-            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-        ],
-        [helper.make_tensor_value_info("on", TensorProto.BOOL, [])],
-    )
+    ones, last = np.ones((4, 2), np.float32), "scores = MatMul(means, w)"
     outside = numpy_helper.from_array(ones, "w")
     outside.ClearField("raw_data")
     outside.data_location = 1
     outside.external_data.add(key="location", value="secret.bin")
-    inner = helper.make_function(
-        "own", "Again", ["a"], ["c"], [node("Identity", ["a"], ["c"])], [helper.make_opsetid("", 17)]
-    )
-    plain = bytes(model([last], {"w": ones}).SerializeToString())
-    graph = model([last], {"w": ones}).graph.SerializeToString()
-    wide = np.ones((4, 4), np.float32)
-    deep = [node("MatMul", [f"x{i}" if i else "means", "m"], [f"x{i + 1}"]) for i in range(999)]
-    unknown = helper.make_node("Relu", ["means"], ["scores"], domain="com.example")
-    costly = {"k": np.ones((64, 1, 63, 63), np.float32), "s": int64(-1, 1, 64, 64)}
-    resized = [node("Reshape", ["means", "s"], ["x"]), node("Conv", ["x", "k"], ["y"], pads=[31] * 4)]
+    opsets = [helper.make_opsetid("", 17)]
+    again = helper.make_function("own", "Again", ["a"], ["c"], [helper.make_node("Identity", ["a"], ["c"])], opsets)
+    plain, called, late = (parsed(last, w=ones) for _ in range(3))
+    called.functions.append(again)
+    late.opset_import[0].version = 99
+    whole, graph = plain.SerializeToString(), plain.graph.SerializeToString()
+    deep = " ".join(f"x{i + 1} = MatMul({f'x{i}' if i else 'means'}, m)" for i in range(999))
+    doubled = parsed(f"{deep} scores = MatMul(x999, w)", w=ones, m=np.ones((4, 4), np.float32))
+    doubled.graph.node.extend([*doubled.graph.node])
+    resized = "x = Reshape(means, s) y = Conv<pads = [31, 31, 31, 31]>(x, k) z = GlobalMaxPool(y)"
+    body = "body (int64 i, bool go) => (bool on) { on = Identity(go) }"
+
+    def int64(*values: int) -> np.ndarray:
+        return np.array(values, np.int64)
+
+    def full(*shape: int) -> np.ndarray:
+        return np.ones(shape, np.float32)
+
+    added: dict[str, tuple[str, dict[str, Any], str]] = {  # nodes that make `b`, which is added to a plain head's scores
+        "loop": (f"b = Loop<body = {body}>(m)", {"m": int64(1 << 40)}, "subgraph"),
+        "if": (f"b = If<then_branch = {body}, else_branch = {body}>(means)", {}, "subgraph"),
+        "scan": (f"b = Scan<body = {body}, num_scan_inputs = 1>(means)", {}, "subgraph"),
+        "constant of shape": ("b = ConstantOfShape(s)", {"s": int64(1 << 30)}, "ConstantOfShape"),
+        "expand": ("b = Expand(v, s)", {"v": ones[:1], "s": int64(1 << 30, 2)}, "Expand"),
+        "tile": ("b = Tile(v, s)", {"v": ones, "s": int64(1 << 20, 1)}, "Tile"),
+        "range": ("b = Range(r, s, t)", {"r": int64(0), "s": int64(1 << 40), "t": int64(1)}, "Range"),
+        "resize": ('b = Resize(v, "", s)', {"v": ones, "s": np.float32([1e5, 1e5])}, "Resize"),
+        "dice": ("b = RandomNormal<shape = [1, 2]>()", {}, "RandomNormal"),
+        "rows by rows": ("t = Transpose(means) b = MatMul(means, t)", {}, "rows stay first"),
+        "rows summed": ("b = ReduceSum<keepdims = 1>(means)", {}, "rows stay first"),
+        "broadcast": ("b = Add(u, v)", {"u": full(1, 1 << 14), "v": full(1 << 14, 1)}, "multiply-adds|intermediate"),
+        "product": ("b = MatMul(u, v)", {"u": full(1 << 11, 1 << 8), "v": full(1 << 8, 1 << 11)}, "multiply-adds"),
+        "wide pads": (f"b = Conv<pads = [{1 << 40}, {1 << 40}]>(x, k)", {"x": full(1, 1, 3), "k": full(1, 1, 3)}, "pads wider"),
+        "too many values": ("", {"b": TensorProto(name="b", data_type=1, dims=[1 << 40], raw_data=b"")}, "allowed: at most"),
+        "training mode": ("b = Dropout(u, r, t)", {"u": ones[:1], "r": np.float32(0.5), "t": np.uint8([1])}, "training_mode"),
+    }  # fmt: skip
+    models: dict[str, tuple[Any, str]] = {
+        **{
+            name: (parsed(f"{nodes} sums = MatMul(means, w) scores = Add(sums, b)", w=ones, **weights), reason)
+            for name, (nodes, weights, reason) in added.items()
+        },
+        "convolution": (parsed(resized, 4096, s=int64(-1, 1, 64, 64), k=full(64, 1, 63, 63)), "multiply-adds"),
+        "endless chain": (doubled, "1000 nodes"),
+        "external data": (parsed(last, w=outside), "another file"),
+        "function": (called, "functions"),
+        "foreign domain": (parsed("scores = com.example.Relu(means)", 2, head=', "com.example": 1'), "of the domain 'com.example'"),
+        "not finite": (parsed(last, w=ones * np.inf), "not finite"),
+        "doubles": (parsed(last, w=np.ones((4, 2))), "data type 11"),
+        "operator set 99": (late, "operator set 99"),
+    }  # fmt: skip
     return {
-        "loop": (adding(node("Loop", ["m"], ["b"], body=body), m=int64(1 << 40)), "subgraph"),
-        "if": (adding(node("If", ["means"], ["b"], then_branch=body, else_branch=body)), "subgraph"),
-        "scan": (adding(node("Scan", ["means"], ["b"], body=body, num_scan_inputs=1)), "subgraph"),
-        "constant of shape": (adding(node("ConstantOfShape", ["s"], ["b"]), s=int64(1 << 30)), "ConstantOfShape"),
-        "expand": (adding(node("Expand", ["v", "s"], ["b"]), v=ones[:1], s=int64(1 << 30, 2)), "Expand"),
-        "tile": (adding(node("Tile", ["v", "s"], ["b"]), v=ones, s=int64(1 << 20, 1)), "Tile"),
-        "range": (adding(node("Range", ["r", "s", "t"], ["b"]), r=int64(0), s=int64(1 << 40), t=int64(1)), "Range"),
-        "resize": (adding(node("Resize", ["v", "", "s"], ["b"]), v=ones, s=np.float32([1e5, 1e5])), "Resize"),
-        "dice": (adding(node("RandomNormal", [], ["b"], shape=[1, 2])), "RandomNormal"),
-        "rows by rows": (
-            adding(node("Transpose", ["means"], ["t"]), node("MatMul", ["means", "t"], ["b"])),
-            "rows stay first",
-        ),
-        "rows summed": (adding(node("ReduceSum", ["means"], ["b"], keepdims=1)), "rows stay first"),
-        "broadcast": (
-            adding(
-                node("Add", ["u", "v"], ["b"]), u=np.ones((1, 1 << 14), np.float32), v=np.ones((1 << 14, 1), np.float32)
-            ),
-            "multiply-adds|intermediate",
-        ),
-        "constant product": (
-            adding(
-                node("MatMul", ["u", "v"], ["b"]),
-                u=np.ones((1 << 11, 1 << 8), np.float32),
-                v=np.ones((1 << 8, 1 << 11), np.float32),
-            ),
-            "multiply-adds",
-        ),
-        "convolution": (
-            bytes(model([*resized, node("GlobalMaxPool", ["y"], ["z"])], costly, d_f=4096).SerializeToString()),
-            "multiply-adds",
-        ),
-        "wide pads": (
-            adding(
-                node("Conv", ["x", "k"], ["b"], pads=[1 << 40, 1 << 40]),
-                x=np.ones((1, 1, 3), np.float32),
-                k=np.ones((1, 1, 3), np.float32),
-            ),
-            "pads wider",
-        ),
-        "endless chain": (
-            bytes(
-                model(
-                    [*deep, node("MatMul", ["x999", "w"], ["scores"])] * 2, {"w": ones, "m": wide}
-                ).SerializeToString()
-            ),
-            "1000 nodes",
-        ),
-        "external data": (bytes(model([last], {"w": outside}).SerializeToString()), "another file"),
-        "function": (bytes(model([last], {"w": ones}, functions=[inner]).SerializeToString()), "functions"),
-        "foreign domain": (bytes(model([unknown], {}, d_f=2).SerializeToString()), "of the domain 'com.example'"),
-        "two graphs": (plain + b"\x3a" + varint(len(graph)) + graph, "graph twice"),
-        "unknown field": (plain + b"\xf8\x3f\x01", "field 1023"),
-        "training": (plain + b"\xa2\x01\x00", "training graph"),
-        "not finite": (bytes(model([last], {"w": ones * np.inf}).SerializeToString()), "not finite"),
-        "doubles": (bytes(model([last], {"w": np.ones((4, 2))}).SerializeToString()), "data type 11"),
-        "too many values": (
-            adding(b=TensorProto(name="b", data_type=1, dims=[1 << 40], raw_data=b"")),
-            "allowed: at most",
-        ),
-        "training mode": (
-            adding(node("Dropout", ["u", "r", "t"], ["b"]), u=ones[:1], r=np.float32(0.5), t=np.array([1], np.uint8)),
-            "training_mode",
-        ),
+        **{name: (bytes(made.SerializeToString()), reason) for name, (made, reason) in models.items()},
+        "two graphs": (whole + b"\x3a" + varint(len(graph)) + graph, "graph twice"),
+        "unknown field": (whole + b"\xf8\x3f\x01", "field 1023"),
+        "training": (whole + b"\xa2\x01\x00", "training graph"),
         "million fields": (b"\x3a" + varint(6_000_000) + b"\x0a\x00" * 3_000_000, "1000 nodes"),
-        "empty operator set 99": (bytes(model([last], {"w": ones}, opset=99).SerializeToString()), "operator set 99"),
     }
 
 

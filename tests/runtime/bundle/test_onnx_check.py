@@ -13,9 +13,10 @@ import pytest
 
 pytest.importorskip("onnx")
 
-from heads import onnx_chain, random_layers
+from heads import affine_head, onnx_chain, random_layers
 from models import hostile_models, model, random_model
 from onnx import helper
+from onnx.parser import parse_model
 
 from pans.runtime.bundle.head import open_head
 from pans.runtime.bundle.onnx_check import ROWS, check_head, shapes_of
@@ -36,6 +37,33 @@ def test_heads_that_would_run_away_are_refused_unrun(name: str, monkeypatch: pyt
     data, reason = HOSTILE[name]
     with pytest.raises(DamagedFileError, match=reason):
         open_head(data, {"foreign domain": 2, "convolution": 4096}.get(name, 4), 2, "here")
+
+
+AFFINE = affine_head(np.eye(2), np.zeros(2))
+NO_HEADS = [  # of 2 patterns and 2 classes: a graph, or the bytes of a file, and the reason
+    ("(float[n, 3] x) => (float[n, 3] y) { y = Identity(x) }", r"allowed: \(n or 1, 2\)"),
+    ("(float[n, 2] x) => (float[n, 4] y) { y = Concat<axis = 1>(x, x) }", "output"),
+    ("(float[n, 2, 1] x) => (float[n, 2, 1] y) { y = Identity(x) }", "shape"),
+    ("(float[2, 2] x) => (float[2, 2] y) { y = Identity(x) }", "shape"),
+    ("(double[n, 2] x) => (double[n, 2] y) { y = Identity(x) }", "tensor"),
+    ("(float[n, 2] x) => (int64[n, 1] y) { y = ArgMax<axis = 1>(x) }", "tensor"),
+    ("(float[n, 2] x, float[n, 2] z) => (float[n, 2] y) { y = Add(x, z) }", "one input"),
+    ("(float[n, 2] x) => (float[n, 2] y) { y = Teleport(x) }", "operator 'Teleport', allowed: Abs"),
+    *((data, "ONNX") for data in (b"\xff" * 40, b"", np.random.default_rng(1).bytes(300))),
+    *((AFFINE.replace(*change), "ONNX head") for change in ((b"means", b"\xf0eans"), (b"n", b"\xad"))),
+    (AFFINE.replace(b"Gemm", b"\xf0emm"), "utf-8"),
+]
+
+
+@pytest.mark.parametrize(("graph", "reason"), NO_HEADS, ids=range(len(NO_HEADS)))
+def test_what_is_no_head_is_refused_with_the_reason(
+    graph: str | bytes, reason: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    if isinstance(graph, str):
+        graph = parse_model(f'<ir_version: 8, opset_import: ["": 17]> head {graph}').SerializeToString()
+    with pytest.raises(DamagedFileError, match=reason):
+        open_head(graph, 2, 2, "here")
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_check_needs_neither_onnx_nor_onnxruntime() -> None:
