@@ -32,44 +32,31 @@ OF_REGISTRATION = {"target": None, "page": None, "precision_px": 0.05, "precisio
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--device",
-        required=True,
-        help="device URL; a clear field must stand before it (sim: scene=uniform), or the target (sim: scene=registration)",
-    )
-    parser.add_argument("--profile", help="hardware profile: a shipped name or a TOML file (default: the sim: URL's)")
-    parser.add_argument(
-        "-o", "--out", required=True, type=Path, metavar="FILE", help="calibration file to write (.json)"
-    )
+    add, positive = parser.add_argument, Range(1e-4, 10).option
+    before = "a clear field must stand before it (sim: scene=uniform), or the target (sim: scene=registration)"
+    add("--device", required=True, help=f"device URL; {before}")
+    add("--profile", help="hardware profile: a shipped name or a TOML file (default: the sim: URL's)")
+    add("-o", "--out", required=True, type=Path, metavar="FILE", help="calibration file to write (.json)")
     add_force(parser)
-    parser.add_argument("--seconds", type=Range(0.5, 86_400).option, default=10.0, help="instrument time (default 10)")
-    parser.add_argument(
-        "--seed", type=Range(0, (1 << 62) - 1, whole=True).option, default=1, help="of the random patterns (default 1)"
-    )
-    group = parser.add_argument_group("registration (docs/how-to/calibrate.md#register-the-optical-table)")
-    group.add_argument(
-        "--registration",
-        action="store_true",
-        help="measure where a known target stands, sharpness, black level and flat field",
-    )
-    group.add_argument(
-        "--target", type=Path, metavar="FILE", help="a picture or a scene (.npz) of the target (default: built in)"
-    )
-    group.add_argument(
-        "--page", type=Path, metavar="FILE", help="write a page with pictures of target and residuals (.html)"
-    )
-    group.add_argument(
-        "--precision-px", type=Range(1e-4, 10).option, default=OF_REGISTRATION["precision_px"], metavar="PX",
-        help="half of the widest 95 %% interval of a shift that is accepted (default 0.05)",
-    )  # fmt: skip
-    group.add_argument(
-        "--precision-deg", type=Range(1e-4, 10).option, default=OF_REGISTRATION["precision_deg"], metavar="DEG",
-        help="the same of the rotation (default 0.1)",
-    )  # fmt: skip
+    add("--seconds", type=Range(0.5, 86_400).option, default=10.0, help="instrument time (default 10)")
+    seed = Range(0, (1 << 62) - 1, whole=True).option
+    add("--seed", type=seed, default=1, help="of the random patterns (default 1)")
+    add = parser.add_argument_group("registration (docs/how-to/calibrate.md#register-the-optical-table)").add_argument
+    measured = "measure where a known target stands, sharpness, black level and flat field"
+    add("--registration", action="store_true", help=measured)
+    add("--target", type=Path, metavar="FILE", help="a picture or a scene (.npz) of the target (default: built in)")
+    add("--page", type=Path, metavar="FILE", help="write a page with pictures of target and residuals (.html)")
+    for flag, unit, words in (
+        ("--precision-px", "PX", "half of the widest 95 %% interval of a shift that is accepted (default 0.05)"),
+        ("--precision-deg", "DEG", "the same of the rotation (default 0.1)"),
+    ):
+        default = OF_REGISTRATION[flag[2:].replace("-", "_")]
+        add(flag, type=positive, default=default, metavar=unit, help=words)
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    _check(args)
+    outputs = [args.out] if args.page is None else [args.out, args.page]
+    check_outputs(outputs, inputs=[args.profile, args.target, *files_of_url(args.device)], force=args.force)
     if args.registration:
         return _register(args)
     refuse_without(args, "--registration", OF_REGISTRATION)
@@ -107,22 +94,12 @@ def _calibrate(args: argparse.Namespace) -> int:
     values |= {"contradictions": dict(doubts)} if doubts else {}
     values |= {"command": shlex.join(["pans", *sys.argv[1:]]), "seed": args.seed, "device": facts}
     sha256 = save_calibration(args.out, values, force=args.force)
-    payload = {
-        "calibration": str(args.out),
-        "sha256": sha256,
-        **{key: value for key, value in values.items() if key != "channels"},
-    }
-    emit(args, payload, _words(args.out, values))
+    payload = {key: value for key, value in values.items() if key != "channels"}
+    emit(args, {"calibration": str(args.out), "sha256": sha256, **payload}, _words(args.out, values))
     if doubts:
         return EXIT_TIMING
     off = abs(values["efficiency"]["relative_to_profile"] - 1.0) > PEAK_OFF
     return EXIT_ALERT if off or values["silent_channels"] else EXIT_FINE
-
-
-def _check(args: argparse.Namespace) -> None:
-    """Refuse what cannot be written before anything is measured."""
-    outputs = [args.out] if args.page is None else [args.out, args.page]
-    check_outputs(outputs, inputs=[args.profile, args.target, *files_of_url(args.device)], force=args.force)
 
 
 def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str, Any], Counter[str]]:
@@ -144,8 +121,7 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
         raise KeyboardInterrupt(result.ended)
     if result.ended != "completed":
         raise LinkError(f"the calibration was not completed: {result.ended}", remedy="check the link and try again")
-    keep = ("serial", "firmware", "name", "simulated")
-    facts = {key: result.device[key] for key in keep if key in result.device}
+    facts = {key: result.device[key] for key in ("serial", "firmware", "name", "simulated") if key in result.device}
     return core, facts, Counter(contradictions_of(result))
 
 
@@ -205,19 +181,16 @@ def _words(path: Path, values: dict[str, Any]) -> str:
         f"  non-uniformity  {spread['relative']:.2%} ({found}, p = {spread['p_value']:.2g})",
     ]
     if 1 < len(values["channels"]) <= CHANNELS_SHOWN:
-        lines += [_of_channel(number, row) for number, row in enumerate(values["channels"])]
+        for number, row in enumerate(values["channels"]):
+            level = row["level_relative"]
+            said = "light unknown" if level is None else f"{level:.3f} of the photon level"
+            lines.append(f"  channel {number:<7} {said}, dark {row['dark_per_exposure']:.3g} per exposure")
     if values["silent_channels"]:
         lines.append(f"  SILENT          no click in light: channel {', '.join(map(str, values['silent_channels']))}")
     if doubts := values.get("contradictions"):
         kinds = ", ".join(f"{what} {count}" for what, count in sorted(doubts.items()))
         lines.append(f"  FAULT           {sum(doubts.values())} messages contradict the evidence: {kinds}")
     return "\n".join(lines)
-
-
-def _of_channel(number: int, row: dict[str, Any]) -> str:
-    level = row["level_relative"]
-    said = "light unknown" if level is None else f"{level:.3f} of the photon level"
-    return f"  channel {number:<7} {said}, dark {row['dark_per_exposure']:.3g} per exposure"
 
 
 CALIBRATE = Command(

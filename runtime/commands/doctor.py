@@ -333,6 +333,12 @@ COMPARED: tuple[tuple[str, str, str, float, dict[str, str]], ...] = (
 )  # fmt: skip
 
 
+ROW: dict[str, Any] = {  # of a setting that is not tried: judged by its effect
+    "measured": "for how long a core ran something else",
+    **{"without": {}, "with": {}, "rounds_better": None, "rounds": None, "effect": ""},
+}
+
+
 def settings_of(found: Rehearsal) -> list[dict[str, Any]]:
     """Return a row for each setting: what is in force, what was measured without and with it, and what to do."""
     isolated, cores = isolated_cores(), ", ".join(str(row["core"]) for row in found.cores) or "unknown"
@@ -345,65 +351,57 @@ def settings_of(found: Rehearsal) -> list[dict[str, Any]]:
     rows = []
     for setting, before, after, q, do in COMPARED:
         base = "bound, SCHED_FIFO" if found.fifo else "bound"
-        row = _compared(found, base if before == "base" else before, after, q)
-        advice = do.get(row["effect"] or "refused", "nothing").format(host=found.host, device=found.device)
+        figures = _compared(found, base if before == "base" else before, after, q)
+        advice = do.get(figures["effect"] or "refused", "nothing").format(host=found.host, device=found.device)
         advice = advice.replace(", and a simulated device on pans simulate --core None", "")
-        rows.append({"setting": setting, "in_force": in_force[setting], **row, "do": advice})
+        rows.append(ROW | {"setting": setting, "in_force": in_force[setting], "do": advice} | figures)
     others = next((row for row in found.cores if row["core"] == found.host), {})
     is_shared = found.host not in isolated and not found.fifo and others.get("away_ms_per_s", 0.0) > AWAY_MS_PER_S
-    do_isolate = f"allow SCHED_FIFO; or isolcpus={found.host} at boot, then --core {found.host}"
-    rows.append(_measured("isolcpus", f"cores {sorted(isolated)}", others, do_isolate if is_shared else "nothing"))
+    isolate = f"allow SCHED_FIFO; or isolcpus={found.host} at boot, then --core {found.host}"
     worst = max(found.cores, key=lambda row: float(row.get("fifo_away_ms_per_s", 0.0)), default={})
     beyond = {name.removeprefix("fifo_"): value for name, value in worst.items() if name.startswith("fifo_")}
     stolen = "unknown" if found.steal_ms is None else f"{found.steal_ms:.0f} ms stolen in {found.seconds:.0f} s"
     held = float(beyond.get("largest_away_us", 0.0)) > AWAY_US
     own = "a computer of its own, or cores of its own: no priority helps against interrupts and the hypervisor"
-    return [*rows, _measured("virtualisation", stolen, beyond, own if held else "nothing")]
+    for setting, state, away, do in (
+        ("isolcpus", f"cores {sorted(isolated)}", others, isolate if is_shared else "nothing"),
+        ("virtualisation", stolen, beyond, own if held else "nothing"),
+    ):
+        without = {name: away[name] for name in ("away_ms_per_s", "largest_away_us") if name in away}
+        rows.append(ROW | {"setting": setting, "in_force": state, "without": without, "do": do})
+    return rows
 
 
 def _compared(found: Rehearsal, before: str, after: str, q: float) -> dict[str, Any]:
     """Compare two arms by quantile `q`: one helps or harms only if it does so in every round."""
     arms = [found.arms.get(name) for name in (before, after)]
     first, second = ([float(np.quantile(one, q)) for one in arm.rounds_ns] if arm else [] for arm in arms)
-    effect, better = "", None
-    if first and len(first) == len(second):
-        better = sum(one > two for one, two in zip(first, second))
-        worse, ratio = sum(one < two for one, two in zip(first, second)), median(second) / median(first)
-        effect = "helps" if better == len(first) and ratio < HELPS else "none"
-        effect = "harms" if worse == len(first) and ratio > HARMS else effect
-    return {
-        "measured": f"woken by a timer: {before}; {after} (compared by p{100 * q:.0f})",
-        "without": arms[0].figures() if arms[0] else {},
-        "with": arms[1].figures() if arms[1] else {},
-        "rounds_better": better,
-        "rounds": len(first) if effect else None,
-        "effect": effect,
-    }
-
-
-def _measured(setting: str, in_force: str, away: dict[str, Any], do: str) -> dict[str, Any]:
-    names = ("away_ms_per_s", "largest_away_us")
-    without = {name: away[name] for name in names if name in away}
-    measured = "for how long a core ran something else"
-    row = {"setting": setting, "in_force": in_force, "measured": measured, "without": without, "with": {}}
-    return row | {"rounds_better": None, "rounds": None, "effect": "", "do": do}
+    effect, better, n = "", None, len(first)
+    if first and n == len(second):
+        better, worse = (sum(one > two for one, two in zip(*arms)) for arms in ((first, second), (second, first)))
+        ratio = median(second) / median(first)
+        effect = "helps" if better == n and ratio < HELPS else "harms" if worse == n and ratio > HARMS else "none"
+    without, with_it = (arm.figures() if arm else {} for arm in arms)
+    measured = f"woken by a timer: {before}; {after} (compared by p{100 * q:.0f})"
+    rounds = {"rounds_better": better, "rounds": n if effect else None, "effect": effect}
+    return {"measured": measured, "without": without, "with": with_it, **rounds}
 
 
 def table_text(rows: list[dict[str, Any]], found: Rehearsal) -> str:
     """Return the table, a line of figures and one of advice for each row."""
     lines = [f"{'setting':<16} {'in force':<32} {'without':>28} {'with':>28}   times in us: p50 / p99 / p99.9 / max"]
     for row in rows:
-        lines.append(f"{row['setting']:<16} {row['in_force']:<32} {_cell(row['without']):>28} {_cell(row['with']):>28}")
-        rounds = (
-            f"; better in {row['rounds_better']} of {row['rounds']} rounds: {row['effect']}" if row["effect"] else ""
-        )
-        lines += [f"{'':<16} {row['measured']}{rounds}", f"{'':<16} do: {row['do']}"]
+        rounds = f"; better in {row['rounds_better']} of {row['rounds']} rounds: {row['effect']}" * bool(row["effect"])
+        lines += [
+            f"{row['setting']:<16} {row['in_force']:<32} {_cell(row['without']):>28} {_cell(row['with']):>28}",
+            f"{'':<16} {row['measured']}{rounds}",
+            f"{'':<16} do: {row['do']}",
+        ]
     pair = f"--core {found.host} for the run" if found.host is not None else "no cores to choose from"
     pair += "" if found.device is None else f", --core {found.device} for a simulated device on this computer"
     load = "{:.2f} before, {:.2f} after".format(*found.load_1min)
-    return "\n".join(
-        [*lines, f"cores suggested: {pair}", f"load of one minute: {load}; measured for {found.seconds:.1f} s"]
-    )
+    lines += [f"cores suggested: {pair}", f"load of one minute: {load}; measured for {found.seconds:.1f} s"]
+    return "\n".join(lines)
 
 
 def _cell(values: dict[str, Any]) -> str:
@@ -440,31 +438,23 @@ def _configure_doctor(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(option, action="store_true", help=words)
 
 
-def udev_rule() -> str:
-    """Return the text of the shipped udev rule."""
-    return (SHIPPED / RULE).read_text(encoding="utf-8")
-
-
 def _doctor(args: argparse.Namespace) -> int:
     if args.udev:
-        emit(args, {"udev": udev_rule()}, udev_rule().rstrip())
+        rule = (SHIPPED / RULE).read_text(encoding="utf-8")
+        emit(args, {"udev": rule}, rule.rstrip())
         return EXIT_FINE
     if args.warm:
         return _warm(args)
     findings = examine()
     broken = [finding.check for finding in findings if finding.needed and not finding.ok]
     payload: dict[str, Any] = {"findings": [asdict(finding) for finding in findings], "ready": not broken}
-    if args.realtime:
-        text = _realtime(payload)
-    else:
-        lines = []
-        for finding in findings:
-            mark = "ok" if finding.ok else "FAIL" if finding.needed else "note"
-            lines.append(f"{mark:<5}{finding.check:<22} {finding.found}")
-            if not finding.ok:
-                lines.append(f"     remedy: {finding.remedy}")
-        text = "\n".join([*lines, f"cannot run: {', '.join(broken)}" if broken else "ready to run"])
-    emit(args, payload, text)
+    lines = []
+    for finding in findings:
+        mark = "ok" if finding.ok else "FAIL" if finding.needed else "note"
+        lines.append(f"{mark:<5}{finding.check:<22} {finding.found}")
+        lines += [] if finding.ok else [f"     remedy: {finding.remedy}"]
+    lines.append(f"cannot run: {', '.join(broken)}" if broken else "ready to run")
+    emit(args, payload, _realtime(payload) if args.realtime else "\n".join(lines))
     return EXIT_ALERT if broken else EXIT_FINE
 
 
@@ -475,9 +465,7 @@ def _realtime(payload: dict[str, Any]) -> str:
         raise UsageError("--realtime measures on Linux and macOS only", remedy=remedy)
     from pans.runtime.timing.rehearsal import SECONDS, rehearse
 
-    say(
-        f"pans: measuring wake-ups for about {SECONDS:.0f} s; what else runs now takes part, and a live run would suffer"
-    )
+    say(f"pans: measuring wake-ups for about {SECONDS:.0f} s; all that runs takes part, and a live run would suffer")
     # no thread that draws: it would take part in what is measured
     with progress_bar("real time", 1.0, threaded=False) as report:
         found = rehearse(SECONDS, report)

@@ -100,54 +100,28 @@ def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str
 
 
 def _configure_bundle(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--patterns",
-        required=True,
-        type=Path,
-        metavar="P.npy",
-        help="floats (d_f, pixels) in photons, or a folder of grey PNG pictures in the order of their names",
-    )
-    parser.add_argument(
-        "--photons-at-white",
-        type=Range(1e-9, 1e9).option,
-        metavar="N",
-        help="of PNG pictures: photons per exposure through a white pixel and a clear object",
-    )
-    parser.add_argument(
-        "--head", type=Path, metavar="H.onnx", help="click means (n, d_f) -> scores (n, classes), float32"
-    )
-    parser.add_argument(
-        "--table", type=Path, metavar="T.npy", help="scores (2**d_f, classes); bit i of a row is pattern i"
-    )
-    parser.add_argument(
-        "--outcomes",
-        type=Range(2, 16, whole=True).option,
-        default=2,
-        metavar="K",
-        help="what head or table take of an exposure: K photon numbers, 0 to K - 1 or more (default 2: no click and a click)",
-    )
-    parser.add_argument("--classes", required=True, metavar="a,b,...", help="class names in the order of the scores")
+    add = parser.add_argument
+    patterns = "floats (d_f, pixels) in photons, or a folder of grey PNG pictures in the order of their names"
+    add("--patterns", required=True, type=Path, metavar="P.npy", help=patterns)
+    white = "of PNG pictures: photons per exposure through a white pixel and a clear object"
+    add("--photons-at-white", type=Range(1e-9, 1e9).option, metavar="N", help=white)
+    add("--head", type=Path, metavar="H.onnx", help="click means (n, d_f) -> scores (n, classes), float32")
+    add("--table", type=Path, metavar="T.npy", help="scores (2**d_f, classes); bit i of a row is pattern i")
+    numbers = "K photon numbers, 0 to K - 1 or more (default 2: no click and a click)"
+    outcomes = f"what head or table take of an exposure: {numbers}"
+    add("--outcomes", type=Range(2, 16, whole=True).option, default=2, metavar="K", help=outcomes)
+    add("--classes", required=True, metavar="a,b,...", help="class names in the order of the scores")
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--levels", type=int, metavar="N", help=f"intensity levels (default {DEFAULT_LEVELS})")
-    group.add_argument(
-        "--profile", metavar="P", help="take the levels of this profile, and check that it can expose them"
-    )
-    parser.add_argument(
-        "--image-shape", metavar="HxW", help="rows x columns of a pattern (default: square, else one row)"
-    )
-    parser.add_argument(
-        "--dither",
-        choices=("auto", "on", "off"),
-        default="auto",
-        help="error diffusion instead of rounding (default auto: up to 8 levels)",
-    )
-    parser.add_argument(
-        "--data",
-        metavar="SCENE",
-        help="say what the levels cost in accuracy on these labelled images: .npz, class folders or a shipped scene",
-    )
-    parser.add_argument("--task", default="custom", metavar="NAME", help="what is decided (default: custom)")
-    parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
+    profile = "take the levels of this profile, and check that it can expose them"
+    group.add_argument("--profile", metavar="P", help=profile)
+    add("--image-shape", metavar="HxW", help="rows x columns of a pattern (default: square, else one row)")
+    dither = "error diffusion instead of rounding (default auto: up to 8 levels)"
+    add("--dither", choices=("auto", "on", "off"), default="auto", help=dither)
+    data = "say what the levels cost in accuracy on these labelled images: .npz, class folders or a shipped scene"
+    add("--data", metavar="SCENE", help=data)
+    add("--task", default="custom", metavar="NAME", help="what is decided (default: custom)")
+    add("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     add_new_bundle(parser)
 
 
@@ -219,14 +193,8 @@ def _cost(
         raise UsageError(f"{args.data} has the classes {there}, allowed with --classes: {allowed}")
     with as_usage_error():
         cost = quantisation_cost(patterns, bundle, data.images, data.labels, exposure_us, profile)
-    return {
-        "accuracy_given": cost.accuracy_given,
-        "accuracy_shown": cost.accuracy_shown,
-        "accuracy_difference_se": cost.difference_se,
-        "objects": cost.objects,
-        "trials": cost.trials,
-        "simulated": True,
-    }
+    figures = {name: getattr(cost, name) for name in ("accuracy_given", "accuracy_shown", "objects", "trials")}
+    return {**figures, "accuracy_difference_se": cost.difference_se, "simulated": True}
 
 
 def _patterns(args: argparse.Namespace) -> tuple[NDArray[Any], dict[str, Any]]:

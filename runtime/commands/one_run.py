@@ -10,12 +10,12 @@ import hashlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say, warn
 from pans.runtime.cli.option_fields import check_options, option_fields, refuse_without
@@ -41,10 +41,8 @@ if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.decision import Output
     from pans.runtime.core.follower import Follower
-    from pans.runtime.core.plan import Plan
     from pans.runtime.link.base import Link
     from pans.runtime.live import LiveRun, RunResult
-    from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.monitor import Monitor
     from pans.runtime.record import Recorder
@@ -87,24 +85,6 @@ class _Around(NamedTuple):
     monitor: Monitor
     metrics: MetricsServer | None
     ending: ExitStack
-
-
-@dataclass(frozen=True, slots=True)
-class _Prepared:
-    """All that a run needs but its link."""
-
-    profile: Profile
-    bundle: Bundle  # with the patterns that are displayed
-    dark: DarkRun
-    plan: Plan
-    core: Follower
-    flow_run: FlowRun | None
-    frames: int  # of a decision: shots, times the windows of a flow that are added
-    options: RunOptions  # as `run_live` takes them
-    header: dict[str, Any]
-    expected_decisions: int
-    registration: InUse | None
-    warnings: Sequence[str]
 
 
 def run_and_report(args: argparse.Namespace, options: RunOptions) -> int:
@@ -241,74 +221,182 @@ def dose_of(options: RunOptions, bundle: Bundle, profile: Profile) -> DoseCap | 
     return None
 
 
-# ---- prepare ----
+# ---- prepare and run ----
 
 
-def _prepare(options: RunOptions, profile: Profile) -> _Prepared:
-    from pans.runtime.bundle.model import load_bundle
-    from pans.runtime.core.plan import build_plan, detector_warnings
-    from pans.runtime.core.plan_codec import drive_words
-    from pans.runtime.core.still import Core
-    from pans.runtime.decide.backends import make_decider
-    from pans.runtime.instrument.calibration import now_utc
-    from pans.runtime.live.dark_run import DarkRun
-    from pans.runtime.live.gates import open_actuator
+class _Run:
+    """One run: all that it needs but its link, made at once; `recorded` runs it."""
 
-    flow, shots = flow_of(options), options.shots
-    bundle, bundle_sha256 = load_bundle(options.bundle)
-    dose = dose_of(options, bundle, profile)
-    decider = make_decider(bundle, shots=shots, backend=options.backend, confidence=options.confidence, dose=dose)
-    placed = None
-    if options.registration is not None:
-        from pans.runtime.registration.file import in_use
+    def __init__(self, options: RunOptions, profile: Profile, around: _Around) -> None:
+        from pans.runtime.bundle.model import load_bundle
+        from pans.runtime.core.plan import build_plan, detector_warnings
+        from pans.runtime.core.plan_codec import drive_words
+        from pans.runtime.core.still import Core
+        from pans.runtime.decide.backends import make_decider
+        from pans.runtime.instrument.calibration import now_utc
+        from pans.runtime.live.dark_run import DarkRun
+        from pans.runtime.live.gates import open_actuator
 
-        placed = in_use(options.registration, bundle, profile, now_utc(), options.calibration_max_age_h)
-        say(f"pans: {placed.words()}")
-        bundle = placed.shown
-    dark = DarkRun.of(options, placed.profile if placed and not options.calibration else profile)
-    n_objects, flow_run, seconds = -(-options.decisions // options.trials), None, options.seconds
-    core: Follower
-    if flow is not None:
-        from pans.runtime.flow.make import plan_flow
-        from pans.runtime.live.flow_run import FlowRun
+        self.profile, self.around = profile, around
+        flow, shots, seconds = flow_of(options), options.shots, options.seconds
+        bundle, bundle_sha256 = load_bundle(options.bundle)
+        dose = dose_of(options, bundle, profile)
+        decider = make_decider(bundle, shots=shots, backend=options.backend, confidence=options.confidence, dose=dose)
+        self.registration: InUse | None = None
+        if options.registration is not None:
+            from pans.runtime.registration.file import in_use
 
-        plan, flow_core, n_cycles = plan_flow(dark.profile, bundle, decider, flow, shots, seconds)
-        seconds = 0.0  # the end of a flow is in its plan
-        flow_core.guard = dark.guard(plan, bundle, shots, flow=True)
-        second = load_profile(options.act_profile) if options.act_profile else profile
-        core, flow_run = flow_core, FlowRun(flow_core, open_actuator(options.act, second))
-    else:
-        plan = build_plan(
-            dark.profile,
-            bundle,
-            shots_per_object=shots * options.trials,
-            dark_slots_per_cycle=options.dark_slots,
-            order=options.order,
-            drive=options.drive,
-            automaton=getattr(decider, "automaton", None),
+            self.registration = in_use(options.registration, bundle, profile, now_utc(), options.calibration_max_age_h)
+            say(f"pans: {self.registration.words()}")
+            bundle = self.registration.shown
+        self.bundle = bundle  # with the patterns that are displayed
+        placed = self.registration.profile if self.registration and not options.calibration else profile
+        self.dark = DarkRun.of(options, placed)
+        n_objects = -(-options.decisions // options.trials)
+        self.expected_decisions = n_objects * options.trials
+        self.frames = shots * (
+            1 if flow is None else flow.pool
+        )  # of a decision: shots, times the windows of a flow that are added
+        self.core: Follower
+        self.flow_run: FlowRun | None = None
+        if flow is not None:
+            from pans.runtime.flow.make import plan_flow
+            from pans.runtime.live.flow_run import FlowRun
+
+            self.plan, flow_core, n_cycles = plan_flow(self.dark.profile, bundle, decider, flow, shots, seconds)
+            seconds = 0.0  # the end of a flow is in its plan
+            flow_core.guard = self.dark.guard(self.plan, bundle, shots, flow=True)
+            second = load_profile(options.act_profile) if options.act_profile else profile
+            self.core, self.flow_run = flow_core, FlowRun(flow_core, open_actuator(options.act, second))
+        else:
+            self.plan = build_plan(
+                self.dark.profile,
+                bundle,
+                shots_per_object=shots * options.trials,
+                dark_slots_per_cycle=options.dark_slots,
+                order=options.order,
+                drive=options.drive,
+                automaton=getattr(decider, "automaton", None),
+            )
+            if self.plan.automaton is not None:
+                say(f"pans: {drive_words(self.dark.profile, bundle, self.plan)}")
+            n_cycles = n_objects * self.plan.cycles_per_object
+            self.core = Core(self.plan, decider, shots, n_cycles, self.dark.guard(self.plan, bundle, shots))
+        self.header = recording_header(options, profile, bundle_sha256, decider, n_objects, self.plan)
+        parts = {"dark": self.dark, "registration": self.registration, "flow": self.flow_run}
+        self.header["config"] |= {name: part.header() for name, part in parts.items() if part is not None}
+        self.options = replace(options, n_cycles=n_cycles, lease_ms=profile.timing.lease_ms, seconds=seconds)
+        for warning in (*self.dark.warnings, *detector_warnings(self.dark.profile, bundle, self.plan.exposure_us)):
+            warn(warning)
+
+    def recorded(self, options: RunOptions, link: Link) -> Outcome:
+        """Run with a recording, if `options` ask for one; they name the folder that the run was given."""
+        from pans.runtime.record import Recorder
+
+        recorder: Recorder | None = None
+        with ExitStack() as opened:
+            if options.recording is not None:
+                opened.enter_context(gone_if_refused(options))
+                # the bundle's bytes are not held by a name: they may have 64 MiB, and the run begins here
+                recorder = opened.enter_context(
+                    Recorder(
+                        options.recording,
+                        self.header | {"simulated": link.simulated},
+                        bundle=_same_bundle(options.bundle, self.header["bundle_sha256"]),
+                        overwrite=options.force,
+                        limits=part_limits(options),
+                    )
+                )
+            result = self._watched(options, link, recorder)
+            summary = self._summary(options, result)
+            if recorder is not None and (kept := recorder.keep_deleted()) is not None:
+                options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
+                fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
+                warn(fault)
+                summary = replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
+            if recorder is not None:
+                summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
+        return self._conclude(options, result, summary)
+
+    def _watched(self, options: RunOptions, link: Link, recorder: Recorder | None) -> RunResult:
+        """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
+        from pans.runtime.link.fit import scene_words
+        from pans.runtime.live import Observers, Recovery
+        from pans.runtime.live.loop import running
+        from pans.runtime.monitor.snapshot import begin_facts
+        from pans.runtime.watch.watchers import Watchers
+
+        around, monitor = self.around, self.around.monitor
+        recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
+        facts = begin_facts(
+            self.bundle,
+            title=f"{self.bundle.name} on {self.profile.name}",
+            simulated=link.simulated,
+            expected=self.expected_decisions,
+            deadline_us=options.deadline_us,
+            trials=options.trials,
+            illumination=self.bundle.illumination() * self.frames,
         )
-        if plan.automaton is not None:
-            say(f"pans: {drive_words(dark.profile, bundle, plan)}")
-        n_cycles = n_objects * plan.cycles_per_object
-        core = Core(plan, decider, shots, n_cycles, dark.guard(plan, bundle, shots))
-    header = recording_header(options, profile, bundle_sha256, decider, n_objects, plan)
-    header["config"] |= {"dark": dark.header()}
-    header["config"] |= {} if placed is None else {"registration": placed.header()}
-    header["config"] |= {} if flow_run is None else {"flow": flow_run.header()}
-    return _Prepared(
-        profile=profile,
-        bundle=bundle,
-        dark=dark,
-        plan=plan,
-        core=core,
-        flow_run=flow_run,
-        frames=shots * (1 if flow is None else flow.pool),
-        options=replace(options, n_cycles=n_cycles, lease_ms=profile.timing.lease_ms, seconds=seconds),
-        header=header,
-        expected_decisions=n_objects * options.trials,
-        registration=placed,
-        warnings=[*dark.warnings, *detector_warnings(dark.profile, bundle, plan.exposure_us)],
-    )
+        monitor.begin(self.bundle, recorder, facts)
+        with Watchers(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
+
+            def prepared(run: LiveRun) -> None:
+                self.dark.check_device(run)
+                if self.registration is not None:
+                    self.registration.check_device(self.dark.serial_of(run))
+                welcome = run.connection.session.welcome
+                if welcome is not None and (words := scene_words(welcome.facts, options.device)):
+                    say(f"pans: {words}")
+                seen.prepared(run)
+                monitor.prepared(run)
+                if self.flow_run is not None:
+                    self.flow_run.prepared(run)
+
+            def look(run: LiveRun, output: Output) -> None:
+                self.dark.look(run, output)
+                seen.note_news(run)
+                monitor.watch(run, output)
+
+            observers = Observers(look, prepared, around.stop, acts=False)
+            what = self.dark.profile, self.bundle, self.plan, self.core, self.options
+            return around.ending.enter_context(running(link, *what, recorder, recovery, observers))
+
+    def _summary(self, options: RunOptions, result: RunResult) -> Summary:
+        from pans.runtime.report.summary import summarise, walk_figures
+
+        walks = walk_figures(result, self.plan, self.bundle, self.profile.name, options.confidence)
+        shown = None if walks is None else walks.illumination_mean
+        return summarise(
+            result,
+            illumination=self.bundle.illumination() * self.frames if shown is None else shown,
+            expected_decisions=self.expected_decisions,
+            flow=None if self.flow_run is None else self.flow_run.figures(),
+            dark=self.dark.figures(result.dark),
+            walks=walks,
+            registration=None if self.registration is None else self.registration.facts(),
+        )
+
+    def _conclude(self, options: RunOptions, result: RunResult, summary: Summary) -> Outcome:
+        """Write the page and return what came of the run."""
+        from pans.runtime.report.summary_page import write_markdown
+
+        confusion, page = result.tally.confusion, options.page
+        if self.flow_run is not None:
+            confusion = confusion + self.flow_run.core.matcher.confusion
+        if page is not None:
+            facts = what_was_run(options, self.profile, self.bundle.name, self.header, summary)
+            write_markdown(page, summary, facts, confusion, self.bundle.classes, force=options.force)
+        return Outcome(summary, confusion, options.recording, page)
+
+
+def _same_bundle(path: Path, sha256: str) -> bytes:
+    """Return the bundle's file once more, for the recording; DamagedFileError if it is no longer the one that decides."""
+    from pans.runtime.container import read_file
+
+    data = read_file(path)
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise DamagedFileError(f"{path}: changed while the run began", remedy="run it again")
+    return data
 
 
 # ---- open ----
@@ -319,7 +407,7 @@ def _prepare_and_run(options: RunOptions, profile: Profile, around: _Around) -> 
     if around.monitor.url:
         say(f"pans: live page at {around.monitor.url}")
     try:
-        ready = _prepare(options, profile)
+        run = _Run(options, profile, around)
         load_ahead()
     except BaseException as error:
         try:
@@ -328,14 +416,12 @@ def _prepare_and_run(options: RunOptions, profile: Profile, around: _Around) -> 
             if isinstance(error, PansError):
                 error.message += f"\nbesides, the device could not be opened: {besides}"
         raise
-    for warning in ready.warnings:
-        warn(warning)
     link = opening.result()
     around.ending.callback(link.close)
     with claimed(options) as options:
         if options.trace is not None:
             link = _traced(options, link, options.trace, around)
-        return _recorded(options, ready, link, around)
+        return run.recorded(options, link)
 
 
 def _in_background(call: Callable[[], Link]) -> Future[Link]:
@@ -382,126 +468,7 @@ def _monitor_of(options: RunOptions) -> Monitor:
     return Monitor(panel=panel, address=options.serve, lines=options.display)
 
 
-# ---- run ----
-
-
-def _recorded(options: RunOptions, ready: _Prepared, link: Link, around: _Around) -> Outcome:
-    """Run with a recording, if one is asked for."""
-    from pans.runtime.record import Recorder
-
-    recorder: Recorder | None = None
-    with ExitStack() as opened:
-        if options.recording is not None:
-            opened.enter_context(gone_if_refused(options))
-            header, limits = ready.header | {"simulated": link.simulated}, part_limits(options)
-            # the bundle's bytes are not held by a name: they may have 64 MiB, and the run begins here
-            recorder = opened.enter_context(
-                Recorder(
-                    options.recording,
-                    header,
-                    bundle=_same_bundle(options, ready),
-                    overwrite=options.force,
-                    limits=limits,
-                )
-            )
-        result = _watched(options, ready, link, recorder, around)
-        summary = _summary(options, ready, result)
-        if recorder is not None and (kept := recorder.keep_deleted()) is not None:
-            options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
-            fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
-            warn(fault)
-            summary = replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
-        if recorder is not None:
-            summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
-    return _conclude(options, ready, result, summary)
-
-
-def _same_bundle(options: RunOptions, ready: _Prepared) -> bytes:
-    """Return the bundle's file once more, for the recording; DamagedFileError if it is no longer the one that decides."""
-    from pans.runtime.container import read_file
-
-    data = read_file(options.bundle)
-    if hashlib.sha256(data).hexdigest() != ready.header["bundle_sha256"]:
-        raise DamagedFileError(f"{options.bundle}: changed while the run began", remedy="run it again")
-    return data
-
-
-def _watched(
-    options: RunOptions, ready: _Prepared, link: Link, recorder: Recorder | None, around: _Around
-) -> RunResult:
-    """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
-    from pans.runtime.link.fit import scene_words
-    from pans.runtime.live import Observers, Recovery
-    from pans.runtime.live.loop import running
-    from pans.runtime.monitor.snapshot import begin_facts
-    from pans.runtime.watch.watchers import Watchers
-
-    dark, monitor = ready.dark, around.monitor
-    recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
-    facts = begin_facts(
-        ready.bundle,
-        title=f"{ready.bundle.name} on {ready.profile.name}",
-        simulated=link.simulated,
-        expected=ready.expected_decisions,
-        deadline_us=options.deadline_us,
-        trials=options.trials,
-        illumination=ready.bundle.illumination() * ready.frames,
-    )
-    monitor.begin(ready.bundle, recorder, facts)
-    with Watchers(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
-
-        def prepared(run: LiveRun) -> None:
-            dark.check_device(run)
-            if ready.registration is not None:
-                ready.registration.check_device(dark.serial_of(run))
-            welcome = run.connection.session.welcome
-            if welcome is not None and (words := scene_words(welcome.facts, options.device)):
-                say(f"pans: {words}")
-            seen.prepared(run)
-            monitor.prepared(run)
-            if ready.flow_run is not None:
-                ready.flow_run.prepared(run)
-
-        def look(run: LiveRun, output: Output) -> None:
-            dark.look(run, output)
-            seen.note_news(run)
-            monitor.watch(run, output)
-
-        observers = Observers(look, prepared, around.stop, acts=False)
-        what = dark.profile, ready.bundle, ready.plan, ready.core, ready.options
-        return around.ending.enter_context(running(link, *what, recorder, recovery, observers))
-
-
 # ---- report ----
-
-
-def _summary(options: RunOptions, ready: _Prepared, result: RunResult) -> Summary:
-    from pans.runtime.report.summary import summarise, walk_figures
-
-    walks = walk_figures(result, ready.plan, ready.bundle, ready.profile.name, options.confidence)
-    shown = None if walks is None else walks.illumination_mean
-    return summarise(
-        result,
-        illumination=ready.bundle.illumination() * ready.frames if shown is None else shown,
-        expected_decisions=ready.expected_decisions,
-        flow=None if ready.flow_run is None else ready.flow_run.figures(),
-        dark=ready.dark.figures(result.dark),
-        walks=walks,
-        registration=None if ready.registration is None else ready.registration.facts(),
-    )
-
-
-def _conclude(options: RunOptions, ready: _Prepared, result: RunResult, summary: Summary) -> Outcome:
-    """Write the page and return what came of the run."""
-    from pans.runtime.report.summary_page import write_markdown
-
-    confusion, page, bundle = result.tally.confusion, options.page, ready.bundle
-    if ready.flow_run is not None:
-        confusion = confusion + ready.flow_run.core.matcher.confusion
-    if page is not None:
-        facts = what_was_run(options, ready.profile, bundle.name, ready.header, summary)
-        write_markdown(page, summary, facts, confusion, bundle.classes, force=options.force)
-    return Outcome(summary, confusion, options.recording, page)
 
 
 def process_start_ns() -> int:

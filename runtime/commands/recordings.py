@@ -41,15 +41,12 @@ EITHER = "a recording (file, or folder of its parts), or a bundle"
 
 
 def _configure_replay(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="a recording (.pansrec), or a folder with one in parts")
-    parser.add_argument("--bundle", type=Path, help="decide with this bundle instead of the recorded one")
-    parser.add_argument("--pictures", type=Path, metavar="OUT.npz", help="write the pictures that the head returns")
-    parser.add_argument(
-        "--truth",
-        type=Path,
-        metavar="SCENE.npz",
-        help="compare these pictures with the scene's images (SSIM, squared error)",
-    )
+    add = parser.add_argument
+    add("recording", type=Path, help="a recording (.pansrec), or a folder with one in parts")
+    add("--bundle", type=Path, help="decide with this bundle instead of the recorded one")
+    add("--pictures", type=Path, metavar="OUT.npz", help="write the pictures that the head returns")
+    truth = "compare these pictures with the scene's images (SSIM, squared error)"
+    add("--truth", type=Path, metavar="SCENE.npz", help=truth)
     add_force(parser)
 
 
@@ -126,12 +123,8 @@ REPLAY = Command(
 
 def _configure_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, metavar="FILE", help=EITHER)
-    parser.add_argument(
-        "--format",
-        required=True,
-        choices=FORMATS,
-        help="of a recording: csv (a folder), photon-hdf5, parquet (decisions); of a bundle: onnx, npy or png (a folder)",
-    )
+    form = "of a recording: csv (a folder), photon-hdf5, parquet (decisions); of a bundle: onnx, npy or png (a folder)"
+    parser.add_argument("--format", required=True, choices=FORMATS, help=form)
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT", help="the folder, or the file")
     add_force(parser)
 
@@ -253,12 +246,8 @@ def _configure_compare(parser: argparse.ArgumentParser) -> None:
     side = "a run's folder, a recording (.pansrec), or a summary as `pans run --json` prints it (.json)"
     for name, metavar in (("first", "A"), ("second", "B")):
         parser.add_argument(name, type=Path, metavar=metavar, help=side)
-    parser.add_argument(
-        "--objects",
-        default="auto",
-        choices=("auto", "same", "different"),
-        help="whether objects of the same number are the same (default auto: of the same simulated scene)",
-    )
+    same = "whether objects of the same number are the same (default auto: of the same simulated scene)"
+    parser.add_argument("--objects", default="auto", choices=("auto", "same", "different"), help=same)
     parser.add_argument("-o", "--out", type=Path, metavar="OUT.html", help="also write a page")
     add_force(parser)
 

@@ -51,20 +51,20 @@ def check_run_files(options: RunOptions) -> None:
         raise UsageError(f"{options.record}: is a folder, expected the name of a file", remedy="choose another name")
     inputs = input_files(options)
     outputs = [path for path in (options.recording, options.page, options.trace) if path is not None]
-    if options.recording is not None and options.rotate_bytes:
-        parts = files_of_parts(options.recording)
-        if parts and not options.force:
-            raise refuse_existing(parts[0])
+    if options.recording is not None and options.rotate_bytes and not options.force:
+        for part in files_of_parts(options.recording):
+            raise refuse_existing(part)
     if options.out_root is not None:
         outputs.append(options.out_root / ".new" / "run")
-    state = options.state
+    state, force = options.state, options.force
     if state is not None:
-        check_outputs([state], inputs=inputs, force=options.force, ours=is_state_file)  # its folder must be there
+        check_outputs([state], inputs=inputs, force=force, ours=is_state_file)  # its folder must be there
         outputs.append(state)
-    force, mine = options.force, {state}
-    check_outputs(
-        outputs, inputs=inputs, force=force, ours=lambda path: path in mine and is_state_file(path), makes_folders=True
-    )
+
+    def is_ours(path: Path) -> bool:
+        return path == state and is_state_file(path)
+
+    check_outputs(outputs, inputs=inputs, force=force, ours=is_ours, makes_folders=True)
     _check_disk(options)
 
 
@@ -98,10 +98,12 @@ def claimed(options: RunOptions) -> Iterator[RunOptions]:
     folders = {path.parent for path in (options.recording, options.page, options.trace) if path is not None}
     try:
         for folder in sorted(folders):
-            made += missing_folders(folder)
+            made += [one for one in (*reversed(folder.parents), folder) if not os.path.lexists(one)]
             make_folder(folder)
+        locks = [] if options.recording is None else [options.recording.with_name(f".{options.recording.name}.lock")]
+        locks += [] if options.out is None else [options.out / ".pans-run.lock"]
         with ExitStack() as held:
-            for lock in sorted(_locks(options)):
+            for lock in sorted(locks):
                 held.enter_context(locked(lock))
             yield options
     finally:
@@ -130,15 +132,6 @@ def _recorded_files(options: RunOptions) -> set[Path]:
     return {path for path in (options.recording, *files_of_parts(options.recording)) if os.path.lexists(path)}
 
 
-def missing_folders(folder: Path) -> list[Path]:
-    """Return `folder` and those above it that do not exist, the outermost first."""
-    missing: list[Path] = []
-    while not os.path.lexists(folder):
-        missing.insert(0, folder)
-        folder = folder.parent
-    return missing
-
-
 def is_state_file(path: Path) -> bool:
     """Return whether `path` is a state file of a run, which the next one may replace."""
     try:
@@ -148,11 +141,6 @@ def is_state_file(path: Path) -> bool:
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(found, dict) and found.get("format") == STATE_FORMAT
-
-
-def _locks(options: RunOptions) -> set[Path]:
-    recording = set() if options.recording is None else {options.recording.with_name(f".{options.recording.name}.lock")}
-    return recording if options.out is None else {*recording, options.out / ".pans-run.lock"}
 
 
 def files_of_url(device: str) -> list[str]:

@@ -12,9 +12,10 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from pans.firmware_sim.ports.serve import open_sim
+from pans.runtime import SHIPPED
 from pans.runtime.cli import main
 from pans.runtime.commands import doctor
-from pans.runtime.commands.doctor import Finding, examine, port_state, serial_ports, udev_rule
+from pans.runtime.commands.doctor import Finding, examine, port_state, serial_ports
 from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.link.base import TracedLink
 
@@ -53,7 +54,7 @@ def test_what_is_needed_and_missing_is_an_alert(
 
 def test_the_udev_rule_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--udev"]) == 0
-    assert capsys.readouterr().out.strip() == udev_rule().strip()
+    assert capsys.readouterr().out.strip() == (SHIPPED / doctor.RULE).read_text().strip()
     assert int(doctor.RULE.partition("-")[0]) < 73  # later, systemd has already handed out the access rights
 
 
