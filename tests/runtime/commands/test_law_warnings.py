@@ -46,20 +46,13 @@ def test_a_run_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert (REACHES in capsys.readouterr().err) is blinded
 
 
-@pytest.mark.parametrize("encoder", ["active", "automaton"])
-def test_a_training_warns(encoder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "size",
+    [("active", "--features", "3"), ("automaton", "--exposures", "3", "--states", "4")],
+    ids=lambda size: size[0],
+)
+def test_a_training_warns(size: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("torch", reason="needs the train extra")
-    size = ("--exposures", "3", "--states", "4") if encoder == "automaton" else ("--features", "3")
-    words = [
-        "train",
-        "barcode",
-        "--profile",
-        microled(tmp_path, blinded=True),
-        "--photons",
-        "4",
-        "--epochs",
-        "1",
-        *size,
-    ]
-    assert main([*words, "--encoder", encoder, "-o", str(tmp_path / "out.pans")]) == 0
+    words = ("train", "barcode", "--photons", "4", "--epochs", "1", "-o", str(tmp_path / "out.pans"))
+    assert main([*words, "--profile", microled(tmp_path, blinded=True), "--encoder", *size]) == 0
     assert REACHES in capsys.readouterr().err

@@ -32,36 +32,28 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in paths}
 
 
-BEFORE = {  # what is there already
-    "out": ["taken/run.pansrec"],
-    "summary": ["taken/summary.md"],
-    "parts": ["taken/run-0001.pansrec", "taken/run.pansrec", "taken/run-0007.pansrec"],
-    "trace": ["trace.txt"],
-    "state": ["notes.json"],
-}
-REFUSED = {  # what is asked for, and why it is refused
-    "out": (["--out", "taken"], "exists already"),
-    "summary": (["--out", "taken"], "exists already"),
-    "parts": (["--out", "taken", "--rotate-mb", "1"], "exists already"),
-    "trace": (["--trace", "trace.txt"], "exists already"),
-    "state": (["--state", "notes.json"], "exists already"),
-    "state is the trace": (["--state", "x", "--trace", "x"], "is also the output"),
-    "busy port": (["--out", "a/b", "--device", "serial:/dev/none", "--profile", "ideal"], "cannot open"),
-    "impossible plan": (["--out", "a", "--device", "sim:dmd-spad?pace=fast"], ""),
-}
+REFUSED = [  # what is asked for, what is there already, and why it is refused
+    ("--out taken", ["taken/run.pansrec"], "exists already"),
+    ("--out taken", ["taken/summary.md"], "exists already"),
+    ("--out taken --rotate-mb 1", ["taken/run.pansrec", "taken/run-0007.pansrec"], "exists already"),
+    ("--trace trace.txt", ["trace.txt"], "exists already"),
+    ("--state notes.json", ["notes.json"], "exists already"),
+    ("--state x --trace x", [], "is also the output"),
+    ("--out a/b --device serial:/dev/none --profile ideal", [], "cannot open"),
+    ("--out a --device sim:dmd-spad?pace=fast", [], "levels"),
+]
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_refused_run_touches_nothing(case: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words, why = REFUSED[case]
-    for name in BEFORE.get(case, []):
+@pytest.mark.parametrize(("words", "there", "why"), REFUSED)
+def test_a_refused_run_touches_nothing(
+    words: str, there: list[str], why: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in there:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(b"another run's")
     before = contents(folder)
-    assert main([*RUN, *words]) in (2, 3)
-    message = capsys.readouterr().err
-    assert not why or pytest.raises(AssertionError, match=why).matches(AssertionError(message)), message
-    assert "Traceback" not in message
+    assert main([*RUN, *words.split()]) in (2, 3)
+    assert why in capsys.readouterr().err
     assert contents(folder) == before
 
 
