@@ -7,7 +7,7 @@ fraction of the incomplete gamma function as in the NIST Digital Library of Math
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 _TINY = 1e-300
 _EPSILON = 1e-16
@@ -25,8 +25,8 @@ def beta_cdf(x: float, a: float, b: float) -> float:
         return 1.0
     log_front = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x)
     if x < (a + 1.0) / (a + b + 2.0):
-        return min(1.0, math.exp(log_front) * _beta_fraction(x, a, b) / a)
-    return max(0.0, 1.0 - math.exp(log_front) * _beta_fraction(1.0 - x, b, a) / b)
+        return min(1.0, math.exp(log_front) * _fraction(_beta_terms(x, a, b)) / a)
+    return max(0.0, 1.0 - math.exp(log_front) * _fraction(_beta_terms(1.0 - x, b, a)) / b)
 
 
 def jeffreys_interval(clicks: int, exposures: int, coverage: float = 0.95) -> tuple[float, float]:
@@ -57,7 +57,7 @@ def wilson_interval(clicks: float, exposures: int) -> tuple[float, float]:
 def binomial_tail(clicks: int, exposures: int, probability: float) -> float:
     """Return P(X >= clicks) for X ~ Binomial(exposures, probability).
 
-    Terms are summed from the first down their geometric decay in log space, so that tails down to 1e-300 keep their digits; below, 0.
+    Terms are summed from the first down their geometric decay, so that tails down to 1e-300 keep their digits; below, 0.
     """
     if clicks <= 0:
         return 1.0
@@ -101,7 +101,7 @@ def chi2_tail(value: float, degrees: float) -> float:
             term *= x / k
             total += term
         return max(0.0, 1.0 - total * math.exp(log_front))
-    return math.exp(log_front) * _gamma_fraction(x, a)
+    return math.exp(log_front) * _fraction(_gamma_terms(x, a))
 
 
 def chi2_quantile(probability: float, degrees: float) -> float:
@@ -120,39 +120,26 @@ def bisect(rising: Callable[[float], float], low: float, high: float) -> float:
     return high
 
 
-def _beta_fraction(x: float, a: float, b: float) -> float:
-    """The continued fraction of the incomplete beta function, by Lentz."""
-    c, d = 1.0, 1.0 - (a + b) * x / (a + 1.0)
-    d = 1.0 / (d if abs(d) > _TINY else _TINY)
-    result = d
-    for m in range(1, 100_000):
-        for numerator in (
-            m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m)),
-            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1.0)),
-        ):
-            d = 1.0 + numerator * d
-            d = 1.0 / (d if abs(d) > _TINY else _TINY)
-            c = 1.0 + numerator / c
-            c = c if abs(c) > _TINY else _TINY
-            result *= c * d
-        if abs(c * d - 1.0) < 1e-15:
-            break
-    return result
-
-
-def _gamma_fraction(x: float, a: float) -> float:
-    """The continued fraction of the upper incomplete gamma function, by Lentz."""
-    b = x + 1.0 - a
-    c, d = 1.0 / _TINY, 1.0 / b
-    result = d
-    for n in range(1, 100_000):
-        numerator = -n * (n - a)
-        b += 2.0
-        d = numerator * d + b
-        d = 1.0 / (d if abs(d) > _TINY else _TINY)
-        c = b + numerator / c
-        c = c if abs(c) > _TINY else _TINY
+def _fraction(terms: Iterable[tuple[float, float]]) -> float:
+    """The continued fraction a1 / (b1 + a2 / (b2 + ...)) of pairs (a, b), by Lentz."""
+    result, c, d = _TINY, _TINY, 0.0
+    for a, b in terms:
+        d = 1.0 / (b + a * d or _TINY)
+        c = b + a / c or _TINY
         result *= c * d
         if abs(c * d - 1.0) < 1e-15:
             break
     return result
+
+
+def _beta_terms(x: float, a: float, b: float) -> Iterator[tuple[float, float]]:
+    yield 1.0, 1.0
+    for m in range(100_000):
+        if m:
+            yield m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m)), 1.0
+        yield -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1.0)), 1.0
+
+
+def _gamma_terms(x: float, a: float) -> Iterator[tuple[float, float]]:
+    yield 1.0, x + 1.0 - a
+    yield from ((-n * (n - a), x + 1.0 - a + 2.0 * n) for n in range(1, 100_000))

@@ -33,25 +33,15 @@ if TYPE_CHECKING:
     from pans.runtime.record.replaying import replay
     from pans.trainer.evaluate import evaluate
 
-__all__ = [
-    "__version__",
-    "build_plan",
-    "decide",
-    "evaluate",
-    "load_bundle",
-    "load_profile",
-    "load_recording",
-    "replay",
-    "run",
-]
-
 _HOMES = {
     "build_plan": ("pans.runtime.core.plan", "build_plan"),
     "evaluate": ("pans.trainer.evaluate", "evaluate"),
     "load_profile": ("pans.runtime.instrument.profile", "load_profile"),
     "load_recording": ("pans.runtime.record", "read_recording"),
-    "replay": ("pans.runtime.record", "replay"),
+    "replay": ("pans.runtime.record.replaying", "replay"),
 }
+__all__ = ["__version__", "build_plan", "decide", "evaluate", "load_bundle", "load_profile", "load_recording"]
+__all__ += ["replay", "run"]
 
 
 def __getattr__(name: str) -> object:
@@ -103,26 +93,25 @@ def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = 
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.decide.verdict import checked_counts, verdicts_of
 
+    d_f, largest = bundle.n_features, bundle.largest
     try:
         found = np.asarray(clicks)
     except ValueError as error:
         raise UsageError(f"clicks are no array: {error}", remedy="give the same number of counts per object") from error
     if found.size and found.dtype.kind not in "iub":
-        allowed = f"integers, words (n,) or counts (n, {bundle.n_features}) from 0 to {shots * bundle.largest}"
+        allowed = f"integers, words (n,) or counts (n, {d_f}) from 0 to {shots * largest}"
         remedy = "give whole numbers of clicks; means times shots are counts"
         raise UsageError(f"clicks are {found.dtype} {found.shape}, allowed: {allowed}", remedy=remedy)
     found = found.astype(np.int64) if found.dtype.kind != "u" else found
     if found.ndim == 1:
-        if bundle.largest > 1:
-            raise UsageError(f"words of clicks, but {bundle.name} takes photon numbers", remedy="give counts (n, d_f)")
-        if bundle.n_features > 63:
-            what = f"words of one shot hold at most 63 clicks, {bundle.name} has {bundle.n_features}"
-            raise UsageError(what, remedy="give counts (n, d_f)")
-        if found.size and (int(found.min()) < 0 or int(found.max()) >> bundle.n_features):
-            raise UsageError(f"words run from {found.min()} to {found.max()}, allowed: {bundle.n_features} bits")
-        found = word_means(found, bundle.n_features).astype(np.int64)
+        if largest > 1 or d_f > 63:
+            what = "takes photon numbers" if largest > 1 else f"has {d_f} patterns, and words hold at most 63 clicks"
+            raise UsageError(f"words of clicks, but {bundle.name} {what}", remedy="give counts (n, d_f)")
+        if found.size and (int(found.min()) < 0 or int(found.max()) >> d_f):
+            raise UsageError(f"words run from {found.min()} to {found.max()}, allowed: {d_f} bits")
+        found = word_means(found, d_f).astype(np.int64)
     with as_usage_error():
-        counts = checked_counts(found, shots * bundle.largest, bundle.n_features)
+        counts = checked_counts(found, shots * largest, d_f)
     return verdicts_of(make_decider(bundle, shots=shots, backend=backend), counts, shots)
 
 
