@@ -121,7 +121,8 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
         raise KeyboardInterrupt(result.ended)
     if result.ended != "completed":
         raise LinkError(f"the calibration was not completed: {result.ended}", remedy="check the link and try again")
-    facts = {key: result.device[key] for key in ("serial", "firmware", "name", "simulated") if key in result.device}
+    keep = {"serial", "firmware", "name", "simulated"}
+    facts = {key: value for key, value in result.device.items() if key in keep}
     return core, facts, Counter(contradictions_of(result))
 
 
