@@ -363,12 +363,12 @@ def settings_of(found: Rehearsal) -> list[dict[str, Any]]:
     stolen = "unknown" if found.steal_ms is None else f"{found.steal_ms:.0f} ms stolen in {found.seconds:.0f} s"
     held = float(beyond.get("largest_away_us", 0.0)) > AWAY_US
     own = "a computer of its own, or cores of its own: no priority helps against interrupts and the hypervisor"
-    for setting, text, away, do in (
+    for setting, text, away, advice in (
         ("isolcpus", f"cores {sorted(isolated)}", others, isolate if is_shared else "nothing"),
         ("virtualisation", stolen, beyond, own if held else "nothing"),
     ):
         without = {name: away[name] for name in ("away_ms_per_s", "largest_away_us") if name in away}
-        rows.append(ROW | {"setting": setting, "in_force": text, "without": without, "do": do})
+        rows.append(ROW | {"setting": setting, "in_force": text, "without": without, "do": advice})
     return rows
 
 
