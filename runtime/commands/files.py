@@ -37,7 +37,7 @@ def _configure_verify(parser: argparse.ArgumentParser) -> None:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from pans.runtime.record.part_names import is_of_parts
+    from pans.runtime.record.parts import is_of_parts
     from pans.runtime.report.verify import verify_file, verify_parts
 
     groups = [verify_parts(path) if is_of_parts(path) else [verify_file(path)] for path in args.paths]

@@ -22,8 +22,7 @@ from pans.runtime.operate.pattern_files import about, array_parts, head_with_fac
 from pans.runtime.outputs import check_outputs, make_folder, write_file
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
-from pans.runtime.record.part_names import is_of_parts, parts_in
-from pans.runtime.record.parts import open_recording
+from pans.runtime.record.parts import is_of_parts, open_recording, parts_in
 from pans.runtime.record.pictures import PictureLog
 from pans.runtime.record.replaying import Replayed, replay
 from pans.runtime.record.sent_plan import recorded_plan

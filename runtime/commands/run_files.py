@@ -25,7 +25,7 @@ from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.live.run_options import RunOptions
 from pans.runtime.outputs import check_outputs, locked, make_folder, new_run_folder, refuse_existing
-from pans.runtime.record.part_names import files_of_parts
+from pans.runtime.record.parts import files_of_parts
 from pans.runtime.record.recorder import PartLimits
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pans.runtime.container import parse_json_object, read_file
 from pans.runtime.errors import UsageError
 from pans.runtime.record import Recording, read_recording
-from pans.runtime.record.part_names import find_parts
+from pans.runtime.record.parts import find_parts
 
 SUMMARY_MAX_BYTES = 1 << 24
 RECORDING = "run.pansrec"

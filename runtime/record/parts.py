@@ -1,13 +1,17 @@
-"""Recordings in parts: a part's place in the run, the chain from one to the next, a folder of them as one recording.
+"""Recordings in parts, `run-0001.pansrec` and so on for `run.pansrec`: their names, the chain from one to the next, all as one recording.
 
 `chain_violations` says what is wrong between parts; a beginning that the run deleted itself is no fault, a hole is.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from glob import escape
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,10 +24,67 @@ from pans.runtime.container import Block
 from pans.runtime.errors import DamagedFileError, UsageError
 
 from .format import PART_EVENT, Kind
-from .part_names import chained, find_parts, is_of_parts, part_number, part_path, stem_of
 from .recording import Recording, read_recording
 
 REPEATED = frozenset((Kind.HEADER, Kind.BUNDLE))  # in each part
+
+
+def part_path(first: Path, number: int) -> Path:
+    """Return the path of part `number`: `run.pansrec` becomes `run-0001.pansrec`."""
+    return first.with_name(f"{first.stem}-{number:04d}{first.suffix}")
+
+
+def part_number(path: Path) -> int | None:
+    """Return the number in the name of a part: 12 for `run-0012.pansrec`; None for other names."""
+    found = re.fullmatch(r".*-(\d{1,10})", path.stem, re.ASCII)  # the index of a block is a u32, and a part has several
+    return None if found is None else int(found[1])
+
+
+def stem_of(path: Path) -> str:
+    """Return what the parts of one run have in common: `run` for `run-0012.pansrec`."""
+    return path.stem.rpartition("-")[0]
+
+
+def chained(chain_sha256: str, decisions_sha256: str) -> str:
+    """Return the hash over all parts' logs so far: SHA-256 of the one before ("" at first) and this part's, as hex texts."""
+    return hashlib.sha256(f"{chain_sha256}{decisions_sha256}".encode("ascii")).hexdigest()
+
+
+def find_parts(place: str | Path) -> list[Path]:
+    """Return the parts in the folder `place`, or those of the recording `place`, in order."""
+    folder, stem = Path(place), "*"
+    if not folder.is_dir():
+        folder, stem = folder.parent, escape(folder.stem)
+    found = [path for path in folder.glob(f"{stem}-[0-9]*.pansrec") if part_number(path) is not None]
+    return sorted(found, key=lambda path: (stem_of(path), part_number(path)))
+
+
+def is_of_parts(path: str | Path) -> bool:
+    """Say whether `path` stands for a recording in parts: a folder, or the name of a recording of which only parts are there."""
+    return Path(path).is_dir() or (not Path(path).exists() and bool(find_parts(path)))
+
+
+def parts_in(place: str | Path) -> list[Path]:
+    """As `find_parts`; UsageError if there are none."""
+    if paths := find_parts(place):
+        return paths
+    raise UsageError(f"{place}: no parts of a recording are here", remedy="parts are named like run-0001.pansrec")
+
+
+def files_of_parts(first: Path) -> list[Path]:
+    """Return the parts of the recording `first`, and those that were made ahead and never begun: a later run replaces them."""
+    stem, suffix = re.escape(first.stem), re.escape(first.suffix)
+    wanted = re.compile(rf"{stem}-\d{{4,}}{suffix}|\.{stem}-\d{{4,}}{suffix}\.[0-9a-f]+\.partial")
+    try:
+        names = sorted(name for name in os.listdir(first.parent) if wanted.fullmatch(name))
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise UsageError(f"{first.parent}: cannot be read: {error.strerror or error}") from error
+    return [first.with_name(name) for name in names]
+
+
+# ---- the chain ----
 
 
 def part_of(recording: Recording) -> Mapping[str, Any] | None:
@@ -54,35 +115,34 @@ def first_decision(recording: Recording) -> int:
     return 0 if part is None else int(part["first_decision"])
 
 
-def chain_violations(recordings: list[Recording]) -> list[str]:
+def chain_violations(recordings: Sequence[Recording]) -> list[str]:
     """Return what is wrong between parts that should follow each other; each by itself is verify.py's."""
-    violations = []
-    known = [(recording, part) for recording in recordings if (part := part_of(recording)) is not None]
-    violations += [f"{one.path}: not a part" for one in recordings if "part" not in one.header]
-    runs = {recording.header["part"].get("run") for recording, _ in known}
-    if len(runs) > 1:
+    known = _known(recordings)
+    violations = [f"{one.path}: not a part" for one in recordings if "part" not in one.header]
+    if len(runs := {recording.header["part"].get("run") for recording, _ in known}) > 1:
         violations.append(f"parts of {len(runs)} runs are in one folder")
     for recording, part in known:
         if part["number"] != part_number(recording.path):
             violations.append(f"{recording.path.name}: it is part {part['number']} of its run: it was renamed")
     for (earlier, first), (later, second) in pairwise(known):
-        where = f"{later.path.name}"
+        where = later.path.name
         if second["number"] != first["number"] + 1:
             violations.append(
                 f"{where}: part {second['number']} follows part {first['number']}: one is missing between"
             )
             continue
         before = second.get("before") or {}
+        chain_before = str((first.get("before") or {}).get("chain_sha256", ""))
         expected = {
             "first_decision": first["first_decision"],
             "decisions": earlier.n_decisions,
             "decisions_sha256": earlier.decisions_sha256,
-            "chain_sha256": chained(_chain_before(first), earlier.decisions_sha256),
+            "chain_sha256": chained(chain_before, earlier.decisions_sha256),
         }
         for key, found in expected.items():
             if before.get(key) != found:
-                told = ascii(before.get(key))[:80]
-                violations.append(f"{where}: it says that the part before has {key} {told}, found {found}")
+                said = ascii(before.get(key))[:80]
+                violations.append(f"{where}: it says that the part before has {key} {said}, found {found}")
         if second["first_decision"] != first["first_decision"] + earlier.n_decisions:
             violations.append(f"{where}: it begins with decision {second['first_decision']}, which does not follow")
     return violations
@@ -90,23 +150,24 @@ def chain_violations(recordings: list[Recording]) -> list[str]:
 
 def missing_parts(recordings: Sequence[Recording]) -> Iterator[str]:
     """Yield what is missing at the beginning and at the end of one run's parts, and what is there although the run had ended."""
-    known = [(recording, part) for recording in recordings if (part := part_of(recording)) is not None]
-    for place, (recording, part) in enumerate(known):
+    known = _known(recordings)
+    for place, (recording, _) in enumerate(known):
         following = recording.summary.get("next") if "part_ended" in recording.summary else None
-        name, is_last = recording.path.name, place + 1 == len(known)
+        is_last = place + 1 == len(known)
         if following is not None and is_last:
-            yield f"{ascii(following)[1:81].rstrip(chr(39))} is missing: {name} continues in it"
+            yield f"{ascii(following)[1:81].rstrip(chr(39))} is missing: {recording.path.name} continues in it"
         if recording.complete and following is None and not is_last:
-            yield f"{known[place + 1][0].path.name} is surplus: the run ended with {name}"
-        if place == 0:
-            gone = max(int((one.get("deleted") or {}).get("parts", 0)) for _, one in known)
-            first = recording.path.with_name(f"{stem_of(recording.path)}{recording.path.suffix}")
-            for number in range(gone + 1, int(part["number"])):
-                yield f"{part_path(first, number).name} is missing: the run did not delete it"
+            yield f"{known[place + 1][0].path.name} is surplus: the run ended with {recording.path.name}"
+    for recording, part in known[:1]:
+        gone = max(int((one.get("deleted") or {}).get("parts", 0)) for _, one in known)
+        first = recording.path.with_name(f"{stem_of(recording.path)}{recording.path.suffix}")
+        for number in range(gone + 1, int(part["number"])):
+            yield f"{part_path(first, number).name} is missing: the run did not delete it"
 
 
-def _chain_before(part: Mapping[str, Any]) -> str:
-    return str((part.get("before") or {}).get("chain_sha256", ""))
+def _known(recordings: Sequence[Recording]) -> list[tuple[Recording, Mapping[str, Any]]]:
+    """Return the parts that say where they begin, each with how."""
+    return [(recording, part) for recording in recordings if (part := part_of(recording)) is not None]
 
 
 # ---- a run in parts as one recording ----

@@ -41,7 +41,7 @@ from .format import (
     Kind,
 )
 from .log import LogEncoder
-from .part_names import chained, files_of_parts, part_path
+from .parts import chained, files_of_parts, part_path
 from .recording_file import RecordingFile
 
 BUFFER_ROWS = 4096

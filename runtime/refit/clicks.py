@@ -24,7 +24,7 @@ from pans.runtime.container import read_file
 from pans.runtime.core.decision import Decision, DecisionFlag
 from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
 from pans.runtime.record import Recording, read_recording
-from pans.runtime.record.part_names import is_of_parts, parts_in
+from pans.runtime.record.parts import is_of_parts, parts_in
 from pans.runtime.record.replaying import ASKED, ClickLog, replay
 from pans.runtime.report.handshakes import handshakes
 

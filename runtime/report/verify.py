@@ -28,8 +28,7 @@ from pans.runtime.instrument.calibration import find_warnings, load_calibration,
 from pans.runtime.instrument.profile import load_profile, parse_profile, shipped_profiles
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
-from pans.runtime.record.part_names import is_of_parts, parts_in, stem_of
-from pans.runtime.record.parts import chain_violations, first_decision, missing_parts
+from pans.runtime.record.parts import chain_violations, first_decision, is_of_parts, missing_parts, parts_in, stem_of
 from pans.runtime.record.replaying import replay_faults
 from pans.runtime.registration.file import age_warnings, is_registration, load_registration
 from pans.runtime.wire.messages import MalformedMessage, unpack_body

@@ -21,7 +21,7 @@ import pytest
 
 from pans.runtime import SHIPPED
 from pans.runtime.record import read_recording
-from pans.runtime.record.part_names import parts_in
+from pans.runtime.record.parts import parts_in
 from pans.runtime.record.replaying import replay
 from pans.runtime.report.verify import verify_parts
 

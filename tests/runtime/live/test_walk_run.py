@@ -18,7 +18,7 @@ from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
-from pans.runtime.record.part_names import parts_in
+from pans.runtime.record.parts import parts_in
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.wire.messages import DARK_PATTERN
 

@@ -20,8 +20,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DamagedFileError, RecordingError, UsageError
 from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.record import PartLimits, Recorder, read_recording
-from pans.runtime.record.part_names import part_path, parts_in
-from pans.runtime.record.parts import chain_violations, first_decision, part_of
+from pans.runtime.record.parts import chain_violations, first_decision, part_of, part_path, parts_in
 from pans.runtime.record.replaying import replay
 from pans.runtime.report.verify import verify_parts
 

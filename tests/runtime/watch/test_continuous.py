@@ -30,7 +30,7 @@ from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import UsageError
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
 from pans.runtime.record import Recorder, read_recording
-from pans.runtime.record.part_names import parts_in
+from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_parts
 from pans.runtime.watch.metrics import FIGURES, MetricsServer
 from pans.runtime.watch.state_file import StateFile, picture_of
