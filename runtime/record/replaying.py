@@ -1,23 +1,21 @@
 """A recording decided again: from its raw messages to decisions, with the same core as in the live run.
 
-Owns the way from a recording back to a core and the frames' order; never judges. `replay` returns the number of decisions, the hash
-of their log, which is the recorded one when nothing has changed, and how far they agree with a recording that was cut off. A `ClickLog`
-notes the clicks behind each decision on the way.
+`replay` returns the number of decisions, the hash of their log, which is the recorded one when nothing has changed, and how far they
+agree with a recording that was cut off. A `ClickLog` notes the clicks behind each decision on the way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import recorded_guard
 from pans.runtime.core.decision import DECISION_DTYPE, Decision, DecisionFlag
 from pans.runtime.core.follower import Follower, Place
-from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider, Verdict, Verdicts, verdicts_of
@@ -28,7 +26,7 @@ from pans.runtime.flow.matching import PassageFigures
 from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.ranges import Range
 from pans.runtime.wire.commands import Arm
-from pans.runtime.wire.messages import MalformedMessage, unpack_body
+from pans.runtime.wire.messages import Frame, MalformedMessage, unpack_body
 
 from .log import LogEncoder
 from .parts import place_of
@@ -45,16 +43,16 @@ class ClickLog:
     """Stands between a core and its back end, whichever, and remembers the clicks of every decision that it is asked for."""
 
     def __init__(self) -> None:
-        self._decider: Decider | None = None
         self.counts: list[NDArray[np.int64]] = []
         self.decisions: list[Decision] = []
         self.shots = 1
 
     def over(self, decider: Decider) -> Decider:
         """Return the back end that the core is to ask."""
-        self._decider = decider
-        self.name, self.n_features, self.n_classes = decider.name, decider.n_features, decider.n_classes
-        return self
+        self._back_end = decider
+        for name in ("name", "n_features", "n_classes", "scores_batch", "decide_batch"):
+            setattr(self, name, getattr(decider, name))
+        return cast("Decider", self)  # and no more: a kernel would take the tables of a back end that shows them
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """As `Decider`."""
@@ -63,27 +61,14 @@ class ClickLog:
         return self._back_end.decide(counts, shots)
 
     def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
-        """Decide many at once, as the compiled steps ask for."""
+        """Decide many at once, as the kernel asks for."""
         self.counts += list(counts.copy())
         self.shots = shots
         return verdicts_of(self._back_end, counts, shots)
 
-    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
-        """As `Decider`."""
-        return self._back_end.scores_batch(counts, shots)
-
-    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        """As `Decider`."""
-        return self._back_end.decide_batch(counts, shots)
-
     def note(self, decisions: Sequence[Decision]) -> None:
         """Take the decisions in their order: those that were asked for, in the order of asking."""
         self.decisions += [one for one in decisions if not one.flags & DecisionFlag.ABSTAINED or one.flags & int(ASKED)]
-
-    @property
-    def _back_end(self) -> Decider:
-        assert self._decider is not None
-        return self._decider
 
 
 class Replayed(NamedTuple):
@@ -114,10 +99,9 @@ def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = Non
         return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True, contradictions={})
     core, log = _replayed(recording, bundle, pictures)
     passages = replayed_figures(core, recording.events()) if isinstance(core, FlowCore) else None
-    sha256 = log.sha256()
-    same = sha256 if recording.complete else log.sha256_as_far
-    agrees, told = same == recording.decisions_sha256, dict(core.contradictions)
-    return Replayed(log.decisions, sha256, passages, recording.n_decisions, agrees, told)
+    sha256 = log.encoder.hexdigest()
+    agrees = (sha256 if recording.complete else log.sha256_as_far) == recording.decisions_sha256
+    return Replayed(log.decisions, sha256, passages, recording.n_decisions, agrees, dict(core.contradictions))
 
 
 class _Log:
@@ -127,24 +111,21 @@ class _Log:
         self.decisions = 0
         self.sha256_as_far = ""
         self._n_recorded, self._pictures = n_recorded, pictures
-        self._encoder = LogEncoder()
+        self.encoder = LogEncoder()
         self.take([])
 
     def take(self, decisions: Sequence[Any] | NDArray[np.void]) -> None:
         rows = np.asarray(decisions, DECISION_DTYPE)
         here = self._n_recorded - self.decisions  # rows up to the last recorded one
         if 0 <= here <= len(rows) and not self.sha256_as_far:
-            self._encoder.update(rows[:here])
-            self.sha256_as_far = self._encoder.hexdigest()
-            self._encoder.update(rows[here:])
+            self.encoder.update(rows[:here])
+            self.sha256_as_far = self.encoder.hexdigest()
+            self.encoder.update(rows[here:])
         else:
-            self._encoder.update(rows)
+            self.encoder.update(rows)
         self.decisions += len(rows)
         if self._pictures is not None and not isinstance(decisions, np.ndarray):
             self._pictures.note(decisions)
-
-    def sha256(self) -> str:
-        return self._encoder.hexdigest()
 
 
 def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures, NDArray[np.int64]]:
@@ -162,12 +143,7 @@ def _replayed(recording: Recording, bundle: Bundle, pictures: ClickLog | None) -
     """Drive a core through `recording`; return it and the log of its decisions."""
     core, sent = _rebuilt(recording, bundle, pictures)
     log = _Log(recording.n_decisions, pictures)
-    arms = list(sent.arms.items())
-    if pictures is None and isinstance(core, Core) and core.takes:
-        found = _by_kernel(core, arms, recording)
-    else:
-        found = _by_core(core, arms, recording)
-    for decisions in found:
+    for decisions in _decided(core, sent.arms, recording, by_kernel=pictures is None):
         log.take(decisions)
     went_on = "part_ended" in recording.summary  # in the next part
     was_cut = not recording.complete and log.decisions >= recording.n_decisions  # the run did not end there
@@ -191,7 +167,12 @@ def _rebuilt(recording: Recording, bundle: Bundle, pictures: ClickLog | None) ->
         plan = sent.plan(tick_hz, getattr(decider, "automaton", automaton), bundle.largest)
         if pictures is not None:
             decider = pictures.over(decider)
-        core = _core(config, plan, decider, bundle, shots, next(iter(sent.arms.values())).n_cycles)
+        guard = recorded_guard(config.get("dark", {}).get("guard", {}), plan, bundle, shots)
+        n_cycles = next(iter(sent.arms.values())).n_cycles
+        if "flow" not in config:
+            return Core(plan, decider, shots, n_cycles, guard), sent
+        core = recorded_flow_core(config["flow"], plan, decider, bundle, shots, n_cycles)
+        core.guard = guard
         return core, sent
     except _NOT_REBUILT as error:
         raise DamagedFileError(
@@ -227,72 +208,46 @@ def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
     return []
 
 
-def _core(
-    config: dict[str, Any], plan: Plan, decider: Decider, bundle: Bundle, shots: int, n_cycles: int
-) -> Core | FlowCore:
-    guard = recorded_guard(config.get("dark", {}).get("guard", {}), plan, bundle, shots)
-    if "flow" not in config:
-        return Core(plan, decider, shots, n_cycles, guard)
-    core = recorded_flow_core(config["flow"], plan, decider, bundle, shots, n_cycles)
-    core.guard = guard
-    return core
-
-
-class _Streams:
-    """The streams of a run in their order: each ARM begins one, which has the session of its frames; a later part goes on in one."""
-
-    def __init__(self, core: Follower, arms: list[tuple[int, Arm]], recording: Recording) -> None:
-        self.session = 0
-        self._core, self._following = core, iter(arms)
-        self._place, self._path = place_of(recording), recording.path
-
-    def begin_up_to(self, session: int) -> list[Any]:
-        """Begin streams until that of `session`, and return the decisions; DamagedFileError if there is none."""
-        decisions: list[Any] = []
-        while session != self.session:
-            if (begun := self._begin_next()) is None:
-                raise DamagedFileError(f"{self._path}: a message of a session that never armed the device")
-            decisions += begun
-        return decisions
-
-    def begin_rest(self) -> Iterator[Sequence[Any]]:
-        """Begin the streams that gave no message at all, and yield the decisions."""
-        while (begun := self._begin_next()) is not None:
-            yield begun
-
-    def _begin_next(self) -> Sequence[Any] | None:
-        self.session, arm = next(self._following, (0, None))
-        if arm is None:
-            return None
-        output = self._core.begin(arm.start_tick, arm.n_cycles)
-        if self._place is not None:
-            self._core.resume(Place.of(self._place))
-            self._place = None
-        return output.decisions
-
-
-def _by_core(core: Follower, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[Sequence[Any]]:
-    """Drive `core` as the live loop did, message by message."""
-    streams = _Streams(core, arms, recording)
-    for _, body in recording.messages():
-        frame = unpack_body(body)
-        if frame.session != streams.session:
-            yield streams.begin_up_to(frame.session)
-        yield core.step(frame).decisions
-    yield from streams.begin_rest()
-
-
-def _by_kernel(
-    core: Core, arms: list[tuple[int, Arm]], recording: Recording
+def _decided(
+    core: Core | FlowCore, arms: Mapping[int, Arm], recording: Recording, *, by_kernel: bool
 ) -> Iterator[Sequence[Any] | NDArray[np.void]]:
-    """Drive `core` as the live loop did, many messages in one call of the kernel; rows are valid until the next ones."""
-    streams, streamed = _Streams(core, arms, recording), StreamCore.of(core, 0)
-    for messages in recording.iter_messages():
-        for batch in streamed.replay(messages):
-            yield batch.rows
-            for frame in batch.others:
-                if frame.session != streams.session:
-                    yield streams.begin_up_to(frame.session)
-                    streamed.follow(frame.session)
-                    yield core.step(frame).decisions
-    yield from streams.begin_rest()
+    """Drive `core` as the live loop did, and yield its decisions; rows are valid until the next ones.
+
+    `by_kernel` takes many messages in one call, where the core has a kernel. Those of another session than the present one begin the
+    streams of the next ARMs.
+    """
+    streams, session = _begun(core, arms, place_of(recording)), 0
+    streamed = StreamCore.of(core, 0) if by_kernel and isinstance(core, Core) and core.takes else None
+
+    def batches() -> Iterator[tuple[Sequence[Any] | NDArray[np.void], list[Frame]]]:
+        if streamed is None:
+            yield from (([], [unpack_body(body)]) for _, body in recording.messages())
+            return
+        for messages in recording.iter_messages():
+            for batch in streamed.replay(messages):
+                yield batch.rows, [frame for frame in batch.others if frame.session != session]
+
+    for rows, frames in batches():
+        yield rows
+        for frame in frames:
+            while frame.session != session:
+                if (begun := next(streams, None)) is None:
+                    raise DamagedFileError(f"{recording.path}: a message of a session that never armed the device")
+                session, decisions = begun
+                yield decisions
+            if streamed is not None:
+                streamed.follow(session)
+            yield core.step(frame).decisions
+    yield from (decisions for _, decisions in streams)  # those that gave no message at all
+
+
+def _begun(
+    core: Follower, arms: Mapping[int, Arm], place: Mapping[str, Any] | None
+) -> Iterator[tuple[int, Sequence[Any]]]:
+    """Begin the stream of each ARM, the first one at the `place` of a later part; yield its session, and the decisions."""
+    for session, arm in arms.items():
+        output = core.begin(arm.start_tick, arm.n_cycles)
+        if place is not None:
+            core.resume(Place.of(place))
+            place = None
+        yield session, output.decisions
