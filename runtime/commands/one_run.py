@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,7 +29,6 @@ from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import DISK_NEARLY_FULL, INTERRUPTED, RECORDING_DELETED, REFUSED, Stop, stop_signals
 from pans.runtime.live.run_options import FLOW, RunOptions
-from pans.runtime.operate.warm import load_ahead
 from pans.runtime.timing.realtime import check_core
 
 from .run_files import check_run_files, claimed, gone_if_refused, part_limits, recording_header, what_was_run
@@ -408,7 +408,7 @@ def _prepare_and_run(options: RunOptions, profile: Profile, around: _Around) -> 
         say(f"pans: live page at {around.monitor.url}")
     try:
         run = _Run(options, profile, around)
-        load_ahead()
+        _load_ahead()
     except BaseException as error:
         try:
             opening.result().close()
@@ -436,6 +436,21 @@ def _in_background(call: Callable[[], Link]) -> Future[Link]:
 
     threading.Thread(target=work, daemon=True).start()
     return future
+
+
+def _load_ahead() -> None:
+    """Load what a run needs besides, while its port opens: nothing of it has to be loaded between there and ARM."""
+    import numpy as np
+
+    from pans.runtime.kernel.receive import unpack_blocks
+    from pans.runtime.record.recorder import load_kernels
+    from pans.runtime.wire.framing import FrameDecoder
+
+    load_kernels()
+    FrameDecoder().warm_up()
+    unpack_blocks(np.zeros(8, np.uint8), np.zeros((0, 4), np.int64), np.zeros(1, np.uint16), np.zeros(1, np.uint8))
+    for name in ("live.loop", "monitor.snapshot", "watch.watchers"):
+        import_module(f"pans.runtime.{name}")
 
 
 def _traced(options: RunOptions, link: Link, path: Path, around: _Around) -> Link:

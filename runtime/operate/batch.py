@@ -12,6 +12,7 @@ import glob
 import importlib
 import json
 import os
+import re
 import shlex
 import signal
 import socket
@@ -62,16 +63,16 @@ def items_of(command: str, inputs: Sequence[str], vary: Sequence[str], extra: st
 
     `vary` holds `NAME=VALUES`, `extra` further words, in which `{path}`, `{folder}`, `{stem}` and the varied names are replaced.
     """
-    options = [_values(one) for one in vary]
+    options = dict(_values(one) for one in vary)
     paths = [path for one in inputs for path in (_matching(one) if files else [one])]
     try:
         words = shlex.split(extra)
     except ValueError as error:
         raise UsageError(f"--with {extra!r}: {error}", remedy="close its quotes") from error
     items = [
-        _item(command, path, dict(zip((name for name, _ in options), chosen, strict=True)), words)
+        _item(command, path, dict(zip(options, chosen)), words)
         for path in dict.fromkeys(paths)
-        for chosen in product(*(values for _, values in options))
+        for chosen in product(*options.values())
     ]
     if len(items) > ITEMS_MAX:
         raise UsageError(f"{len(items)} items, allowed at most {ITEMS_MAX}", remedy="vary fewer options at once")
@@ -80,66 +81,57 @@ def items_of(command: str, inputs: Sequence[str], vary: Sequence[str], extra: st
 
 def _matching(pattern: str) -> list[str]:
     found = sorted(glob.glob(pattern, recursive=True)) if glob.has_magic(pattern) else [pattern]
-    missing = [path for path in found if not os.path.exists(path)]
-    if not found or missing:
+    if not found or not all(map(os.path.exists, found)):
         raise UsageError(f"{pattern}: there is no such file", remedy="put patterns in quotes: 'runs/*/run.pansrec'")
     return found
 
 
 def _values(text: str) -> tuple[str, list[str]]:
     """Read `NAME=1,2,5` or `NAME=0-9`."""
-    name, is_pair, values = text.partition("=")
-    name = name.removeprefix("--")
-    first, is_range, last = values.partition("-")
-    if is_range and first.isdecimal() and last.isdecimal() and len(last) < 10 and int(first) <= int(last):
-        if int(last) - int(first) >= VALUES_MAX:
-            raise UsageError(f"--vary {text}: more than {VALUES_MAX} values", remedy="vary fewer")
-        return name, [str(number) for number in range(int(first), int(last) + 1)]
+    name, _, values = text.removeprefix("--").partition("=")
     found = [value for value in values.split(",") if value]
-    if not is_pair or not name or not found:
+    ends = re.fullmatch(r"(\d{1,9})-(\d{1,9})", values)
+    if ends and int(ends[1]) <= int(ends[2]):
+        numbers = range(int(ends[1]), int(ends[2]) + 1)
+        if len(numbers) > VALUES_MAX:
+            raise UsageError(f"--vary {text}: more than {VALUES_MAX} values", remedy="vary fewer")
+        found = [str(number) for number in numbers]
+    if not name or not found:
         raise UsageError(f"--vary {text!r} is not NAME=VALUES", remedy="write seed=0-9, or eta=0.5,1,2")
     return name, found
 
 
 def _item(command: str, path: str, chosen: Mapping[str, str], extra: Sequence[str]) -> Item:
-    places = {"path": path, "folder": os.path.dirname(path) or ".", "stem": Path(path).stem, **chosen}
     words = [command, path]
     for name, value in chosen.items():
         if not any(f"{{{name}}}" in word for word in extra):
             words += [f"--{name}", value]
-    words += [_filled(word, places) for word in extra]
-    return Item(path, tuple(words), tuple(chosen.items()), json.dumps([words, _identity(path)]))
-
-
-def _filled(word: str, places: Mapping[str, str]) -> str:
-    for name, value in places.items():
-        word = word.replace(f"{{{name}}}", value)
-    return word
-
-
-def _identity(path: str) -> list[int]:
-    """Return size and time of change of a file: one that has changed is done again."""
+    places = {"path": path, "folder": os.path.dirname(path) or ".", "stem": Path(path).stem, **chosen}
+    for word in extra:
+        for name, value in places.items():
+            word = word.replace(f"{{{name}}}", value)
+        words.append(word)
     try:
         found = os.stat(path)
-    except OSError:
-        return []
-    return [found.st_size, found.st_mtime_ns]
+        identity = [found.st_size, found.st_mtime_ns]  # one that has changed is done again
+    except OSError:  # no file, but a name
+        identity = []
+    return Item(path, tuple(words), tuple(chosen.items()), json.dumps([words, identity]))
 
 
 # ---- one item, in a worker ----
 
 
-def run_item(words: Sequence[str], folder: str) -> dict[str, Any]:
+def run_item(words: Sequence[str], folder: str, patience_s: float | None = None) -> dict[str, Any]:
     """Run `pans WORDS --json` in `folder`, in a process of its own, and return exit code, seconds, host, and the answer or the error."""
     began_s = time.monotonic()
     command = [sys.executable, "-m", "pans", *words, "--json"]
-    row: dict[str, Any] = {"exit": None, "host": socket.gethostname(), "answer": None, "error": None}
+    row: dict[str, Any] = {"exit": None, "seconds": 0.0, "host": socket.gethostname(), "answer": None, "error": None}
+    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
     try:
-        done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, stdin=subprocess.DEVNULL, preexec_fn=_end_with_parent()
-        )
-    except OSError as error:
-        return row | {"seconds": 0.0, "error": f"cannot be started in {folder}: {error.strerror or error}"}
+        done = subprocess.run(command, cwd=folder, timeout=patience_s, preexec_fn=_end_with_parent(), **pipes)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return row | {"error": f"cannot be run in {folder}: {error}"}
     answer = _answer(done.stdout)
     fault = answer.get("error") if isinstance(answer, dict) else None
     if isinstance(fault, dict):
@@ -184,10 +176,8 @@ def results_of_dask(items: Sequence[Item], folder: str, address: str) -> Iterato
     try:
         client = distributed.Client(address, timeout=CONNECT_S)
     except (OSError, ValueError) as error:
-        raise LinkError(
-            f"--dask {address}: no scheduler answers: {error}",
-            remedy="start one with `dask scheduler`, or use --workers",
-        ) from error
+        what = f"--dask {address}: no scheduler answers: {error}"
+        raise LinkError(what, remedy="start one with `dask scheduler`, or use --workers") from error
     with client:
         futures = {
             client.submit(run_item, item.words, folder, key=f"pans-{number}", pure=False, retries=RETRIES): item
@@ -196,20 +186,16 @@ def results_of_dask(items: Sequence[Item], folder: str, address: str) -> Iterato
         by_key = {future.key: item for future, item in futures.items()}
         try:
             for future in distributed.as_completed(list(futures)):
-                yield by_key[future.key], _result(future)
+                try:
+                    row = future.result()
+                except Exception as error:  # a worker that died again and again, or that has no pans
+                    row = {"exit": None, "seconds": None, "host": "", "answer": None}
+                    row["error"] = f"{type(error).__name__}: {error}"[:2000]
+                yield by_key[future.key], row
                 future.release()
         except BaseException:
             client.cancel(list(futures), force=True)
             raise
-
-
-def _result(future: Any) -> dict[str, Any]:
-    try:
-        found: dict[str, Any] = future.result()
-    except Exception as error:  # a worker that died again and again, or that has no pans
-        failed = {"exit": None, "seconds": None, "host": "", "answer": None}
-        return failed | {"error": f"{type(error).__name__}: {error}"[:2000]}
-    return found
 
 
 def need_distributed() -> Any:
@@ -217,24 +203,22 @@ def need_distributed() -> Any:
     try:
         return importlib.import_module("distributed")
     except ImportError as error:
-        raise UsageError(
-            "--dask needs the packages dask and distributed, which are not installed",
-            remedy="pip install 'pans-runtime[dask]'",
-        ) from error
+        what = "--dask needs the packages dask and distributed, which are not installed"
+        raise UsageError(what, remedy="pip install 'pans-runtime[dask]'") from error
 
 
 # ---- the journal ----
 
 
 class Journal:
-    """The results so far, one JSON object per line, of an item each."""
+    """The results so far, one JSON object per line of the file `path`; `rows` by the keys of their items."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.rows: dict[str, dict[str, Any]] = {}
 
     def read(self) -> None:
-        """Take what is there; a last line that was cut goes. UsageError for a file that is no journal."""
+        """Read what is there; a last line that was cut goes. UsageError for a file that is no journal."""
         whole = 0
         with open(self.path, "rb") as file:
             for line in file:
@@ -243,28 +227,22 @@ class Journal:
                     break
                 self.rows[row["key"]] = row
                 whole += len(line)
-            rest = file.read(1)
-        size = self.path.stat().st_size
+            rest, size = file.read(1), os.fstat(file.fileno()).st_size
         if rest or (size and not whole):
             raise UsageError(f"{self.path}: is not the journal of a batch", remedy="choose another name with --out")
         os.truncate(self.path, whole)
 
-    def add(self, item: Item, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Write one result and return its row."""
-        full = {"format": FORMAT, "key": item.key, "item": item.path, **dict(item.varied), **row}
-        line = (json.dumps(full) + "\n").encode()
+    def add(self, item: Item, row: Mapping[str, Any]) -> None:
+        """Write one result, synced."""
+        self.rows[item.key] = {"format": FORMAT, "key": item.key, "item": item.path, **dict(item.varied), **row}
         try:
             with open(self.path, "ab") as file:
-                file.write(line)
+                file.write((json.dumps(self.rows[item.key]) + "\n").encode())
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise UsageError(
-                f"{self.path}: cannot be written: {error.strerror or error}",
-                remedy="make room, then go on with --resume",
-            ) from error
-        self.rows[item.key] = full
-        return full
+            what = f"{self.path}: cannot be written: {error.strerror or error}"
+            raise UsageError(what, remedy="make room, then continue with --resume") from error
 
 
 def flat_rows(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -297,7 +275,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     where.add_argument("--workers", type=WORKERS.option, metavar="N", help="N at a time on this machine")
     scheduler = "a scheduler of Dask, such as tcp://host:8786 (extra dask)"
     where.add_argument("--dask", default="", metavar="URL", help=scheduler)
-    resume = "go on with these results: only what is missing or has changed"
+    resume = "continue these results: only what is missing or has changed"
     add("--resume", action="store_true", help=resume)
     add_force(parser)
 
@@ -318,7 +296,7 @@ def _run(args: argparse.Namespace) -> int:
     try:
         _work(args, journal, todo)
     except KeyboardInterrupt:
-        say(f"interrupted; finished results are in {journal.path}\n  go on: the same command with --resume")
+        say(f"interrupted; finished results are in {journal.path}\n  continue: the same command with --resume")
         return EXIT_INTERRUPTED
     rows = [journal.rows[item.key] for item in items]
     if args.out.suffix == ".parquet":
@@ -347,7 +325,9 @@ def _journal(args: argparse.Namespace) -> Journal:
         need_distributed()
     path = args.out if args.out.suffix == ".jsonl" else args.out.with_name(f"{args.out.name}.jsonl")
     if not args.resume and path.exists() and not args.force:
-        raise UsageError(f"{path}: exists already", remedy="go on with --resume, choose another name, or use --force")
+        raise UsageError(
+            f"{path}: exists already", remedy="continue with --resume, choose another name, or use --force"
+        )
     mine = args.resume and path.exists()
     check_outputs({args.out, path}, force=args.force, ours=lambda found: mine)
     return Journal(path)

@@ -27,9 +27,8 @@ def add_option_file(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("options in a file (docs/how-to/run-for-days.md)")
     group.add_argument("--config", type=Path, metavar="FILE", help="take the options of this TOML file")
     group.add_argument("--unset", action="append", default=[], metavar="NAME", help="leave out an option of the file")
-    group.add_argument(
-        "--write-config", type=Path, metavar="FILE", help="write all options to this TOML file, and do not run"
-    )
+    what = "write all options to this TOML file, and do not run"
+    group.add_argument("--write-config", type=Path, metavar="FILE", help=what)
 
 
 def prepare_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:
@@ -48,17 +47,16 @@ def prepare_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> li
     given, where = _read(path, options)
     for name in unset:
         if given.pop(name.removeprefix("--"), None) is None:
-            remedy = f"it has: {', '.join(given) or 'none'}"
-            raise UsageError(f"--unset {name}: {path} has no such option", remedy=remedy)
+            known = ", ".join(given) or "none"
+            raise UsageError(f"--unset {name}: {path} has no such option", remedy=f"it has: {known}")
     typed, before = {word.partition("=")[0] for word in words}, list[str]()
     for name, value in given.items():
         action, place = options[name], f"{where(name)}: {name}"
         values = _values(parser, action, value, place)
         if not action.option_strings:
             action.default, action.required, action.nargs = values[0], False, "?"
-        elif not (
-            isinstance(action, argparse._AppendAction) and f"--{name}" in typed
-        ):  # a typed list replaces the file's
+        # a typed list replaces the file's
+        elif not (isinstance(action, argparse._AppendAction) and f"--{name}" in typed):
             before += [f"--{name}" if text is True else f"--{name}={text}" for text in values]
     return [*before, *words]
 
@@ -117,27 +115,26 @@ def _read(path: Path, options: Mapping[str, argparse.Action]) -> tuple[dict[str,
 
 def _values(parser: argparse.ArgumentParser, action: argparse.Action, value: Any, where: str) -> list[Any]:
     """Return the words after an option for its value in the file: True alone for an option without one, none where that is off."""
+    found = f"{where}: found {json.dumps(value, default=str)[:60]}"
+    is_list = isinstance(action, argparse._AppendAction)
     if action.nargs == 0:
         if not isinstance(value, bool):
-            raise ConfigError(f"{where}: found {_shown(value)}, allowed: true or false")
+            raise ConfigError(f"{found}, allowed: true or false")
         return [True] if value else []
-    is_list = isinstance(action, argparse._AppendAction)
     if is_list and not isinstance(value, list):
-        raise ConfigError(f'{where}: found {_shown(value)}, allowed: a list, such as ["a", "b"]')
-    return [_text(parser, action, item, where) for item in (value if is_list else [value])]
-
-
-def _text(parser: argparse.ArgumentParser, action: argparse.Action, value: Any, where: str) -> str:
-    if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise ConfigError(f"{where}: found {_shown(value)}, allowed: a number or a text")
-    if not isinstance(value, str) and action.type in (None, Path):
-        raise ConfigError(f"{where}: found {_shown(value)}, allowed: a text in quotes")
-    text = value if isinstance(value, str) else repr(value)
-    try:
-        parser._check_value(action, parser._get_value(action, text))
-    except argparse.ArgumentError as error:
-        raise ConfigError(f"{where}: {error.message}") from error
-    return text
+        raise ConfigError(f'{found}, allowed: a list, such as ["a", "b"]')
+    texts = []
+    for item in value if is_list else [value]:
+        if isinstance(item, bool) or not isinstance(item, str | int | float):
+            raise ConfigError(f"{found}, allowed: a number or a text")
+        if not isinstance(item, str) and action.type in (None, Path):
+            raise ConfigError(f"{found}, allowed: a text in quotes")
+        texts.append(item if isinstance(item, str) else repr(item))
+        try:
+            parser._check_value(action, parser._get_value(action, texts[-1]))
+        except argparse.ArgumentError as error:
+            raise ConfigError(f"{where}: {error.message}") from error
+    return texts
 
 
 def _entry(name: str, action: argparse.Action, value: Any) -> Iterator[str]:
@@ -155,19 +152,10 @@ def _entry(name: str, action: argparse.Action, value: Any) -> Iterator[str]:
 
 
 def _toml(value: Any, name: str) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_toml(item, name) for item in value)}]"
-    text = str(value)
+    """Write a value: what JSON holds is TOML too, but for one control character."""
+    text = json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
     try:
         text.encode()
     except UnicodeEncodeError as error:
-        raise UsageError(f"--{name} {text!a}: is not UTF-8, and cannot stand in a TOML file") from error
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _shown(value: Any) -> str:
-    return json.dumps(value, default=str)[:60]
+        raise UsageError(f"--{name} {value!a}: is not UTF-8, and cannot stand in a TOML file") from error
+    return text

@@ -18,6 +18,21 @@ from pans.runtime.errors import UsageError
 from pans.runtime.outputs import whole_file
 from pans.runtime.record import Recording
 
+COLUMNS = {  # name: its type, and the field of a decision ("": made of another one)
+    "decision": ("int64", "index"),
+    "tick": ("int64", "tick"),
+    "exposure": ("int64", "exposure_index"),
+    "object": ("int64", "object"),
+    "first_shot": ("int64", "shot"),
+    "clicks": ("int64", "clicks"),
+    "label": ("int32", "label"),
+    "class": ("string", ""),
+    "truth": ("int32", "truth"),
+    "probability": ("float32", "probability"),
+    "flags": ("int32", "flags"),
+    "exposures": ("int64", "exposures"),
+}
+
 
 def need_pyarrow() -> Any:
     """Return pyarrow; UsageError that names the extra."""
@@ -25,9 +40,8 @@ def need_pyarrow() -> Any:
         importlib.import_module("pyarrow.parquet")
         return importlib.import_module("pyarrow")
     except ImportError as error:
-        raise UsageError(
-            "Parquet needs the package pyarrow, which is not installed", remedy="pip install 'pans-runtime[parquet]'"
-        ) from error
+        what = "Parquet needs the package pyarrow, which is not installed"
+        raise UsageError(what, remedy="pip install 'pans-runtime[parquet]'") from error
 
 
 def write_decisions(path: Path, recording: Recording, *, force: bool = False) -> None:
@@ -36,52 +50,31 @@ def write_decisions(path: Path, recording: Recording, *, force: bool = False) ->
     The schema's metadata hold `pans`, a JSON object with the recording's facts (`simulated`, `tick_us`, `decisions_sha256`, ...).
     """
     pyarrow = need_pyarrow()
-    classes = recording.bundle().classes if recording.bundle_place else ()
-    tick_us = 1e6 / int(recording.header["config"]["tick_hz"])
+    classes = list(recording.bundle().classes if recording.bundle_place else ())
     facts = {
         "recording": recording.path.name,
         "simulated": recording.simulated,
         "complete": recording.complete,
-        "tick_us": tick_us,
-        "classes": list(classes),
+        "tick_us": 1e6 / int(recording.header["config"]["tick_hz"]),
+        "classes": classes,
         "decisions_sha256": recording.decisions_sha256,
         "bundle_sha256": recording.header.get("bundle_sha256"),
     }
-    schema = _decision_schema(pyarrow).with_metadata({"pans": json.dumps(facts)})
-    names = pyarrow.array(list(classes), pyarrow.string())
+    columns = [(name, getattr(pyarrow, kind)()) for name, (kind, _) in COLUMNS.items()]
+    schema = pyarrow.schema(columns, metadata={"pans": json.dumps(facts)})
+    names = np.array([*classes, None], object)  # the last one is that of an unknown or nameless label
     with whole_file(path, force=force) as beside, pyarrow.parquet.ParquetWriter(beside, schema) as writer:
         for rows in recording.iter_decisions():
-            writer.write_batch(_decision_batch(pyarrow, schema, rows, names))
-
-
-def _decision_schema(pyarrow: Any) -> Any:
-    types = {
-        **{"decision": "int64", "tick": "int64", "exposure": "int64", "object": "int64", "first_shot": "int64"},
-        **{"clicks": "int64", "label": "int32", "class": "string", "truth": "int32", "probability": "float32"},
-        **{"flags": "int32", "exposures": "int64"},
-    }
-    return pyarrow.schema([(name, getattr(pyarrow, kind)()) for name, kind in types.items()])
-
-
-def _decision_batch(pyarrow: Any, schema: Any, rows: Any, names: Any) -> Any:
-    label = rows["label"].astype(np.int64)
-    unknown = label == NO_LABEL
-    nameless = unknown | (label >= len(names))
-    of_class = pyarrow.array(np.where(nameless, 0, label), mask=nameless)
-    columns = {
-        **{"decision": rows["index"], "tick": rows["tick"], "exposure": rows["exposure_index"]},
-        **{"object": rows["object"], "first_shot": rows["shot"], "clicks": rows["clicks"]},
-        "label": pyarrow.array(label, mask=unknown),
-        "class": names.take(of_class) if len(names) else pyarrow.nulls(len(rows), pyarrow.string()),
-        "truth": pyarrow.array(rows["truth"].astype(np.int64), mask=rows["truth"] < 0),
-        "probability": pyarrow.array(rows["probability"], mask=unknown),
-        **{"flags": rows["flags"], "exposures": rows["exposures"]},
-    }
-    arrays = [
-        pyarrow.array(np.ascontiguousarray(one)) if isinstance(one, np.ndarray) else one for one in columns.values()
-    ]
-    cast = [array.cast(field.type) for array, field in zip(arrays, schema, strict=True)]
-    return pyarrow.record_batch(cast, schema=schema)
+            label = rows["label"].astype(np.int64)
+            unknown = label == NO_LABEL
+            found = {name: rows[field] for name, (_, field) in COLUMNS.items() if field}
+            found["class"] = names[np.where(label < len(classes), label, len(classes))]
+            masks = {"label": unknown, "probability": unknown, "truth": rows["truth"] < 0}
+            arrays = [
+                pyarrow.array(np.ascontiguousarray(found[name]), mask=masks.get(name)).cast(kind)
+                for name, kind in columns
+            ]
+            writer.write_batch(pyarrow.record_batch(arrays, schema=schema))
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], *, force: bool = False) -> None:

@@ -13,7 +13,7 @@ import re
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -45,24 +45,15 @@ class Run:
     verdict: str  # PASS, FAIL, "running", or "cut" without an END
     decisions: int | None
     accuracy: float | None
-    size: int  # bytes, of the run's own files
+    bytes: int  # of the run's own files
     simulated: bool
     locked: bool
     files: tuple[Path, ...] = field(repr=False)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the facts, JSON-able."""
-        return {
-            "folder": str(self.folder),
-            "started": self.started.isoformat(timespec="seconds"),
-            "bundle": self.bundle,
-            "verdict": self.verdict,
-            "decisions": self.decisions,
-            "accuracy": self.accuracy,
-            "bytes": self.size,
-            "simulated": self.simulated,
-            "locked": self.locked,
-        }
+        """Return the facts but for the files, JSON-able."""
+        facts = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "files"}
+        return facts | {"folder": str(self.folder), "started": self.started.isoformat(timespec="seconds")}
 
 
 def runs_in(root: Path) -> list[Run]:
@@ -79,27 +70,29 @@ def runs_in(root: Path) -> list[Run]:
 def run_of(folder: Path) -> Run | None:
     """Return the run in `folder`, None if there is no recording in it."""
     try:
-        entries = sorted(path for path in folder.iterdir() if path.name != LATEST)
+        entries = sorted(path for path in folder.iterdir() if path.is_file() and not path.is_symlink())
     except OSError:
         return None
-    recordings = [path for path in entries if path.suffix == ".pansrec" and path.is_file() and not path.is_symlink()]
+    recordings = [path for path in entries if path.suffix == ".pansrec"]
     if not recordings:
         return None
-    files = [path for path in entries if OURS.fullmatch(path.name) and path.is_file() and not path.is_symlink()]
+    files = tuple(path for path in entries if OURS.fullmatch(path.name))
     (header, bundle), summary = _begin(recordings[0]), _end(recordings[-1])
+    started = datetime.fromtimestamp(recordings[0].stat().st_mtime, UTC)
+    with suppress(ValueError):
+        started = datetime.fromisoformat(str(header.get("created_utc", "")))
     is_locked = _is_locked(folder / RUN_LOCK)
-    verdict = "running" if is_locked else str(summary.get("verdict", "cut"))
     return Run(
         folder=folder,
-        started=_started(header, recordings[0]),
+        started=started if started.tzinfo else started.replace(tzinfo=UTC),
         bundle=bundle or str(header.get("bundle_sha256", ""))[:12],
-        verdict=verdict[:20],
+        verdict="running" if is_locked else str(summary.get("verdict", "cut"))[:20],
         decisions=_number(summary.get("decisions")),
         accuracy=_number(summary.get("accuracy")),
-        size=sum(path.stat().st_size for path in files),
+        bytes=sum(path.stat().st_size for path in files),
         simulated=bool(header.get("simulated") or summary.get("simulated")),
         locked=is_locked,
-        files=tuple(files),
+        files=files,
     )
 
 
@@ -113,38 +106,27 @@ def _begin(path: Path) -> tuple[dict[str, Any], str]:
             if block is not None and block.kind == Kind.HEADER:
                 header, chain = parse_json_object(block.payload, str(path)), block.chain
             elif block is not None and block.kind == Kind.BUNDLE:
-                return header, _name_in(block.payload)
+                start = block.payload.find(b"{", 0, 256)  # nothing else of the bundle is read
+                return header, str(_object_at(block.payload[: start + (1 << 20)], start).get("name", ""))[:100]
     return header, ""
-
-
-def _name_in(bundle: bytes) -> str:
-    """Return the name that a bundle gives itself, "" without one; nothing else of it is read."""
-    start = bundle.find(b"{", 0, 256)
-    with suppress(ValueError, RecursionError):
-        found, _ = json.JSONDecoder().raw_decode(bundle[start : start + (1 << 20)].decode("ascii", "replace"))
-        return str(found.get("name", ""))[:100]
-    return ""
 
 
 def _end(path: Path) -> dict[str, Any]:
     """Return the summary of a recording's END, {} without one; its bytes are not checked against the whole file."""
-    with suppress(PansError, OSError, ValueError, RecursionError), open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        file.seek(max(0, size - END_MAX_BYTES))
+    with suppress(OSError), open_regular(path) as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - END_MAX_BYTES))
         tail = file.read(END_MAX_BYTES)
-        start = tail.rfind(b'{"blocks":')
-        if start >= 0:
-            found, _ = json.JSONDecoder().raw_decode(tail[start:].decode("ascii", "replace"))
-            summary = found.get("summary")
-            return summary if isinstance(summary, dict) else {}
+        summary = _object_at(tail, tail.rfind(b'{"blocks":')).get("summary")
+        return summary if isinstance(summary, dict) else {}
     return {}
 
 
-def _started(header: dict[str, Any], path: Path) -> datetime:
-    with suppress(ValueError):
-        found = datetime.fromisoformat(str(header.get("created_utc", "")))
-        return found if found.tzinfo else found.replace(tzinfo=UTC)
-    return datetime.fromtimestamp(path.stat().st_mtime, UTC)
+def _object_at(data: bytes, start: int) -> dict[str, Any]:
+    """The JSON object that begins at `start` (-1: none), {} where there is none."""
+    with suppress(ValueError, RecursionError):
+        found, _ = json.JSONDecoder().raw_decode(data[start:].decode("ascii", "replace"))
+        return found if isinstance(found, dict) else {}
+    return {}
 
 
 def _number(value: Any) -> Any:
@@ -182,7 +164,7 @@ def prunable(
         for run in sorted(runs, key=lambda run: run.started, reverse=True)[keep:]
         if not run.locked
         and (older_s is None or at - run.started.timestamp() > older_s)
-        and (larger is None or run.size > larger)
+        and (larger is None or run.bytes > larger)
     ]
 
 
@@ -225,9 +207,8 @@ def size_bytes(text: str) -> int:
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "what", nargs="*", metavar="[prune] [FOLDER]", help=f"list or prune this folder (default {RUNS})"
-    )
+    what = f"list or prune this folder (default {RUNS})"
+    parser.add_argument("what", nargs="*", metavar="[prune] [FOLDER]", help=what)
     group = parser.add_argument_group("prune: which runs go; all that is given must hold")
     group.add_argument("--older-than", type=duration_s, metavar="TIME", help="begun longer ago than that: 30d, 12h, 2w")
     group.add_argument("--larger-than", type=size_bytes, metavar="SIZE", help="larger than that: 5GB, 200MB")
@@ -247,45 +228,33 @@ def _run(args: argparse.Namespace) -> int:
         if getattr(args, name) not in (None, False):
             option = name.replace("_", "-")
             raise UsageError(f"--{option} has no effect on a list", remedy=f"pans runs prune --{option} ...")
-    runs = runs_in(folder)
-    latest = folder / LATEST
-    payload: dict[str, Any] = {
-        "folder": str(folder),
-        "latest": str(latest.resolve()) if latest.is_symlink() else None,
-        "bytes": sum(run.size for run in runs),
-        "runs": [run.as_json() for run in runs],
-    }
-    emit(args, payload, "\n".join([*_table(runs), f"{len(runs)} runs, {_size(payload['bytes'])} in {folder}"]))
+    runs, latest = runs_in(folder), folder / LATEST
+    total = sum(run.bytes for run in runs)
+    named = {"folder": str(folder), "latest": str(latest.resolve()) if latest.is_symlink() else None}
+    payload = named | {"bytes": total, "runs": [run.as_json() for run in runs]}
+    emit(args, payload, "\n".join([*_table(runs), f"{len(runs)} runs, {_size(total)} in {folder}"]))
     return EXIT_FINE
 
 
 def _prune(args: argparse.Namespace, folder: Path) -> int:
     if args.older_than is None and args.larger_than is None and args.keep is None:
-        raise UsageError(
-            "`pans runs prune` needs to know which runs may go", remedy="give --older-than, --larger-than or --keep"
-        )
-    runs = runs_in(folder)
+        remedy = "give --older-than, --larger-than or --keep"
+        raise UsageError("`pans runs prune` needs to know which runs may go", remedy=remedy)
+    runs, stays = runs_in(folder), list[str]()
     going = prunable(runs, older_s=args.older_than, larger=args.larger_than, keep=args.keep or 0)
-    total = sum(run.size for run in going)
-    stays: list[str] = []
-    if args.yes:
-        for run in going:
-            try:
-                stays += delete_run(run)
-            except UsageError as error:  # it began to run since it was listed
-                stays.append(error.message)
-        latest = folder / LATEST
-        if latest.is_symlink() and not latest.exists():
-            latest.unlink()  # it named a run that is gone
+    total = sum(run.bytes for run in going)
+    for run in going if args.yes else ():
+        try:
+            stays += delete_run(run)
+        except UsageError as error:  # it began to run since it was listed
+            stays.append(error.message)
+    latest = folder / LATEST
+    if args.yes and latest.is_symlink() and not latest.exists():
+        latest.unlink()  # it named a run that is gone
     for line in stays:
         warn(line)
-    payload = {
-        "folder": str(folder),
-        "deleted": bool(args.yes),
-        "bytes": total,
-        "runs": [run.as_json() for run in going],
-        "left": stays,
-    }
+    payload = {"folder": str(folder), "deleted": bool(args.yes), "bytes": total}
+    payload |= {"runs": [run.as_json() for run in going], "left": stays}
     done = f"{len(going)} of {len(runs)} runs, {_size(total)}"
     last = f"deleted: {done}" if args.yes else f"would be deleted: {done}\nnext: the same command with --yes"
     emit(args, payload, "\n".join([*_table(going), last]))
@@ -293,19 +262,16 @@ def _prune(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _table(runs: Sequence[Run]) -> list[str]:
-    rows = [("begun", "verdict", "decisions", "accuracy", "size", "bundle", "folder"), *(_row(run) for run in runs)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return lines if runs else []
-
-
-def _row(run: Run) -> tuple[str, ...]:
-    accuracy = "" if run.accuracy is None else f"{100 * run.accuracy:.1f} %"
-    verdict = f"{run.verdict}{' SIMULATED' if run.simulated else ''}"
-    begun = run.started.astimezone().strftime("%Y-%m-%d %H:%M")
-    decisions = "" if run.decisions is None else str(run.decisions)
-    names = one_line(run.bundle, 40), one_line(run.folder.name, 80)
-    return (begun, one_line(verdict, 40), decisions, accuracy, _size(run.size), *names)
+    rows = [("begun", "verdict", "decisions", "accuracy", "size", "bundle", "folder")]
+    for run in runs:
+        verdict = one_line(f"{run.verdict}{' SIMULATED' if run.simulated else ''}", 40)
+        begun = run.started.astimezone().strftime("%Y-%m-%d %H:%M")
+        decisions = "" if run.decisions is None else str(run.decisions)
+        accuracy = "" if run.accuracy is None else f"{100 * run.accuracy:.1f} %"
+        names = one_line(run.bundle, 40), one_line(run.folder.name, 80)
+        rows.append((begun, verdict, decisions, accuracy, _size(run.bytes), *names))
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows] if runs else []
 
 
 def _size(count: int) -> str:

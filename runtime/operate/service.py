@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -39,10 +39,9 @@ SYSTEM_UNITS, USER_UNITS = Path("/etc/systemd/system"), Path("~/.config/systemd/
 UNIT_MAX_BYTES = 1 << 16
 START_S = 180  # kernels are compiled once, on a slow machine for a minute
 STOP_S = 45  # the watchdog ends a stuck run within 5 s; a slow disk has 30 s to sync
-TEMPLATE = SHIPPED / "pans-run.service"
 SYSTEM_ONLY = ("# what only the system's manager", "[Install]")  # left out between these in a user's own unit
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}")
-_ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "%": "%%"}
+ESCAPES = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "%": "%%"})
 POLL_S = 0.05
 NOT_THE_SERVICES = ("INVOCATION_ID", "JOURNAL_STREAM", "MAINPID")
 WATCHDOG = Range(16, 3600)  # a run that looks for its lost device may be silent for 15 s
@@ -61,58 +60,38 @@ OF_ACTION = {  # options that have an effect with each action, beside --name, --
 # ---- the unit ----
 
 
-@dataclass(frozen=True, slots=True)
-class Service:
-    """What a unit is written for; `writes` are the folders that the run writes to, all paths absolute."""
+def unit_text(
+    name: str, command: Sequence[str], folder: Path, writes: Sequence[Path], watchdog_s: float, user: str
+) -> str:
+    """Return the unit of `command`, whose first word is absolute, in `folder`; it may write there and to `writes`.
 
-    name: str
-    command: tuple[str, ...]
-    folder: Path
-    writes: tuple[Path, ...]
-    watchdog_s: float
-    user: str = ""  # whom a unit of the system runs as; "" in a unit of a user's own manager
-
-
-def unit_text(service: Service) -> str:
-    """Return the unit."""
-    template = TEMPLATE.read_text(encoding="utf-8")
-    if not service.user:
+    `user` is whom a unit of the system runs as, "" in a unit of a user's own manager.
+    """
+    template = (SHIPPED / "pans-run.service").read_text(encoding="utf-8")
+    if not user:
         first, last = (template.index(mark) for mark in SYSTEM_ONLY)
         template = (template[:first] + "\n" + template[last:]).replace("User={user}\n", "")
-    writes = sorted({service.folder, *service.writes})
     return template.format(
-        name=service.name,
-        command=command_line(service.command),
-        folder=_escaped(str(service.folder)),
-        user=service.user,
-        watchdog_s=service.watchdog_s,
+        name=name,
+        command=command_line(command),
+        folder=_escaped(str(folder)),
+        user=user,
+        watchdog_s=watchdog_s,
         start_s=START_S,
         stop_s=STOP_S,
         priority=FIFO_PRIORITY,
-        writes="\n".join(f"ReadWritePaths={quoted(str(path))}" for path in writes),
-        target="multi-user" if service.user else "default",
+        writes="\n".join(f'ReadWritePaths="{_escaped(str(path))}"' for path in sorted({folder, *writes})),
+        target="multi-user" if user else "default",
     )
 
 
-# ---- quoting ----
-
-
-def _escaped(text: str) -> str:
-    return "".join(_ESCAPES.get(letter, letter) for letter in text)
-
-
-def quoted(text: str) -> str:
-    """Return one word as a unit writes it: in quotes, with systemd's escapes and specifiers doubled."""
-    return f'"{_escaped(text)}"'
-
-
 def command_line(words: Sequence[str]) -> str:
-    """Return the value of ExecStart for a command whose first word is an absolute path.
+    """Return the value of ExecStart for a command: words in quotes, with systemd's escapes, specifiers and variables doubled.
 
     >>> command_line(["/usr/bin/pans", "run", "50%.pans", "$HOME"])
     '"/usr/bin/pans" "run" "50%%.pans" "$$HOME"'
     """
-    return " ".join(quoted(word).replace("$", "$$") for word in words)
+    return " ".join(f'"{_escaped(word)}"' for word in words).replace("$", "$$")
 
 
 def command_of(text: str) -> tuple[list[str], Path]:
@@ -125,21 +104,20 @@ def command_of(text: str) -> tuple[list[str], Path]:
     return [word.replace("$$", "$") for word in words], Path(folder)
 
 
+def _escaped(text: str) -> str:
+    return text.translate(ESCAPES)
+
+
 def _unescaped(text: str) -> str:
     letters = {"n": "\n", "t": "\t", "r": "\r"}
     return re.sub(r"\\(.)", lambda found: letters.get(found[1], found[1]), text.replace("%%", "%"))
 
 
-# ---- files ----
-
-
 def check_name(name: str) -> str:
     """Return `name`; UsageError if a unit cannot be called so."""
     if not NAME.fullmatch(name):
-        raise UsageError(
-            f"--name {name!r}: allowed are letters, digits, dot, dash and underscore, at most 100",
-            remedy="choose a short name, such as lab",
-        )
+        allowed = "allowed are letters, digits, dot, dash and underscore, at most 100"
+        raise UsageError(f"--name {name!r}: {allowed}", remedy="choose a short name, such as lab")
     return name
 
 
@@ -152,9 +130,8 @@ def read_unit(path: Path) -> str:
     """Return the text of a unit of ours; UsageError for any other file, and if it is not there."""
     text = read_file(path, UNIT_MAX_BYTES).decode("utf-8", "replace")
     if not text.startswith(MARK):
-        raise UsageError(
-            f"{path}: was not written by `pans service install`", remedy="name another service with --name"
-        )
+        what = f"{path}: was not written by `pans service install`"
+        raise UsageError(what, remedy="name another service with --name")
     return text
 
 
@@ -163,38 +140,29 @@ def read_unit(path: Path) -> str:
 
 @dataclass(slots=True)
 class Heard:
-    """What a service said, and when: seconds since its start."""
+    """What a service said: each line with its time, seconds since the start; and how it ended."""
 
-    ready_s: float | None = None
-    watchdog_s: list[float] = field(default_factory=list)
-    stopping_s: float | None = None
+    lines: list[tuple[float, str]] = field(default_factory=list)
     asked_s: float | None = None  # SIGTERM
     ended_s: float = 0.0
     exit_code: int | None = None  # None: it had to be killed
+    errors: str = ""  # the end of its stderr
 
-    def take(self, message: str, at_s: float) -> None:
-        """Note one datagram, which may hold several lines."""
-        for line in message.split("\n"):
-            if line == "READY=1" and self.ready_s is None:
-                self.ready_s = at_s
-            elif line == "WATCHDOG=1":
-                self.watchdog_s.append(at_s)
-            elif line == "STOPPING=1":
-                self.stopping_s = at_s
+    def times_s(self, line: str) -> list[float]:
+        """Return when the service said `line`, such as READY=1."""
+        return [at_s for at_s, found in self.lines if found == line]
 
     def longest_silence_s(self) -> float:
-        """The longest time between two signs of life, from READY to SIGTERM or the end."""
-        if self.ready_s is None:
-            return float("inf")
-        until = self.ended_s if self.asked_s is None else self.asked_s
-        times = [self.ready_s, *(at for at in self.watchdog_s if self.ready_s <= at <= until), until]
-        return max(after - before for before, after in pairwise(times))
+        """Return the longest time between two signs of life, from READY to SIGTERM or the end."""
+        ready_s, until_s = self.times_s("READY=1")[0], self.ended_s if self.asked_s is None else self.asked_s
+        alive_s = [at_s for at_s in self.times_s("WATCHDOG=1") if ready_s <= at_s <= until_s]
+        return max(after - before for before, after in pairwise([ready_s, *alive_s, until_s]))
 
 
 def start_and_hear(
     command: Sequence[str], folder: Path, *, watchdog_s: float, seconds: float, start_s: float, stop_s: float
-) -> tuple[Heard, str]:
-    """Run `command` in `folder` for `seconds` after it is ready, stop it with SIGTERM, and return what it said, and its stderr's end.
+) -> Heard:
+    """Run `command` in `folder` for `seconds` after it is ready, stop it with SIGTERM, and return what it said.
 
     It has `start_s` to be ready and `stop_s` to end, as systemd gives it. UsageError where there are no such sockets.
     """
@@ -205,43 +173,37 @@ def start_and_hear(
         place = opened.enter_context(tempfile.TemporaryDirectory(prefix="pans-notify-"))
         stderr = opened.enter_context(tempfile.TemporaryFile())
         manager = opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-        address = str(Path(place) / "notify")
-        manager.bind(address)
+        manager.bind(address := f"{place}/notify")
         manager.settimeout(POLL_S)
         environment = {key: value for key, value in os.environ.items() if key not in NOT_THE_SERVICES}
         environment |= {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": str(round(watchdog_s * 1e6))}
-        began_s = time.monotonic()
+        began_s, due_s = time.monotonic(), start_s
         process = subprocess.Popen(
             command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr
         )
-        opened.callback(_end, process)
-        due_s = start_s
+        opened.callback(process.wait)
+        opened.callback(process.kill)
         while True:
             ended = process.poll() is not None
             try:
-                heard.take(manager.recv(4096).decode("utf-8", "replace"), time.monotonic() - began_s)
+                said = manager.recv(4096).decode("utf-8", "replace")
+                heard.lines += [(time.monotonic() - began_s, line) for line in said.split("\n")]
             except TimeoutError:
                 if ended:
                     break
             now_s = time.monotonic() - began_s
-            if heard.ready_s is not None and heard.asked_s is None:
-                due_s = heard.ready_s + seconds
+            if heard.asked_s is None and (ready_s := heard.times_s("READY=1")):
+                due_s = ready_s[0] + seconds
             if now_s <= due_s or ended:
                 continue
             if heard.asked_s is not None:
                 break
             heard.asked_s, due_s = now_s, now_s + stop_s
             process.send_signal(signal.SIGTERM)
-        heard.ended_s = time.monotonic() - began_s
-        heard.exit_code = process.returncode if ended else None
+        heard.ended_s, heard.exit_code = time.monotonic() - began_s, process.returncode
         stderr.seek(max(0, stderr.tell() - 2000))
-        return heard, stderr.read().decode("utf-8", "replace")
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.kill()
-        process.wait()
+        heard.errors = stderr.read().decode("utf-8", "replace")
+    return heard
 
 
 # ---- the command ----
@@ -264,66 +226,40 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    _check_effects(args)
-    if args.action == "monitoring":
-        return _monitoring(args)
-    folder = args.unit_dir or (USER_UNITS.expanduser() if args.user else SYSTEM_UNITS)
-    path = folder / f"pans-{check_name(_name(args))}.service"
-    if args.action == "verify":
-        return _verify(args, path)
-    if args.action == "remove":
-        return _remove(args, path)
-    text = unit_text(_service(args))
-    if args.action == "show":
-        emit(args, {"unit": str(path), "text": text}, text.rstrip("\n"))
-        return EXIT_FINE
-    return _install(args, path, text)
-
-
-def _check_effects(args: argparse.Namespace) -> None:
-    allowed = OF_ACTION[args.action]
-    for option in sorted(set().union(*OF_ACTION.values()) - allowed):
+    for option in sorted(set().union(*OF_ACTION.values()) - OF_ACTION[args.action]):
         if getattr(args, option) not in (None, False):
             name = option.replace("_", "-")
             raise UsageError(f"--{name} has no effect with `pans service {args.action}`", remedy="leave it out")
-
-
-def _name(args: argparse.Namespace) -> str:
-    if args.name:
-        return str(args.name)
-    if args.config is None:
-        given = "--config" if args.action in ("install", "show") else "--name"
-        raise UsageError(f"`pans service {args.action}` needs {given}", remedy=f"name the service with {given}")
-    return str(args.config.stem)
-
-
-# ---- install ----
-
-
-def _service(args: argparse.Namespace) -> Service:
-    if args.config is None:
-        raise UsageError(
-            f"`pans service {args.action}` needs --config",
-            remedy="write the options to a file: pans run ... --write-config",
+    if args.action == "monitoring":
+        return _monitoring(args)
+    needed = "config" if args.action in ("install", "show") else "name"
+    if getattr(args, needed) is None:
+        remedy = (
+            "write the options to a file: pans run ... --write-config" if needed == "config" else "name the service"
         )
-    folder = (args.folder or Path.cwd()).resolve()
+        raise UsageError(f"`pans service {args.action}` needs --{needed}", remedy=remedy)
+    name = check_name(args.name or args.config.stem)
+    folder = args.unit_dir or (USER_UNITS.expanduser() if args.user else SYSTEM_UNITS)
+    return _ACTIONS[args.action](args, name, folder / f"pans-{name}.service")
+
+
+def _unit(args: argparse.Namespace, name: str) -> tuple[str, list[Path]]:
+    """Return the text of the unit that the options ask for, and the folders that its run writes to."""
+    folder, config = (args.folder or Path.cwd()).resolve(), args.config.resolve()
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a folder", remedy="make it first")
-    config = args.config.resolve()
-    writes = tuple(sorted({*_written_folders(config, folder)}))
+    writes = sorted({*_written_folders(config, folder)})
     command = (sys.executable, "-m", "pans", "run", "--config", str(config))
     user = "" if args.user else args.run_as or os.environ.get("SUDO_USER") or getpass.getuser()
-    return Service(_name(args), command, folder, writes, args.watchdog_s or 20.0, user)
+    return unit_text(name, command, folder, writes, args.watchdog_s or 20.0, user), writes
 
 
 def _written_folders(config: Path, folder: Path) -> Iterator[Path]:
     """Yield the folders that the run of these options writes to, seen from `folder`; the options are checked as a run checks them."""
     run = load_command(find_commands()["run"])
     parser = parser_of("run", run)
-    words = ["--config", str(config)]
-    if run.prepare is not None:
-        words = run.prepare(parser, words)
-    options = parser.parse_args(words)
+    assert run.prepare is not None
+    options = parser.parse_args(run.prepare(parser, ["--config", str(config)]))
     if options.seconds or options.decisions:
         warn(f"{config.name} ends the run by itself (seconds, decisions); a service that ends so is not started again")
     for name in ("out", "record"):
@@ -337,107 +273,57 @@ def _written_folders(config: Path, folder: Path) -> Iterator[Path]:
         yield folder / options.out
 
 
-def _install(args: argparse.Namespace, path: Path, text: str) -> int:
+def _show(args: argparse.Namespace, name: str, path: Path) -> int:
+    text, _ = _unit(args, name)
+    emit(args, {"unit": str(path), "text": text}, text.rstrip("\n"))
+    return EXIT_FINE
+
+
+def _install(args: argparse.Namespace, name: str, path: Path) -> int:
+    text, writes = _unit(args, name)
     check_outputs([path], inputs=[args.config], force=args.force, ours=is_unit_of_ours, makes_folders=True)
-    make_folder(path.parent)
-    command, folder = command_of(text)
-    for place in (one for one in _service(args).writes if not one.exists()):
-        make_folder(place)  # a unit's ReadWritePaths must exist
+    for place in (path.parent, *writes):  # a unit's ReadWritePaths must exist
+        make_folder(place)
     write_file(path, text.encode(), force=True)
-    findings = list(_analysed(path, user=args.user))
-    manager = "systemctl --user" if args.user else "systemctl"
+    command, folder = command_of(text)
+    manager = _manager(args)
     following = [f"{manager} daemon-reload", f"{manager} enable --now {path.name}"]
-    payload = {"unit": str(path), "command": command, "folder": str(folder), "findings": findings, "next": following}
-    emit(args, payload, "\n".join([str(path), *_lines(findings), *(f"next: {line}" for line in following)]))
-    return _code(findings)
+    payload = {"unit": str(path), "command": command, "folder": str(folder), "next": following}
+    return _judge(args, path, [_analysed(path, user=args.user)], payload)
 
 
-# ---- verify ----
-
-
-def _verify(args: argparse.Namespace, path: Path) -> int:
+def _verify(args: argparse.Namespace, name: str, path: Path) -> int:
     text = read_unit(path)
-    findings = list(_analysed(path, user=args.user))
     command, folder = command_of(text)
     there = Path(command[0]).is_file() and folder.is_dir()
-    findings.append(_finding("command and folder", there, f"{command[0]} in {folder}", "install the unit again"))
+    findings = [
+        _analysed(path, user=args.user),
+        _finding("command and folder", there, f"{command[0]} in {folder}", "install the unit again"),
+    ]
     if args.start is not None and there:
         watchdog_s = float(text.partition("\nWatchdogSec=")[2].partition("\n")[0])
         say(f"starting {path.name} for {args.start:g} s ...")
         told_s = min(watchdog_s, args.start / 3)  # a run speaks three times in that time: nine times while it is heard
-        heard, errors = start_and_hear(
-            command, folder, watchdog_s=told_s, seconds=args.start, start_s=START_S, stop_s=STOP_S
+        findings += _heard(
+            start_and_hear(command, folder, watchdog_s=told_s, seconds=args.start, start_s=START_S, stop_s=STOP_S),
+            watchdog_s,
         )
-        findings += _judged(heard, errors, watchdog_s)
-    emit(args, {"unit": str(path), "findings": findings}, "\n".join([str(path), *_lines(findings)]))
-    return _code(findings)
+    return _judge(args, path, findings, {"unit": str(path)})
 
 
-def _analysed(path: Path, *, user: bool) -> Iterator[Mapping[str, Any]]:
-    """Yield what `systemd-analyze verify` finds wrong with the unit, or that it is not there."""
-    program = shutil.which("systemd-analyze")
-    if program is None:
-        yield _finding("systemd-analyze", True, "not installed: the unit's directives were not checked", "")
-        return
-    words = [program, *(["--user"] if user else []), "--man=no", "verify", str(path)]
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=ANALYZE_S)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        yield _finding("systemd-analyze", False, f"could not be asked: {error}", f"run it by hand: {' '.join(words)}")
-        return
-    said = [line for line in done.stderr.splitlines() if path.name in line or done.returncode]
-    found = "; ".join(said) or "no complaints"
-    yield _finding("systemd-analyze", not said and done.returncode == 0, found, "install the unit again")
-
-
-def _judged(heard: Heard, errors: str, watchdog_s: float) -> Iterator[Mapping[str, Any]]:
-    """Yield what is to be said of one start, of the protocol's four parts."""
-    last = errors.strip().rsplit("\n", 1)[-1]
-    if heard.ready_s is None:
-        yield _finding("READY", False, f"not within {START_S} s, or the run ended: {last}", "start the run by hand")
-        return
-    yield _finding("READY", True, f"after {heard.ready_s:.1f} s", "")
-    silence_s = heard.longest_silence_s()
-    said = f"{len(heard.watchdog_s)} messages, {silence_s:.2f} s apart at most, allowed {watchdog_s:g} s"
-    lives = bool(heard.watchdog_s) and silence_s < watchdog_s
-    yield _finding("WATCHDOG", lives, said, "the machine is too slow, or the watchdog's time too short: --watchdog-s")
-    stops = heard.stopping_s is not None
-    yield _finding("STOPPING", stops, "said" if stops else "not said before the process ended", "look into its log")
-    ended = f"exit code {heard.exit_code}" if heard.exit_code is not None else f"not within {STOP_S} s of SIGTERM"
-    alone = "" if heard.asked_s is not None else ", by itself"
-    yield _finding("end", heard.exit_code in (0, 1), f"{ended}{alone}: {last}"[:400], "look into its log")
-
-
-def _finding(check: str, ok: bool, found: str, remedy: str) -> Mapping[str, Any]:
-    return {"check": check, "ok": ok, "found": found, "remedy": "" if ok else remedy}
-
-
-def _lines(findings: list[Mapping[str, Any]]) -> Iterator[str]:
-    for one in findings:
-        yield f"  {'ok' if one['ok'] else 'WRONG':<6} {one['check']}: {one['found']}"
-        if one["remedy"]:
-            yield f"         remedy: {one['remedy']}"
-
-
-def _code(findings: list[Mapping[str, Any]]) -> int:
-    return EXIT_FINE if all(one["ok"] for one in findings) else EXIT_ALERT
-
-
-# ---- remove, monitoring ----
-
-
-def _remove(args: argparse.Namespace, path: Path) -> int:
+def _remove(args: argparse.Namespace, name: str, path: Path) -> int:
     read_unit(path)
     try:
         path.unlink()
     except OSError as error:
-        raise UsageError(
-            f"{path}: cannot be removed: {error.strerror or error}", remedy="run it as its owner"
-        ) from error
-    manager = "systemctl --user" if args.user else "systemctl"
-    following = [f"{manager} disable --now {path.name}", f"{manager} daemon-reload"]
+        what = f"{path}: cannot be removed: {error.strerror or error}"
+        raise UsageError(what, remedy="run it as its owner") from error
+    following = [f"{_manager(args)} disable --now {path.name}", f"{_manager(args)} daemon-reload"]
     emit(args, {"removed": str(path), "next": following}, f"{path} is removed\nnext: {' && '.join(following)}")
     return EXIT_FINE
+
+
+_ACTIONS = {"show": _show, "install": _install, "verify": _verify, "remove": _remove}
 
 
 def _monitoring(args: argparse.Namespace) -> int:
@@ -451,6 +337,62 @@ def _monitoring(args: argparse.Namespace) -> int:
     following = 'next: let Prometheus scrape "127.0.0.1:9464", and run with --metrics 127.0.0.1:9464'
     emit(args, {"files": [str(path) for path in paths]}, "\n".join([*map(str, paths), following]))
     return EXIT_FINE
+
+
+def _manager(args: argparse.Namespace) -> str:
+    return "systemctl --user" if args.user else "systemctl"
+
+
+# ---- findings ----
+
+
+def _analysed(path: Path, *, user: bool) -> dict[str, Any]:
+    """Return what `systemd-analyze verify` finds wrong with the unit, or that it is not there."""
+    program = shutil.which("systemd-analyze")
+    if program is None:
+        return _finding("systemd-analyze", True, "not installed: the unit's directives were not checked", "")
+    words = [program, *(["--user"] if user else []), "--man=no", "verify", str(path)]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=ANALYZE_S)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return _finding("systemd-analyze", False, f"could not be asked: {error}", f"run it by hand: {' '.join(words)}")
+    said = [line for line in done.stderr.splitlines() if path.name in line or done.returncode]
+    fine = not said and done.returncode == 0
+    return _finding("systemd-analyze", fine, "; ".join(said) or "no complaints", "install the unit again")
+
+
+def _heard(heard: Heard, watchdog_s: float) -> Iterator[dict[str, Any]]:
+    """Yield what is to be said of one start, of the protocol's four parts."""
+    last = heard.errors.strip().rsplit("\n", 1)[-1]
+    ready_s, said, stops = (heard.times_s(f"{word}=1") for word in ("READY", "WATCHDOG", "STOPPING"))
+    if not ready_s:
+        yield _finding("READY", False, f"not within {START_S} s, or the run ended: {last}", "start the run by hand")
+        return
+    yield _finding("READY", True, f"after {ready_s[0]:.1f} s", "")
+    silence_s = heard.longest_silence_s()
+    found = f"{len(said)} messages, {silence_s:.2f} s apart at most, allowed {watchdog_s:g} s"
+    lives = bool(said) and silence_s < watchdog_s
+    yield _finding("WATCHDOG", lives, found, "the machine is too slow, or the watchdog's time too short: --watchdog-s")
+    found = "said" if stops else "not said before the process ended"
+    yield _finding("STOPPING", bool(stops), found, "look into its log")
+    ended = f"exit code {heard.exit_code}" if heard.exit_code is not None else f"not within {STOP_S} s of SIGTERM"
+    alone = "" if heard.asked_s is not None else ", by itself"
+    yield _finding("end", heard.exit_code in (0, 1), f"{ended}{alone}: {last}"[:400], "look into its log")
+
+
+def _finding(check: str, ok: bool, found: str, remedy: str) -> dict[str, Any]:
+    return {"check": check, "ok": ok, "found": found, "remedy": "" if ok else remedy}
+
+
+def _judge(args: argparse.Namespace, path: Path, findings: list[dict[str, Any]], payload: dict[str, Any]) -> int:
+    """Print the findings and return the exit code."""
+    lines = [str(path)]
+    for one in findings:
+        lines.append(f"  {'ok' if one['ok'] else 'WRONG':<6} {one['check']}: {one['found']}")
+        lines += [f"         remedy: {one['remedy']}"] if one["remedy"] else []
+    lines += [f"next: {line}" for line in payload.get("next", ())]
+    emit(args, payload | {"findings": findings}, "\n".join(lines))
+    return EXIT_FINE if all(one["ok"] for one in findings) else EXIT_ALERT
 
 
 SERVICE = Command(
