@@ -24,6 +24,7 @@ from pans.runtime.core.decision import RUN_DTYPE as RUN_DTYPE
 from pans.runtime.core.decision import VERDICT_DTYPE as VERDICT_DTYPE
 from pans.runtime.core.decision import VERDICT_FIELDS as VERDICT_FIELDS
 from pans.runtime.errors import DamagedFileError
+from pans.runtime.wire.framing import read_only
 
 from .format import LONG_VERDICT
 
@@ -91,7 +92,7 @@ class LogEncoder:
 
     def _take(self, rows: NDArray[np.void]) -> _Parts:
         """Return the parts of the block that holds `rows`, and add them to the hash."""
-        bits = np.ascontiguousarray(rows, DECISION_DTYPE).view(_ROW_BITS)
+        bits = read_only(np.ascontiguousarray(rows, DECISION_DTYPE).view(_ROW_BITS))
         n_runs, n_verdicts = self._encode(bits, *self._arrays)
         known = self._verdicts[:n_verdicts], self._exposures[:n_verdicts]
         parts = _Parts(self._runs[:n_runs], *known, self._codes[: len(rows)])

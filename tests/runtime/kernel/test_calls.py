@@ -282,3 +282,32 @@ def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:
     env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=True)
     assert done.stdout.split() == ["4", "1", "0"]
+
+
+def test_nothing_is_compiled_once_the_light_is_on(tmp_path: Path) -> None:
+    """In a process of its own, where no other test has compiled anything: what kernels are called with is known before arming."""
+    program = f"""
+import sys
+from pans.runtime.cli import main
+from pans.runtime.live import loop
+
+def compiled():
+    values = [one for name, module in list(sys.modules.items()) if name.startswith("pans.runtime") for one in vars(module).values()]
+    return {{str(one): len(one.signatures) for one in values if hasattr(one, "signatures")}}
+
+def lit(*arguments, original=loop._light_on):
+    before = compiled()
+    original(*arguments)
+    print("CHANGED", [name for name, n in compiled().items() if n != before.get(name, n)])
+
+loop._light_on = lit
+for number, words in enumerate([
+    ["demo", "--pace", "fast", "--trials", "1"],
+    ["run", "fashion10", "--device", "sim:oled-qcmos?pace=fast", "--decisions", "50", "--shots", "2"],
+    ["run", "fashion-adaptive", "--device", "sim:dmd-spad?scene=fashion200&pace=fast", "--drive", "host", "--decisions", "20"],
+]):
+    main([*words, "--out", {str(tmp_path)!r} + f"/{{number}}", "--no-realtime"])
+"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    lines = [line for line in found.stdout.splitlines() if line.startswith("CHANGED")]
+    assert lines == ["CHANGED []"] * 3, (lines, found.stderr[-2000:])
