@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mutated_sessions import Evidence, MutatedLink, Mutation, by
+from mutated_sessions import Evidence, MutatedLink, Mutation
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_TIMING, main
 from pans.runtime.commands import one_run
@@ -26,7 +26,7 @@ def test_contradictions_are_a_fault_and_stand_in_the_file(
     opened = base.open_link
     for module in (one_run, reconnect, gates):  # imported before: else they would keep the false one for good
         assert module.open_link is opened
-    lie = Mutation("CLICKS", "object_index", *by(17), most=3)
+    lie = Mutation("CLICKS", "object_index", by=17, most=3)
     monkeypatch.setattr(base, "open_link", lambda url: MutatedLink(opened(url), (lie,), Evidence(1 << 40, 2, 10**6)))
     out = tmp_path / "c.json"
     assert main(["calibrate", "--device", URL, "--seconds", "0.5", "-o", str(out), "--json"]) == EXIT_TIMING
