@@ -23,6 +23,7 @@ from .stream_kernels import DecisionTables, FrameWalkArrays, IdleArrays, MarkArr
 from .window import DecisionWindows, WindowArrays
 
 ROWS_PER_CALL = 65536  # decisions of one call, beside those of a block; a megabyte per 18 000
+COUNTS_PER_CALL = 1 << 21  # counts of theirs that a back end is asked for: 16 MiB
 WORD_FEATURES = 24  # of tables by word: what stream_kernels.py looks up at once
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
 _LARGEST = (1 << 62) - 1
@@ -37,10 +38,11 @@ class CoreState:
         self.core, self.windows = core, windows
         self._decider, self._shots = decider, shots
         self.tables = decision_tables(decider, shots, plan)
-        rows_max = self.block_rows + ROWS_PER_CALL
+        asked = 0 if self.decides else decider.n_features
+        rows_max = self.block_rows + min(ROWS_PER_CALL, COUNTS_PER_CALL // max(asked, 1))
         # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
         self._rows: Rows = np.full(rows_max, 0, DECISION_DTYPE)
-        self._counts = np.full((0 if self.tables.labels.size else rows_max, decider.n_features), 0, np.int64)
+        self._counts = np.full((rows_max if asked else 0, decider.n_features), 0, np.int64)
         n = kernels.MARK_SLOTS
         self._marks = MarkArrays(np.full(n, -1, np.int64), np.full(n, 0, np.int16), np.full(n, 0, np.float32))
         one_by_one = 0 if windows.parallel else CLICKS_MAX

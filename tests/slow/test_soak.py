@@ -98,6 +98,7 @@ def test_a_long_run_with_faults_stays_flat_and_ends_well(tmp_path: Path) -> None
     assert (process.returncode == 0) == (summary["verdict"] == "PASS")  # with faults the verdict is FAIL
     later = [one for one in samples if one["s"] >= WARM_UP_SHARE * samples[-1]["s"]]
     seconds, rss = np.array([one["s"] for one in later]), np.array([one["rss"] for one in later], float)
+    print("MiB", (rss[::6] / 2**20).round(1).tolist())
     slope, error = slope_of(seconds, rss)
     assert (slope + 1.96 * error) * float(np.ptp(seconds)) <= FLAT_RSS_BYTES
     assert later[-1]["handles"] - later[0]["handles"] <= FLAT_HANDLES

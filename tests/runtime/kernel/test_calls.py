@@ -278,7 +278,7 @@ def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:
         "print(n, sum(t.receive.turn.stats.cache_hits.values()), sum(t.receive.turn.stats.cache_misses.values()))"
     )
     here = Path(__file__).parent
-    paths = [here, *(ROOT / "tests" / name for name in ("support", "oracles", "sessions"))]
+    paths = [here, *(ROOT / "tests" / name for name in ("support", "oracles", "sessions", "independent"))]
     env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=True)
     assert done.stdout.split() == ["4", "1", "0"]
