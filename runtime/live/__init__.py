@@ -4,10 +4,10 @@ In come a link, a plan, a core and `RunOptions`; out comes a `RunResult` (`run_l
 iteration) and receiver.py (what a call of the kernel brought). Decisions are the core's, verdicts the report's.
 """
 
-from .config import RunResult
 from .loop import Observers, run_live
 from .reconnect import Recovery
 from .run import LiveRun
 from .run_options import RunOptions
+from .tally import RunResult
 
 __all__ = ["LiveRun", "Observers", "Recovery", "RunOptions", "RunResult", "run_live"]

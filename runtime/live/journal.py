@@ -10,7 +10,6 @@ from collections import Counter
 from typing import Any
 
 from pans.runtime.core.decision import CoreEvent
-from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import Connection
 from pans.runtime.logs import log_event
 from pans.runtime.record import Recorder
@@ -20,16 +19,8 @@ from pans.runtime.wire.session import Refusal
 MAX_EVENTS = 1000  # of the summary; the recording has them all
 MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
 TROUBLE = (
-    *("blame", "gap", "link_lost", "clock_step", "gate_refused", "show_refused"),
-    *(
-        "parts_trouble",
-        "beyond_plan",
-        "contradiction",
-        "disk_short",
-        "disk_nearly_full",
-        "recording_deleted",
-        "host_clock_step",
-    ),
+    *("blame", "gap", "link_lost", "clock_step", "gate_refused", "show_refused", "parts_trouble"),
+    *("beyond_plan", "contradiction", "disk_short", "disk_nearly_full", "recording_deleted", "host_clock_step"),
 )
 
 
@@ -84,54 +75,3 @@ class Journal:
         """Note a command that the device has refused, and that nobody waits for."""
         kind = "show_refused" if refusal.opcode == Opcode.SHOW else "gate_refused"
         self.note(kind, command_id=refusal.command_id, status=refusal.status, text=refusal.text)
-
-
-class Reconciled:
-    """What `LiveRun` counts across its connections."""
-
-    connection: Connection
-    journal: Journal
-    decoded: Counter[str]  # what the connections that are gone have counted
-    contradictions: Counter[str]  # between messages and the clock, or the host's own books
-    failed: list[Connection]  # those that broke before they could be armed
-    recorder: Recorder | None
-    ended: str
-    link_lost: bool
-    taken_here: int  # messages of the present connection that the core was given, or came before ARM
-    armed: Connection | None = None  # the connection whose session was sent ARM last
-    _counted: Connection | None = None
-
-    def lose_link(self, error: LinkError) -> None:
-        """End the run because the link is gone; what was decided so far stands."""
-        self.ended = self.ended or f"the link was lost: {error.message}"
-        self.link_lost = True
-
-    def drop_recorder(self) -> None:
-        """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
-        self.recorder = self.journal.recorder = None
-        self.connection.on_sent = self.connection.on_answer = None
-
-    def count_decoded(self) -> None:
-        """Add up what the present connection's decoder has counted, once: before it goes, or at the end; those that failed too."""
-        while self.failed:
-            self._add_counters(self.failed.pop())
-        if self._counted is not self.connection:
-            self._counted = self.connection
-            self._add_counters(self.connection)
-            self._reconcile(self.connection.decoder.counters.frames)
-
-    def _add_counters(self, connection: Connection) -> None:
-        counters, session = connection.decoder.counters, connection.session.counters
-        self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
-        self.decoded.update({name: getattr(session, name) for name in ("wrong_session", "unknown_type")})
-        self.decoded.update(malformed_answers=session.malformed, implausible_answers=session.implausible)
-
-    def _reconcile(self, frames: int) -> None:
-        """Compare the books of the decoder, the connection and this run: every frame is an answer or was taken."""
-        lost = frames - self.connection.answers - self.connection.delivered
-        untaken = self.connection.delivered - self.taken_here if self.connection is self.armed else 0
-        self.taken_here = 0
-        for what, count in (("frames_lost_in_host", lost), ("messages_not_taken", untaken)):
-            if count:
-                self.contradictions[what] += abs(count)
-                self.journal.note("contradiction", what=what, found=count, expected=0)

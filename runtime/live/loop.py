@@ -35,12 +35,12 @@ from pans.runtime.record import Recorder
 from pans.runtime.timing.realtime import ThreadCounts, arm_realtime, busy_core
 from pans.runtime.wire.session import ArmTooLate
 
-from .config import RunResult
 from .continuous import INTERRUPTED, REFUSED, Stop
 from .receiver import Receiver, StillReceiver, why_fed
 from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveRun, Watcher
 from .run_options import RunOptions
+from .tally import RunResult
 
 NS_PER_S = 1_000_000_000
 

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from pans.runtime.link.connection import ARM_LEAD_NS, Connection
 from pans.runtime.record import Recorder
 from pans.runtime.record.format import TIMING_RUN_DTYPE
 from pans.runtime.record.recorder import repeated_setup
+from pans.runtime.timing.causes import INFERENCE, LateWork, Stamped
 from pans.runtime.timing.clock import future_tick
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_command
@@ -32,13 +33,15 @@ from pans.runtime.wire.messages import DeviceState, MessageType, Opcode, StateRe
 from pans.runtime.wire.schema import LARGEST_TICK, MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
-from .config import Receives
 from .drive import HostDriver, WalkPlace
 from .gates import GateQueue
-from .journal import Journal, Reconciled
+from .journal import Journal
 from .lateness import Lateness
 from .run_options import RunOptions
 from .tally import RunTally
+
+if TYPE_CHECKING:
+    from .receiver import Receiver
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
@@ -55,11 +58,13 @@ I64 = npt.NDArray[np.int64]
 Rows = npt.NDArray[np.void]
 
 
-class LiveRun(Reconciled):
+class LiveRun:
     """One run in progress: what `run_live` calls again and again, and what a live view may look at."""
 
-    receiver: Receives  # set before the run is armed
+    receiver: Receiver  # set before the run is armed
     driver: HostDriver | None = None  # of an automaton that the host follows
+    armed: Connection | None = None  # whose session was sent ARM last
+    _counted: Connection | None = None
 
     def __init__(
         self,
@@ -193,9 +198,9 @@ class LiveRun(Reconciled):
         self.take_rest()
         self.settle(self.core.end())
         self.gates.finish(session)
-        for verdict in self.lateness.closing_verdicts(self.now_ns()):
+        while (verdict := self.lateness.incidents.verdict(self.now_ns(), final=True)) is not None:
             self.journal.take(verdict)
-        self.lateness.close()
+        self.lateness.evidence.close()
         self.journal.clock(self.connection)
         self.stopped = True
 
@@ -215,11 +220,6 @@ class LiveRun(Reconciled):
         return self._fruitless > most
 
     # -- acting --------------------------------------------------------------------------------------------------------
-
-    @property
-    def next_command_id(self) -> int:
-        """The id that the next command of this session will have."""
-        return self.connection.session.next_id
 
     def gate(self, tick: int, duration_ticks: int, channel: int) -> int:
         """Ask for a pulse at an absolute device tick and return the command's id; a refusal (too late) becomes an event.
@@ -306,7 +306,7 @@ class LiveRun(Reconciled):
         output = self.core.step(frame)
         self._drive(arrival_ns)
         self.taken_here += 1
-        self.lateness.stepped(decoded_ns, self.now_ns())
+        self.lateness.evidence.worked(INFERENCE, decoded_ns, self.now_ns())
         if self.recorder is not None:
             self.recorder.add_message(arrival_ns, pack_body(frame))
         self.book(output, (arrival_ns, decoded_ns, self.now_ns()), outputs)
@@ -314,7 +314,8 @@ class LiveRun(Reconciled):
             with suppress(MalformedMessage):  # counted where it was taken
                 status = decode_status(frame.payload)  # the session may know a later one, where the host was held up
                 self.check_tick(status.tick, arrival_ns)
-                self.lateness.status_came(self.connection, status, arrival_ns)
+                left_ns, _ = self.connection.known_clock().to_host_ns(status.tick)
+                self.lateness.evidence.stamped(Stamped(None, None, left_ns, arrival_ns))
 
     def _drive(self, arrival_ns: int) -> None:
         """Where the host drives: name the next state before anything else is done with what has come."""
@@ -413,7 +414,7 @@ class LiveRun(Reconciled):
             for number in range(int(numbers[at]), int(numbers[at] + counts[at])):
                 self.journal.note("late", decision=number, latency_us=float(marks_ns[at, 3] - marks_ns[at, 0]) / 1000)
                 begin_ns, arrival_ns, _, decided_ns, _ = marks_ns[at].tolist()
-                self.lateness.late(number, begin_ns, arrival_ns, decided_ns)
+                self.lateness.incidents.late(LateWork(number, begin_ns, arrival_ns, decided_ns))
 
     def _turn_page(self, now_ns: int) -> None:
         """Go on in the recording's next part when this one is full and no window is open."""
@@ -431,3 +432,40 @@ class LiveRun(Reconciled):
         self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW
         self.connection.session.grant(self._granted_until, self.config.lease_ms)
         self._lease_due_ns = now_ns + self.config.lease_ms * NS_PER_MS // 4
+
+    # -- the books of all connections ----------------------------------------------------------------------------------
+
+    def lose_link(self, error: LinkError) -> None:
+        """End the run because the link is gone; what was decided so far stands."""
+        self.ended = self.ended or f"the link was lost: {error.message}"
+        self.link_lost = True
+
+    def drop_recorder(self) -> None:
+        """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
+        self.recorder = self.journal.recorder = None
+        self.connection.on_sent = self.connection.on_answer = None
+
+    def count_decoded(self) -> None:
+        """Add up what the present connection's decoder has counted, once: before it goes, or at the end; those that failed too."""
+        while self.failed:
+            self._add_counters(self.failed.pop())
+        if self._counted is not self.connection:
+            self._counted = self.connection
+            self._add_counters(self.connection)
+            self._reconcile(self.connection.decoder.counters.frames)
+
+    def _add_counters(self, connection: Connection) -> None:
+        counters, session = connection.decoder.counters, connection.session.counters
+        self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
+        self.decoded.update({name: getattr(session, name) for name in ("wrong_session", "unknown_type")})
+        self.decoded.update(malformed_answers=session.malformed, implausible_answers=session.implausible)
+
+    def _reconcile(self, frames: int) -> None:
+        """Compare the books of the decoder, the connection and this run: every frame is an answer or was taken."""
+        lost = frames - self.connection.answers - self.connection.delivered
+        untaken = self.connection.delivered - self.taken_here if self.connection is self.armed else 0
+        self.taken_here = 0
+        for what, count in (("frames_lost_in_host", lost), ("messages_not_taken", untaken)):
+            if count:
+                self.contradictions[what] += abs(count)
+                self.journal.note("contradiction", what=what, found=count, expected=0)

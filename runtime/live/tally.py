@@ -1,4 +1,4 @@
-"""What the decisions of a run add up to: accuracy with both spreads, clicks, photons, confusion.
+"""What came of a run: `RunResult`, and what its decisions add up to: accuracy with both spreads, clicks, photons, confusion.
 
 Spread over trials: how much the mean accuracy of one pass over the objects varies. Spread over objects: the standard error from
 having measured only these objects. `RunTally.figures` returns the figures of the contract.
@@ -7,12 +7,15 @@ having measured only these objects. `RunTally.figures` returns the figures of th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
+from pans.runtime.instrument.channel_health import DarkReport
+from pans.runtime.timing.ledger import TimingLedger
 
 _ABSTAINED, _AMBIGUOUS = int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
@@ -143,3 +146,37 @@ class RunTally:
             clicks_mean=self.clicks / self.decisions if self.decisions else None,
             photons_mean=self.photons / self.photons_known if self.photons_known else None,
         )
+
+
+@dataclass(slots=True)
+class RunResult:
+    """Everything a report needs; figures are measured, none is inferred from the configuration."""
+
+    tally: RunTally
+    timing: TimingLedger
+    dark: DarkReport
+    stream: dict[str, int]
+    decoder: dict[str, int]
+    clock: dict[str, Any]
+    realtime: dict[str, Any]
+    device: dict[str, Any]
+    slot_jitter_us: float
+    wrong_patterns: int  # late slots among them
+    armed_after_s: float
+    seconds: float
+    ended: str
+    link_lost: bool
+    reconnects: int = 0
+    late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (blame.CAUSES)
+    lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
+    contradictions: dict[str, int] = field(
+        default_factory=dict
+    )  # messages that the evidence excludes, by what is wrong
+    late_slots: int = 0  # that stayed dark because the host named no state in time
+    turn_us: dict[str, float] = field(default_factory=dict)  # of the host's turns, where it drives
+    states_shown: npt.NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros(0, np.int64)
+    )  # exposures of each state
+    decisions_sha256: str = ""
+    events: list[dict[str, Any]] = field(default_factory=list)
+    page_faults: dict[str, int] = field(default_factory=dict)  # of the loop's thread while armed; its switches too
