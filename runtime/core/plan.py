@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 NO_SHOT = 0xFFFF  # shot number of a dark slot
 MAX_SLOTS = 1 << 20  # of one cycle; more would be 16 MB of plan on the wire
 MAX_BLOCK_EXPOSURES = 1024  # keeps a click block near 2 kB
-_U32 = 0xFFFF_FFFF
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,9 +47,8 @@ class Plan:
     mode: str
     n_patterns: int
     slot_offset_ticks: NDArray[np.int64]  # start of the exposure within the cycle
-    slot_pattern: NDArray[
-        np.uint16
-    ]  # DARK_PATTERN in a dark slot, ADAPTIVE_PATTERN where the clicks choose, 0 in parallel mode
+    # DARK_PATTERN in a dark slot, ADAPTIVE_PATTERN where the clicks choose, 0 in parallel mode
+    slot_pattern: NDArray[np.uint16]
     slot_shot: NDArray[np.uint16]  # the shot of the cycle that the exposure belongs to; NO_SHOT in a dark slot
     exposure_ticks: int
     slot_period_ticks: int  # distance of exposures inside a block
@@ -59,9 +57,7 @@ class Plan:
     cycles_per_object: int
     block_exposures: int  # most exposures of one click block
     exposure_us: float  # of the exposure in whole ticks
-    automaton: Automaton | None = (
-        None  # what chooses the patterns of adaptive slots, ADAPTIVE_PATTERN in `slot_pattern`
-    )
+    automaton: Automaton | None = None  # what chooses the patterns of adaptive slots
     drive: str = ""  # of an automaton: "device" if the device follows it, "host" if the host names each state
     largest: int = 1  # the largest number that an exposure can have: 1 of the clicks of one detector
 
@@ -110,13 +106,6 @@ class Plan:
         """Objects, and so decisions, per second."""
         return 1e6 / (self.object_ticks * self.tick_us)
 
-    @property
-    def block_bytes(self) -> int:
-        """Length of the longest click block's payload, about: clicks and pattern numbers, or words."""
-        if self.mode == "parallel":
-            return self.block_exposures * -(-self.n_patterns // 8)
-        return self.block_exposures * 17 // 8
-
 
 @dataclass(frozen=True, slots=True)
 class Ticks:
@@ -134,11 +123,11 @@ def ticks_of(profile: Profile, exposure: float) -> Ticks:
     exposure_ticks = max(1, round(exposure * per_us))
     spacing = exposure_ticks + up(profile.exposure.readout_us * per_us)
     refresh = profile.clock.tick_hz / profile.projector.pattern_rate_max_hz
-    if max(spacing, refresh) > _U32:
-        longest_s = _U32 / profile.clock.tick_hz
+    if max(spacing, refresh) > U32_MAX:
+        longest_s = U32_MAX / profile.clock.tick_hz
         raise PlanError(
             f"exposure and readout, or one refresh period, take {max(spacing, refresh):.4g} ticks of {profile.name}'s clock; "
-            f"the protocol counts up to {_U32} ({longest_s:.4g} s)",
+            f"the protocol counts up to {U32_MAX} ({longest_s:.4g} s)",
             remedy="use a slower clock.tick_hz or a shorter exposure",
         )
     return Ticks(exposure_ticks, spacing, refresh, profile.timing.decision_deadline_us * per_us / 4)

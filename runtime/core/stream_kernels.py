@@ -123,7 +123,7 @@ _NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
 @inner
 def take_frames(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Take a message of a stream of frames, from `start` to `stop`, uint64; ODD, and nothing done, where it is not ordinary."""
-    if not _is_ours(buffer, start, stop, state):
+    if not is_ours(buffer, start, stop, state):
         return ODD
     kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
     if kind == stream.MARK:
@@ -141,7 +141,7 @@ def take_frames(buffer, start, stop, state, marks, windows, tables, rows, counts
 @inner
 def take_clicks(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Take a message as `take_frames` does, of a stream of one detector's exposures."""
-    if not _is_ours(buffer, start, stop, state):
+    if not is_ours(buffer, start, stop, state):
         return ODD
     kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
     if kind == stream.MARK:
@@ -166,7 +166,7 @@ def _took(state, tables):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _is_ours(buffer, start, stop, state):  # type: ignore[no-untyped-def]
+def is_ours(buffer, start, stop, state):  # type: ignore[no-untyped-def]
     """Whether a message has a plain header, of the session that is followed."""
     return (
         stop >= start + _U(stream.BODY_HEADER)
@@ -238,13 +238,10 @@ def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-
     if first + count > (visit + 1) * state[VISIT_EXPOSURES]:
         return False
     tick, period = stream.block_times(buffer, payload)
-    number, cycle = np.int64(load4(buffer, payload + _U(32))), first // windows.offsets.size
-    planned = state[START_TICK] + cycle * state[CYCLE_TICKS] + windows.offsets[first - cycle * windows.offsets.size]
-    if (
-        period != state[PERIOD_TICKS]
-        or (number != visit % _NO_OBJECT and number != _NO_OBJECT)
-        or tick < planned - period
-    ):
+    number = np.int64(load4(buffer, payload + _U(32)))
+    if number != visit % _NO_OBJECT and number != _NO_OBJECT:
+        return False
+    if period != state[PERIOD_TICKS] or tick < planned_tick(first, state, windows.offsets) - period:
         return False
     if not _is_due(visit, first - visit * state[VISIT_EXPOSURES], state, windows):
         return False
@@ -253,15 +250,24 @@ def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-
         state[VISIT] = visit
         state[NEXT_WINDOW] = 0
     state[OBJECT] = number
-    state[LAST_TICK] = tick + (count - 1) * period + state[EXPOSURE_TICKS]
-    final = first + count - 1 - cycle * windows.offsets.size  # may lie in the next cycle of this visit
-    due = (
-        planned - windows.offsets[first - cycle * windows.offsets.size] + windows.offsets[final % windows.offsets.size]
-    )
-    due += final // windows.offsets.size * state[CYCLE_TICKS] + state[EXPOSURE_TICKS]
-    state[JITTER] = max(state[JITTER], abs(state[LAST_TICK] - due))
     stream.go_on(state, count)
+    note_end(tick, count, state, windows.offsets)
     return True
+
+
+@inner
+def planned_tick(exposure, state, offsets):  # type: ignore[no-untyped-def]
+    """When an exposure begins by the plan."""
+    cycle = exposure // offsets.size
+    return state[START_TICK] + cycle * state[CYCLE_TICKS] + offsets[exposure - cycle * offsets.size]
+
+
+@inner
+def note_end(tick, count, state, offsets):  # type: ignore[no-untyped-def]
+    """Note when the last of `count` exposures that were accounted for ended, and how far that is from the plan's time."""
+    state[LAST_TICK] = tick + (count - 1) * state[PERIOD_TICKS] + state[EXPOSURE_TICKS]
+    due = planned_tick(state[stream.NEXT_EXPOSURE] - 1, state, offsets) + state[EXPOSURE_TICKS]
+    state[JITTER] = max(state[JITTER], abs(state[LAST_TICK] - due))
 
 
 @inner

@@ -109,7 +109,7 @@ class FlowCore(Follower):
         state[columns.N_CLASSES], state[kernels.DARK_EVERY] = self.n_classes, self._dark_cycle
         state[kernels.FRAMES] = self.frames
         # of what looks for passages; none where their times are known
-        looks = np.array([] if self._is_tape else [*limits[:8], self._dark_cycle], np.int64)
+        looks = np.array([] if self._is_tape else limits[:8], np.int64)
         flow = FlowArrays(
             np.zeros(limits.ring, np.uint64),
             np.zeros(limits.ring, np.int16),
@@ -164,11 +164,6 @@ class FlowCore(Follower):
     def empty_frames(self) -> int:
         """Light frames far from every object; their clicks per channel are `empty_channels`."""
         return int(self._ring.state[kernels.EMPTY_FRAMES])
-
-    @property
-    def dark_frames(self) -> int:
-        """Dark frames; their clicks per channel are `dark_channels`."""
-        return int(self._ring.state[kernels.DARK_FRAMES])
 
     @property
     def n_passages(self) -> int:
@@ -364,25 +359,15 @@ class FlowCore(Follower):
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
         assert isinstance(block, FrameBlock)  # _fits has seen to it
         ring, first = self._ring, block.exposure_index
-        kernels.put_frames(
-            block.words,
-            first,
-            ring.words,
-            ring.counts,
-            self._dark_cycle,
-            ring.state,
-            self.dark_channels,
-            self.walk.mask[0],
-        )
+        ends_dark, mask = self._dark_cycle, self.walk.mask[0]
+        kernels.put_frames(block.words, first, ring.words, ring.counts, ends_dark, ring.state, self.dark_channels, mask)
         events = [] if self.guard is None or not self._dark_cycle else self.guard.take(block)
         stop = first + n_exposures
         output = self._settle(stop, end_tick - (stop - 1) * self._period_ticks, 0)
         if self.guard is not None and self.watches_empty:
             events = self._watch_empty(self.guard, self.empty_frames, self.empty_channels)
         self.matcher.settle(stop)
-        return (
-            joined(output, Output([], events, None)) if self.watches_empty else joined(Output([], events, None), output)
-        )
+        return output._replace(events=events)
 
     def _settle(self, stop: int, origin_tick: int, flags: int) -> Output:
         """Decide on what exposures before `stop` settle; exposure e ended at `origin_tick` + e periods. With `flags` none is decided."""

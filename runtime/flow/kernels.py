@@ -36,8 +36,8 @@ P_FIRST, P_LAST, P_CENTRE, P_CLICKS, P_FLAGS, P_RELEASE, N_COLUMNS = range(7)
 BROKEN, TOO_LONG = 1, 2
 N_EDGES = 5  # figures of count_edges
 DARK, NEVER_CAME = -1, -2
-# limits, int64: the first eight of settings.FlowLimits, then the frames of a cycle that ends with a dark one (0: none does)
-W, ON, OFF, LONGEST, REFRACTORY, BACKGROUND, VALLEY_FRAMES, VALLEY_SIGMA2, DARK_CYCLE, N_LIMITS = range(10)
+# limits, int64: the first eight of settings.FlowLimits
+W, ON, OFF, LONGEST, REFRACTORY, BACKGROUND, VALLEY_FRAMES, VALLEY_SIGMA2 = range(8)
 
 # stream state, int64 (N_FACTS,): the columns of a core's state, and of a flow alone the most frames of a block, the frames of a cycle that
 # ends with a dark one (0: none does), from how many empty frames on they are told, the frames of a decision, objects so far, how often the
@@ -292,14 +292,6 @@ def total_clicks(counts, first, stop):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _mark_fits(buffer, payload, stop, facts):  # type: ignore[no-untyped-def]
-    """Whether the MARK from `payload` to `stop` is whole, the next message, and says what can be."""
-    return stream.is_next_mark(buffer, payload, stop, facts) and stream.mark_fits(
-        buffer, payload, facts, facts[core.N_CLASSES]
-    )
-
-
-@inner
 def _take_frames(buffer, payload, stop, facts, slot_offsets, flow, mask):  # type: ignore[no-untyped-def]
     """Put the frames from `payload` to `stop` into the ring and return how many; 0, and nothing done, where they are not ordinary."""
     first = facts[stream.NEXT_EXPOSURE]
@@ -311,26 +303,14 @@ def _take_frames(buffer, payload, stop, facts, slot_offsets, flow, mask):  # typ
     tick, period = stream.block_times(buffer, payload)
     if period != facts[core.PERIOD_TICKS] or load4(buffer, payload + _U(32)) != _NO_OBJECT:
         return 0
-    cycle = first // slot_offsets.size
-    planned = facts[core.START_TICK] + cycle * facts[core.CYCLE_TICKS] + slot_offsets[first - cycle * slot_offsets.size]
-    if tick < planned - period:
+    if tick < core.planned_tick(first, facts, slot_offsets) - period:
         return 0
     frames_at = np.int64(payload) + stream.BLOCK_HEADER
     frames = buffer[frames_at : frames_at + count * width].reshape(count, width)
     put_frames(frames, first, flow.words, flow.counts, facts[DARK_EVERY], flow.state, flow.dark_channels, mask)
     stream.go_on(facts, count)
-    _note_end(tick, count, facts, slot_offsets)
+    core.note_end(tick, count, facts, slot_offsets)
     return count
-
-
-@inner
-def _note_end(tick, count, facts, slot_offsets):  # type: ignore[no-untyped-def]
-    """Note when the block's last exposure ended, and by how much that is not the plan's time."""
-    last = facts[stream.NEXT_EXPOSURE] - 1
-    facts[core.LAST_TICK] = tick + (count - 1) * facts[core.PERIOD_TICKS] + facts[core.EXPOSURE_TICKS]
-    cycle = last // slot_offsets.size
-    planned = facts[core.START_TICK] + cycle * facts[core.CYCLE_TICKS] + slot_offsets[last - cycle * slot_offsets.size]
-    facts[core.JITTER] = max(facts[core.JITTER], abs(facts[core.LAST_TICK] - planned - facts[core.EXPOSURE_TICKS]))
 
 
 @inner
@@ -341,20 +321,19 @@ def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
 
     A mark is only counted: who compares decisions with the truth looks for it in what was kept.
     """
-    state, flow = walk.state, walk.flow
-    if stop < start + _U(stream.BODY_HEADER) or load4(buffer, start + _U(4)) != _U(state[core.SESSION]):
+    state, payload = walk.state, start + _U(stream.BODY_HEADER)
+    if not core.is_ours(buffer, start, stop, state):
         return core.ODD
-    if not stream.is_plain(buffer, start):
-        return core.ODD
-    payload = start + _U(stream.BODY_HEADER)
     if buffer[start] == stream.MARK:
-        if not _mark_fits(buffer, payload, stop, state):
+        if not stream.is_next_mark(buffer, payload, stop, state):
+            return core.ODD
+        if not stream.mark_fits(buffer, payload, state, state[core.N_CLASSES]):
             return core.ODD
         stream.go_on(state, np.int64(0))
         return core.TOOK_MARK
     if buffer[start] != stream.FRAMES:
         return core.ODD
-    count = _take_frames(buffer, payload, stop, state, walk.offsets, flow, walk.mask[0])
+    count = _take_frames(buffer, payload, stop, state, walk.offsets, walk.flow, walk.mask[0])
     if count == 0:
         return core.ODD
     behind = state[stream.NEXT_EXPOSURE]
@@ -500,11 +479,7 @@ def _follow(walk, start, lost):  # type: ignore[no-untyped-def]
     critical damping. Exposures count from the window before, so that no number is too long.
     """
     state, flow, edges, frames = walk.state, walk.flow, walk.edges, walk.state[FRAMES]
-    before, middle_before, part_before = (
-        state[BEFORE],
-        state[BEFORE_MIDDLE],
-        state[BEFORE_PART],
-    )
+    before, middle_before, part_before = state[BEFORE], state[BEFORE_MIDDLE], state[BEFORE_PART]
     state[BEFORE], state[BEFORE_MIDDLE] = np.int64(-1) if lost else start, state[MIDDLE]
     state[BEFORE_PART] = state[MIDDLE_PART]
     if lost or before < 0:

@@ -47,12 +47,8 @@ def abort_reason(flags: int) -> str:
 class _Row(NamedTuple):
     """A decision that waits for its mark."""
 
-    number: int
-    centre: int
-    label: int
-    flags: int
-    clicks: int
-    passage_clicks: int
+    decision: Decision
+    passage: Passage
     gated: bool
 
 
@@ -111,9 +107,8 @@ class PassageMatcher:
         self._gaps: deque[tuple[int, int]] = deque(maxlen=MAX_GAPS)
         self._left_field = -1  # last exposure of the marks settled so far
         self._photons = 0.0
-        self._pulses: dict[
-            int, tuple[bool, bool]
-        ] = {}  # decision -> (its truth is a target, alone), of pulses counted as done
+        # of pulses counted as done: decision -> (its truth is a target, alone)
+        self._pulses: dict[int, tuple[bool, bool]] = {}
         self._undone: set[int] = set()  # decisions whose pulse did not happen, not settled yet
 
     # -- what comes ----------------------------------------------------------------------------------------------------
@@ -132,14 +127,9 @@ class PassageMatcher:
         counts["decisions"] += 1
         counts["clicks"] += decision.clicks
         counts["passage_clicks"] += passage.clicks
-        counts["passage_frames"] += passage.last - passage.first + 1
         if decision.flags & _ABSTAINED:
             self.aborted[abort_reason(decision.flags)] += 1
-        self._rows.append(
-            _Row(
-                decision.number, passage.centre, decision.label, decision.flags, decision.clicks, passage.clicks, gated
-            )
-        )
+        self._rows.append(_Row(decision, passage, gated))
 
     def add_gap(self, first: int, stop: int) -> None:
         """Exposures `first`..`stop` - 1 never came."""
@@ -171,7 +161,9 @@ class PassageMatcher:
                 self._settle_mark(mark, self._marks[0] if self._marks else None)
             else:
                 self.counts["cut_off"] += 1
-                self._rows = deque(row for row in self._rows if row.centre < mark.exposure_index - mark.half_exposures)
+                self._rows = deque(
+                    row for row in self._rows if row.passage.centre < mark.exposure_index - mark.half_exposures
+                )
         self._drop_rows(1 << 62)
         self._gaps.clear()
         self._left_field = -1
@@ -179,7 +171,7 @@ class PassageMatcher:
     # -- one mark ------------------------------------------------------------------------------------------------------
 
     def _drop_rows(self, before: int) -> None:
-        while self._rows and self._rows[0].centre < before:
+        while self._rows and self._rows[0].passage.centre < before:
             row = self._rows.popleft()
             self.counts["without_mark"] += 1
             if row.gated:
@@ -192,7 +184,7 @@ class PassageMatcher:
         if following is not None:
             until = min(until, (centre + following.exposure_index) // 2)
         mine = []
-        while self._rows and self._rows[0].centre <= until:
+        while self._rows and self._rows[0].passage.centre <= until:
             mine.append(self._rows.popleft())
         overlaps = following is not None and following.exposure_index - following.half_exposures < until_field(mark)
         coincident = (overlaps or centre - half < self._left_field) and not self._touching
@@ -209,8 +201,8 @@ class PassageMatcher:
             counts["in_gaps"] += 1
         elif coincident:
             counts["coincident"] += 1
-            counts["coincident_aborted"] += any(row.flags & _COINCIDENCE for row in mine)
-            counts["coincident_labelled"] += any(row.label != NO_LABEL for row in mine)
+            counts["coincident_aborted"] += any(row.decision.flags & _COINCIDENCE for row in mine)
+            counts["coincident_labelled"] += any(row.decision.label != NO_LABEL for row in mine)
         else:
             self._settle_alone(mark, mine)
 
@@ -221,24 +213,26 @@ class PassageMatcher:
             counts["missed"] += 1
             return
         counts["doubled"] += len(mine) > 1
-        row = mine[0]
+        decision, passage, _ = mine[0]
+        offset = passage.centre - mark.exposure_index
         self._photons += mark.photons
-        counts["alone_clicks"] += row.clicks
-        counts["alone_passage_clicks"] += row.passage_clicks
-        counts["offset"] += row.centre - mark.exposure_index
-        counts["offset_squared"] += (row.centre - mark.exposure_index) ** 2
-        if row.label == NO_LABEL:
+        counts["alone_clicks"] += decision.clicks
+        counts["alone_passage_clicks"] += passage.clicks
+        counts["offset"] += offset
+        counts["offset_squared"] += offset**2
+        if decision.label == NO_LABEL:
             counts["alone_aborted"] += 1
         elif 0 <= mark.truth < len(self.confusion):
-            self.confusion[mark.truth, row.label] += 1
+            self.confusion[mark.truth, decision.label] += 1
 
     # -- pulses --------------------------------------------------------------------------------------------------------
 
     def _pulse(self, row: _Row, target: bool, alone: bool) -> None:
-        if row.number in self._undone:
-            self._undone.discard(row.number)
+        number = row.decision.number
+        if number in self._undone:
+            self._undone.discard(number)
             return
-        self._pulses[row.number] = (target, alone)
+        self._pulses[number] = (target, alone)
         if len(self._pulses) > MAX_REMEMBERED_PULSES:
             del self._pulses[next(iter(self._pulses))]
         self._count_pulse((target, alone), 1)

@@ -7,7 +7,7 @@ numbers that the kernels count with.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.instrument.checked_toml import position_of, read_toml
 from pans.runtime.intervals import binomial_tail
+from pans.runtime.ranges import Range
 
 KINDS = ("cells", "tape")
 MAX_FILE_BYTES = 1 << 16
@@ -27,61 +28,52 @@ Q = 32  # bits after the point of a bar's alignment, in exposures
 QUIET_QUANTILE = 0.05  # the empty field may exceed the release level that often
 
 
+def _within(default: float, low: float, high: float) -> Any:
+    """A number from `low` to `high`; a whole one where `default` is."""
+    return field(default=default, metadata={"range": Range(low, high, whole=isinstance(default, int))})
+
+
 @dataclass(frozen=True, slots=True)
 class FlowSettings:
     """What is known of the flow. Times and speeds are the instrument's; `classes_gated` are names of the bundle's classes."""
 
     kind: str
-    block_us: float = 250.0  # frames of one message: the price is latency
-    dark_every: int = 0  # one dark frame at the end of that many blocks; 0: none
+    block_us: float = _within(250.0, 0.01, 1e6)  # frames of one message: the price is latency
+    dark_every: int = _within(0, 0, 65534)  # one dark frame at the end of that many blocks; 0: none
     # cells
-    fields_per_s: float = 5000.0  # speed: lengths of the illumination field per second
-    onset_frames: int = 8  # frames whose clicks are summed to find an object
-    false_onsets_per_s: float = 0.01  # the onset level is the lowest that keeps this
-    background: float = 0.0  # clicks per channel and frame beside the dark ones
-    longest: float = 2.2  # fields that one object's light lasts; longer is two
-    valley_sigma: float = (
-        4.0  # depth of a dip between two maxima, in standard deviations of its clicks, that says two objects
-    )
-    refractory_frames: int = 0  # after a release no onset
-    pool: int = 1  # windows side by side whose evidence is added
-    sure: float = 0.0  # a posterior below is ambiguous: no label
+    fields_per_s: float = _within(5000.0, 1e-3, 1e9)  # speed: lengths of the illumination field per second
+    onset_frames: int = _within(8, 1, 1024)  # frames whose clicks are summed to find an object
+    false_onsets_per_s: float = _within(0.01, 1e-12, 1e6)  # the onset level is the lowest that keeps this
+    background: float = _within(0.0, 0, 1)  # clicks per channel and frame besides the dark ones
+    longest: float = _within(2.2, 0.1, 100)  # fields that one object's light lasts; longer is two
+    # depth of a dip between two maxima, in standard deviations of its clicks, that means two objects
+    valley_sigma: float = _within(4.0, 1, 1000)
+    refractory_frames: int = _within(0, 0, 1 << 20)  # after a release no onset
+    pool: int = _within(1, 1, 64)  # windows side by side whose evidence is added
+    sure: float = _within(0.0, 0, 1)  # a posterior below is ambiguous: no label
     # tape
-    bars_per_s: float = 10_000.0
-    track: int = 0  # follow phase and speed by the clicks: an edge corrects 2^-track of what it is off; 0: not at all
-    first_bar: float = 1.0  # when the window of bar position 0 is aligned, in bar pitches from the start
+    bars_per_s: float = _within(10_000.0, 1e-3, 1e9)
+    track: int = _within(
+        0, 0, 8
+    )  # follow phase and speed by the clicks: an edge corrects 2^-track of its error; 0: not
+    first_bar: float = _within(
+        1.0, 0, 1e9
+    )  # when the window of bar position 0 is aligned, in bar pitches from the start
     # gate
-    gate_delay_us: float = 900.0  # from leaving to the pulse
-    gate_us: float = 50.0  # length of the pulse
-    gate_channel: int = 0
+    gate_delay_us: float = _within(900.0, 0, 1e6)  # from leaving to the pulse
+    gate_us: float = _within(50.0, 0.01, 1e6)  # length of the pulse
+    gate_channel: int = _within(0, 0, 255)
     gate_classes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        limits: dict[str, tuple[float, float]] = {
-            "block_us": (0.01, 1e6),
-            "dark_every": (0, 65534),
-            "fields_per_s": (1e-3, 1e9),
-            "onset_frames": (1, 1024),
-            "false_onsets_per_s": (1e-12, 1e6),
-            "background": (0, 1),
-            "longest": (0.1, 100),
-            "valley_sigma": (1, 1000),
-            "refractory_frames": (0, 1 << 20),
-            "pool": (1, 64),
-            "sure": (0, 1),
-            "bars_per_s": (1e-3, 1e9),
-            "track": (0, 8),
-            "first_bar": (0, 1e9),
-            "gate_delay_us": (0, 1e6),
-            "gate_us": (0.01, 1e6),
-            "gate_channel": (0, 255),
-        }
         if self.kind not in KINDS:
             raise UsageError(f"flow kind is {self.kind!r}, allowed: {', '.join(KINDS)}")
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high):
-                raise UsageError(f"{name} is {value!r}, allowed: {low:g} to {high:g}")
+        try:
+            for one in fields(self):
+                if "range" in one.metadata:
+                    one.metadata["range"].checked(getattr(self, one.name), one.name)
+        except ValueError as error:
+            raise UsageError(str(error)) from error
 
     def as_header(self) -> dict[str, Any]:
         """Return the settings as a recording's header holds them."""
@@ -117,8 +109,6 @@ def read_flow(name: str) -> FlowSettings:
             raise ConfigError(f"{path}:{line}:{column}: unknown key {key}, allowed: {', '.join(known)}")
         if key == "gate_classes" and not (isinstance(value, list) and all(isinstance(one, str) for one in value)):
             raise ConfigError(f"{path}:{line}:{column}: gate_classes must be a list of class names, found {value!r}")
-        if isinstance(known[key].default, int) and not isinstance(value, int):
-            raise ConfigError(f"{path}:{line}:{column}: {key} must be a whole number, found {value!r}")
     if "kind" not in tables:
         raise ConfigError(f"{path}:1:1: the key kind is missing, allowed: {', '.join(KINDS)}")
     try:
