@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +10,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from links import served
 
 from pans.firmware_sim.ports.serve import build_instrument, open_sim, parse_sim_url
-from pans.firmware_sim.ports.shell import open_port, serve
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.flow.core import FlowCore
@@ -92,14 +91,10 @@ def test_a_run_at_real_pace(flow_folder: Path, usb: bool) -> None:
     """
     url = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=3"
     device, clock = build_instrument(parse_sim_url(url), time.perf_counter_ns())
-    port, stopped = open_port("tcp:127.0.0.1:0"), threading.Event()
-    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
-    thread.start()
     settings = replace(SETTINGS, gate_delay_us=400_000.0)  # a busy machine makes it
-    url = f"simusb:{port.url.removeprefix('serial:')}" if usb else port.url
-    result, figures, recording, bundle = run(flow_folder, settings, open_link(url), 0.3, url)
-    stopped.set()
-    thread.join(10)
+    with served(device, clock) as port:
+        url = f"simusb:{port.url.removeprefix('serial:')}" if usb else port.url
+        result, figures, recording, bundle = run(flow_folder, settings, open_link(url), 0.3, url)
     assert result.ended == "completed"
     gates = figures["gates"]
     assert gates["asked"] == gates["done"] + gates["refused"] + gates["expired"]

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from bundles import made_bundle
 from commands import json_of
+from heads import onnx_chain, random_layers
+from links import Wrapped
 
 from pans.firmware_sim.ports.serve import open_sim
-from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
+from pans.runtime.bundle.model import Bundle, write_bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.core.plan_codec import plan_chunks, plan_from_chunks
 from pans.runtime.core.still import Core
@@ -26,13 +28,12 @@ PROFILE = load_profile("oled-qcmos")
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+def bundle() -> Bundle:
     rng = np.random.default_rng(1)
     levels = rng.integers(0, 124, (4, 64))
     levels[rng.random(levels.shape) < 0.9] = 0
     levels[0, 0] = 123
-    made = made_bundle(
-        name="loop-test",
+    return made_bundle(
         classes=("a", "b", "c"),
         image_shape=(8, 8),
         levels=124,
@@ -40,9 +41,6 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
         photons_per_level=8.0 / 123,
         table=rng.normal(size=(16, 3)).astype(np.float32),
     )
-    path = tmp_path_factory.mktemp("bundle") / "test.pans"
-    write_bundle(made, path)
-    return load_bundle(path)[0]
 
 
 @pytest.fixture(scope="module")
@@ -60,16 +58,15 @@ def shown(bundle: Bundle) -> dict[str, Any]:
     return {name: getattr(bundle, name) for name in names}
 
 
-class Disturbed:
+class Disturbed(Wrapped):
     """A link that passes every chunk from the device through `disturb`."""
 
     def __init__(self, link: Link, disturb: Any) -> None:
-        self._link, self._disturb = link, disturb
-        self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
-        self.write, self.now_ns, self.close = link.write, link.now_ns, link.close
+        super().__init__(link)
+        self._disturb = disturb
 
     def read(self, timeout_s: float) -> bytes:
-        return bytes(self._disturb(self._link.read(timeout_s)))
+        return bytes(self._disturb(self.link.read(timeout_s)))
 
 
 def run(
@@ -105,18 +102,16 @@ def test_virtual_runs_are_the_same_bit_for_bit(bundle: Bundle, scene: Path) -> N
 
 
 def test_bytes_one_at_a_time_change_nothing(bundle: Bundle, scene: Path) -> None:
-    class Drip(Disturbed):
+    class Drip(Wrapped):
         """One byte per read; the next one is there at once."""
 
         held = bytearray()
 
         def read(self, timeout_s: float) -> bytes:
-            self.held += self._link.read(0.0 if self.held else timeout_s)
-            out = bytes(self.held[:1])
-            del self.held[:1]
-            return out
+            self.held += self.link.read(0.0 if self.held else timeout_s)
+            return bytes([self.held.pop(0)]) if self.held else b""
 
-    dripped = run(bundle, scene, n_objects=2, wrap=lambda link: Drip(link, None))
+    dripped = run(bundle, scene, n_objects=2, wrap=Drip)
     assert dripped.tally.figures() == run(bundle, scene, n_objects=2).tally.figures()
 
 
@@ -143,30 +138,18 @@ def test_a_silent_device_is_a_link_error(bundle: Bundle, scene: Path) -> None:
         run(bundle, scene, wrap=lambda link: Disturbed(link, lambda data: b""))
 
 
-def test_a_device_that_dies_ends_the_run_loudly(bundle: Bundle, scene: Path) -> None:
+@pytest.mark.parametrize("why", ["the device fell silent", "the cable was pulled"])
+def test_a_link_that_ends_still_gives_the_figures_so_far(bundle: Bundle, scene: Path, why: str) -> None:
     seen = [0]
 
-    def die(data: bytes) -> bytes:
+    def end(data: bytes) -> bytes:
         seen[0] += len(data)
+        if seen[0] > 6000 and "cable" in why:
+            raise LinkError(why)
         return data if seen[0] < 6000 else b""
 
-    result = run(bundle, scene, n_objects=200, wrap=lambda link: Disturbed(link, die))
-    assert result.ended == "the link was lost: the device fell silent"
-    assert result.link_lost
-
-
-def test_a_cable_that_is_pulled_still_gives_the_figures_so_far(bundle: Bundle, scene: Path) -> None:
-    seen = [0]
-
-    def pull(data: bytes) -> bytes:
-        seen[0] += len(data)
-        if seen[0] > 6000:
-            raise LinkError("the cable was pulled")
-        return data
-
-    result = run(bundle, scene, n_objects=200, wrap=lambda link: Disturbed(link, pull))
-    assert result.link_lost
-    assert "the cable was pulled" in result.ended
+    result = run(bundle, scene, n_objects=200, wrap=lambda link: Disturbed(link, end))
+    assert (result.ended, result.link_lost) == (f"the link was lost: {why}", True)
     assert 0 < result.tally.decisions < 600
 
 
@@ -177,23 +160,8 @@ def test_a_device_of_another_kind_is_refused(bundle: Bundle, scene: Path) -> Non
         run_live(link, PROFILE, bundle, plan, Core(plan, make_decider(bundle), 1, 1), RunOptions(n_cycles=1))
 
 
-def test_several_shots_per_decision(bundle: Bundle, scene: Path, tmp_path: Path) -> None:
-    onnx = pytest.importorskip("onnx")
-    helper, proto = onnx.helper, onnx.TensorProto
-    weights = np.random.default_rng(7).normal(size=(4, 3)).astype(np.float32)
-    graph = helper.make_graph(
-        [helper.make_node("MatMul", ["x", "w"], ["y"])],
-        "head",
-        [helper.make_tensor_value_info("x", proto.FLOAT, [None, 4])],
-        [helper.make_tensor_value_info("y", proto.FLOAT, [None, 3])],
-        [onnx.numpy_helper.from_array(weights, "w")],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    headed = made_bundle(
-        name="headed",
-        **shown(bundle),
-        head_onnx=model.SerializeToString(),
-    )
+def test_several_shots_per_decision(bundle: Bundle, scene: Path) -> None:
+    headed = made_bundle(**shown(bundle), head_onnx=onnx_chain(random_layers([4, 3])))
     result = run(headed, scene, shots=4, trials=2)
     assert result.tally.decisions == 12
     assert result.tally.clicks / 12 > 4 * 0.2
@@ -215,21 +183,14 @@ def test_a_recording_replays_to_the_same_hash_and_another_bundle_does_not(
     device = f"sim:oled-qcmos?scene={scene}&seed=5&pace=fast"
     words = ("--device", device, "--out", tmp_path)
     summary = json_of(capsys, "run --trials 2 --decisions 12", path, *words)
-    for key in (
-        *("accuracy", "clicks_mean", "photons_mean", "decisions", "late", "lost", "latency_us"),
-        *("verdict", "recording", "report"),
-    ):
-        assert key in summary
+    keys = "accuracy clicks_mean photons_mean decisions late lost latency_us verdict recording report"
+    assert {*keys.split()} <= summary.keys()
     assert summary["simulated"] is True
     assert "SIMULATED" in Path(summary["report"]).read_text()
     assert json_of(capsys, "replay", summary["recording"])["identical"] is True
     assert len(read_recording(summary["recording"]).decisions()) == 12
 
-    other = made_bundle(
-        name="other",
-        **shown(bundle),
-        table=-np.asarray(bundle.table),
-    )
+    other = made_bundle(name="other", **shown(bundle), table=-np.asarray(bundle.table))
     write_bundle(other, tmp_path / "other.pans")
     again = json_of(capsys, "replay", summary["recording"], "--bundle", tmp_path / "other.pans", code=1)
     assert again["identical"] is False

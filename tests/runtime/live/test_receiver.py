@@ -19,10 +19,10 @@ def bare_run(step: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[LiveRun, list[
     came: list[tuple[int, int]] = []
     run = LiveRun.__new__(LiveRun)
     run.core = SimpleNamespace(step=step)  # type: ignore[assignment]
-    run.lateness = SimpleNamespace(  # type: ignore[assignment]
-        stepped=lambda begin, end: None, status_came=lambda link, status, at_ns: came.append((status.tick, at_ns))
-    )
-    run.connection = SimpleNamespace(link=SimpleNamespace(now_ns=lambda: 7))  # type: ignore[assignment]
+    evidence = SimpleNamespace(worked=lambda *times: None, stamped=lambda at: came.append((at.left_ns, at.arrival_ns)))
+    run.lateness = SimpleNamespace(evidence=evidence)  # type: ignore[assignment]
+    clock = SimpleNamespace(to_host_ns=lambda tick: (tick, 0))
+    run.connection = SimpleNamespace(link=SimpleNamespace(now_ns=lambda: 7), known_clock=lambda: clock)  # type: ignore[assignment]
     run.recorder, run._broken, run.taken_here, run.armed = None, None, 0, run.connection
     monkeypatch.setattr(LiveRun, "_account", lambda self, output, times_ns: None)
     return run, came

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,10 +11,10 @@ from typing import Any
 import fault_grid
 import pytest
 from commands import json_of, page_of, words_of
+from links import served
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime import SHIPPED
 from pans.runtime.link.base import open_link
@@ -189,15 +188,10 @@ def test_repeats_are_compared_at_real_pace(how: int, tmp_path: Path) -> None:
     clock = DeviceClock(one.profile.clock.tick_hz)
     device = Repeating(one.profile, one.scene, seed=1, power_on_tick=clock.tick_at(time.perf_counter_ns()))
     device.repeats = repeats
-    port, stopped = open_port("tcp:127.0.0.1:0"), threading.Event()
-    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
-    thread.start()
     config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False)
-    with Recorder(tmp_path / "run.pansrec", {"config": one.recorded()}) as recorder:
+    with served(device, clock) as port, Recorder(tmp_path / "run.pansrec", {"config": one.recorded()}) as recorder:
         result = run_live(open_link(port.url), one.profile, one.bundle, one.plan, one.core, config, recorder)
         recorder.close({})
-    stopped.set()
-    thread.join(10)
     again = replay(read_recording(tmp_path / "run.pansrec"), one.bundle)
     assert (result.ended, again.as_recorded) == ("completed", True)
     assert (repeats.changed > 10, repeats.equal > 10) == (how != EQUAL, how == EQUAL)

@@ -1,0 +1,38 @@
+"""Links for tests: an instrument in a thread behind a real port, and a link around another one."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from pans.firmware_sim.ports.shell import open_port, serve
+
+
+@contextmanager
+def served(device: Any, clock: Any, listen: str = "tcp:127.0.0.1:0") -> Iterator[Any]:
+    """Run `device` in a thread; yield its port."""
+    port, stopped = open_port(listen), threading.Event()
+    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
+    thread.start()
+    try:
+        yield port
+    finally:
+        stopped.set()
+        thread.join(10)
+
+
+class Wrapped:
+    """A link around `link`, to be overridden; reads come one by one, since `read_ahead` is not passed on."""
+
+    def __init__(self, link: Any) -> None:
+        self.link = link
+        for name in ("name", "simulated", "virtual", "now_ns", "close", "pause"):
+            setattr(self, name, getattr(link, name))
+
+    def read(self, timeout_s: float) -> bytes:
+        return bytes(self.link.read(timeout_s))
+
+    def write(self, data: bytes) -> None:
+        self.link.write(data)
