@@ -26,7 +26,7 @@ from pans.runtime.wire.framing import FrameDecoder, encode_frame
 from pans.runtime.wire.messages import MessageType
 from pans.runtime.wire.session import STREAM_TYPES
 
-FRAMES = 150  # stream messages of a session
+FRAMES = 100  # stream messages of a session
 MOST_LATER = 40  # messages between the two
 CLEAN, EQUAL, CHANGED_FIRST, CHANGED_LATER, MIXED = range(5)  # what comes twice in a session
 HOW = ("clean", "equal", "changed first", "changed later", "mixed")
@@ -118,8 +118,7 @@ def wrong_verdicts(folder: Path, sessions: int, monkeypatch: pytest.MonkeyPatch)
     modes = fault_grid.MODES
     for number in range(sessions):
         mode = modes[number % len(modes)]
-        dice = random.Random(number)
-        how, often = dice.randrange(1, len(HOW)), dice.choice((0.01, 0.1, 1.0))
+        how, often = 1 + (number + number // len(modes)) % 4, (0.3, 1.0, 0.1, 0.01)[number // 4 % 4]
         result, recording, repeats = session(folder / "run.pansrec", mode, how, number, often)
         clean, undisturbed, _ = session(folder / "clean.pansrec", mode, CLEAN, number, 0.0)
         kinds[how if repeats.changed or how == EQUAL else EQUAL] += 1
@@ -136,7 +135,7 @@ def wrong_verdicts(folder: Path, sessions: int, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_no_session_is_judged_wrongly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong, kinds = wrong_verdicts(tmp_path, 12, monkeypatch)  # one of each mode
+    wrong, kinds = wrong_verdicts(tmp_path, 6, monkeypatch)
     assert wrong == []
     assert min(kinds[1:]) >= 1
 
@@ -162,7 +161,7 @@ def test_the_exit_code_and_each_file_tell(
     repeats, step = Repeats(how, 1, 0.2), Instrument.step
     monkeypatch.setattr(Instrument, "step", lambda device, tick, data: repeats.spoil(step(device, tick, data)))
     device = "sim:dmd-spad?scene=fashion200&seed=1&pace=fast"
-    words = ("--decisions", 400, "--out", tmp_path / "run", *(("--rotate-mb", 0.02) if parts else ()))
+    words = ("--decisions", 400 if parts else 60, "--out", tmp_path / "run", *(("--rotate-mb", 0.02) if parts else ()))
     told = json_of(capsys, "run", SHIPPED / "fashion-adaptive.pans", "--device", device, *words, code=code)
     n = told["stream"]["repeats_differing"]
     assert (told["verdict"], n > 0) == ("PASS" if code == 0 else "FAIL", code != 0)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from links import served
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
-from pans.firmware_sim.ports.shell import open_port, serve
 from pans.runtime.core.decision import Action
 from pans.runtime.errors import DeviceError, UsageError
 from pans.runtime.instrument.profile import load_profile
@@ -27,22 +28,21 @@ from pans.runtime.wire.messages import DeviceState
 MS = 1_000_000
 PATIENCE_S = 10.0
 PULSER = load_profile("ideal")
+TCP = "tcp:127.0.0.1:0"
 
 
 class Served:
     """An instrument that runs in a thread, reached through a real port."""
 
-    def __init__(self, profile: str, listen: str, offset: int, drift_ppm: float) -> None:
+    def __init__(
+        self, stack: ExitStack, profile: str, listen: str = TCP, offset: int = 0, drift_ppm: float = 0.0
+    ) -> None:
         options = SimOptions(profile, "uniform", offset=offset, drift_ppm=drift_ppm)
         self.device: Any
         self.clock: DeviceClock
         self.device, self.clock = build_instrument(options, time.perf_counter_ns())
-        self.port = open_port(listen)
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(
-            target=serve, args=(self.device, self.clock, self.port, self._stopped.is_set), daemon=True
-        )
-        self._thread.start()
+        self._running = stack.enter_context(ExitStack())
+        self.port = self._running.enter_context(served(self.device, self.clock, listen))
 
     @property
     def url(self) -> str:
@@ -50,23 +50,14 @@ class Served:
         return self.port.url.replace("serial:socket://", "tcp:")
 
     def vanish(self) -> None:
-        if not self._stopped.is_set():
-            self._stopped.set()
-            self._thread.join(PATIENCE_S)
-            self.port.close()
+        self._running.close()
+        self.port.close()
 
 
 @pytest.fixture
 def serve_one() -> Iterator[Callable[..., Served]]:
-    made: list[Served] = []
-
-    def make(*args: Any) -> Served:
-        made.append(Served(*args))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.vanish()
+    with ExitStack() as stack:
+        yield partial(Served, stack)
 
 
 def connected(served: Served) -> SecondInstrument:
@@ -105,7 +96,7 @@ class Lab:
         self.queue.second.close()
 
 
-LISTEN = ["tcp:127.0.0.1:0", *(["pty"] if hasattr(os, "openpty") else [])]
+LISTEN = [TCP, *(["pty"] if hasattr(os, "openpty") else [])]
 
 
 @pytest.mark.parametrize("listen", LISTEN)
@@ -113,7 +104,7 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
     listen: str, serve_one: Callable[..., Served]
 ) -> None:
     """Both clocks start elsewhere and run 100 ppm apart; where the pulses really are is taken from the simulators' own clocks."""
-    first, other = serve_one("flow-snspd", "tcp:127.0.0.1:0", 10**12, 50.0), serve_one("ideal", listen, 77, -50.0)
+    first, other = serve_one("flow-snspd", TCP, 10**12, 50.0), serve_one("ideal", listen, 77, -50.0)
     second = connected(other)
     lab = Lab(first, second)
     asked = []
@@ -137,8 +128,7 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
         off_ns = other.clock.host_ns_at(pulse.tick) - first.clock.host_ns_at(tick)
         assert abs(off_ns) <= row["uncertainty_us"] * 1000
         assert (pulse.end_tick - pulse.tick) / PULSER.clock.tick_hz == pytest.approx(20e-6, rel=0.05)
-    facts = second.facts()
-    kept = second.connection.known_clock().history()
+    facts, kept = second.facts(), second.connection.known_clock().history()
     quickest = np.sort(kept["round_trip_ns"][-10:])  # of those while it ran: none had to wait for the next look
     assert quickest[2] < 15 * MS
     assert facts["worst_uncertainty_us"] == max(row["uncertainty_us"] for row in rows) < 50_000
@@ -148,7 +138,7 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
 
 
 def test_what_the_second_instrument_refuses_is_counted_and_told(serve_one: Callable[..., Served]) -> None:
-    first, other = serve_one("flow-snspd", "tcp:127.0.0.1:0", 0, 0.0), serve_one("ideal", "tcp:127.0.0.1:0", 0, 0.0)
+    first, other = serve_one("flow-snspd"), serve_one("ideal")
     lab = Lab(first, connected(other))
     tick = lab.clock.to_tick(time.perf_counter_ns() + 200 * MS)
     lab.queue.take([Action(1, tick, 100, 99), Action(2, tick, 100, 0)])  # there is no output 99
@@ -160,7 +150,7 @@ def test_what_the_second_instrument_refuses_is_counted_and_told(serve_one: Calla
 
 
 def test_a_second_instrument_that_is_gone_does_not_end_the_run(serve_one: Callable[..., Served]) -> None:
-    first, other = serve_one("flow-snspd", "tcp:127.0.0.1:0", 0, 0.0), serve_one("ideal", "tcp:127.0.0.1:0", 0, 0.0)
+    first, other = serve_one("flow-snspd"), serve_one("ideal")
     lab = Lab(first, connected(other))
     other.vanish()
     lab.turns(PATIENCE_S, lambda: bool(lab.events("actuator_lost")))
@@ -174,7 +164,7 @@ def test_a_second_instrument_that_is_gone_does_not_end_the_run(serve_one: Callab
 
 def test_a_lease_that_ran_out_is_taken_again(serve_one: Callable[..., Served], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pans.runtime.live.gates.LEASE_MS", 100)
-    other = serve_one("ideal", "tcp:127.0.0.1:0", 0, 0.0)
+    other = serve_one("ideal")
     second = connected(other)
     until = time.perf_counter_ns() + round(PATIENCE_S * 1e9)
     while other.device.state is not DeviceState.SAFE and time.perf_counter_ns() < until:
@@ -188,7 +178,7 @@ def test_a_lease_that_ran_out_is_taken_again(serve_one: Callable[..., Served], m
 
 
 def test_another_instrument_than_the_profile_says_is_refused(serve_one: Callable[..., Served]) -> None:
-    other = serve_one("ideal", "tcp:127.0.0.1:0", 0, 0.0)
+    other = serve_one("ideal")
     second = open_actuator(other.url, load_profile("flow-snspd"))
     assert isinstance(second, SecondInstrument)
     with pytest.raises(DeviceError, match="flow-snspd says parallel"):

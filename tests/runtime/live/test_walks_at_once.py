@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import struct
 from pathlib import Path
@@ -17,6 +16,7 @@ from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.runtime.bundle.automaton import walk_nodes
 from pans.runtime.bundle.model import Bundle, write_bundle
 from pans.runtime.cli import main
+from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.core.plan import build_plan
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import DeviceError, PlanError
@@ -165,42 +165,23 @@ def test_a_dead_detector_never_clicks(runs: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "kind", "level"),
-    [
-        ("", "", ""),
-        ("dead:at_s=1:channel=1", "dead", "warning"),
-        ("hot:at_s=1:channel=1:rate_hz=20000", "hot", "alarm"),
-    ],
+    ("change", "policy", "kind", "level"),
+    [("dead:at_s=0.2", "abstain", "dead", "warning"), ("hot:at_s=0.2:rate_hz=20000", "warn", "hot", "alarm")],
 )
 def test_what_one_of_several_detectors_does_in_the_dark_is_told_of_it_alone(
-    runs: Path, tmp_path: Path, change: str, kind: str, level: str, capsys: pytest.CaptureFixture[str]
+    runs: Path, tmp_path: Path, change: str, policy: str, kind: str, level: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    device = f"sim:dmd-four-snspd?scene={runs / 'tiny.npz'}&seed=5&pace=fast" + (f"&changes={change}" if change else "")
-    words = ["--dark-slots", "2", "--decisions", "3000", "--trials", "100", "--json", "--out", str(tmp_path / "run")]
-    main(["run", str(runs / "walk.pans"), "--device", device, *words])
-    dark = json.loads(capsys.readouterr().out)["dark"]
-    found = [finding for finding in dark["findings"] if finding["state"] == kind] if kind else dark["findings"]
-    assert [(finding["channels"], finding["level"]) for finding in found] == ([([1], level)] if kind else [])
-    assert len(dark["channels"]) == CHANNELS
+    device = f"sim:dmd-four-snspd?scene={runs / 'tiny.npz'}&seed=5&pace=fast&changes={change}:channel=1"
+    words = ("--dark-slots", 2, "--decisions", 900, "--trials", 30, "--on-dark", policy, "--out", tmp_path)
+    summary = json_of(capsys, "run", runs / "walk.pans", "--device", device, *words, code=None)
+    dark = summary["dark"]
+    found = [finding for finding in dark["findings"] if finding["state"] == kind]
+    assert [(finding["channels"], finding["level"]) for finding in found] == [([1], level)]
     for channel, row in enumerate(dark["channels"]):
-        as_expected = row["low"] <= row["expected"] * 1.15 and row["high"] >= row["expected"] * 0.85
-        assert as_expected == (not kind or channel != 1)
-    if not kind:  # any of three, each at its rate
-        assert dark["low"] < dark["expected"] < dark["high"]
-        assert dark["expected"] == pytest.approx(1 - (1 - dark["channels"][0]["expected"]) ** CHANNELS)
-    assert main(["replay", str(tmp_path / "run" / "run.pansrec")]) == 0
-
-
-def test_a_policy_gives_no_label_while_one_of_several_detectors_is_dead(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    device = f"sim:dmd-four-snspd?scene={runs / 'tiny.npz'}&seed=5&pace=fast&changes=dead:at_s=1:channel=1"
-    words = ["--dark-slots", "2", "--decisions", "3000", "--trials", "100", "--on-dark", "abstain"]
-    main(["run", str(runs / "walk.pans"), "--device", device, *words, "--json", "--out", str(tmp_path / "run")])
-    abstained = json.loads(capsys.readouterr().out)["abstained"]
-    rows = read_recording(tmp_path / "run" / "run.pansrec").decisions()
-    without = np.flatnonzero(rows["flags"] & 16)
-    assert len(without) == abstained > 1000
-    assert without[0] > 300
+        assert (row["low"] <= row["expected"] * 1.15 and row["high"] >= row["expected"] * 0.85) == (channel != 1)
+    assert dark["expected"] == pytest.approx(1 - (1 - dark["channels"][0]["expected"]) ** CHANNELS)
+    without = np.flatnonzero(read_recording(tmp_path / "run.pansrec").decisions()["flags"] & DecisionFlag.DARK_ALARM)
+    assert len(without) == summary["abstained"]
+    assert (len(without) > 100) == (policy == "abstain")
     assert (np.diff(without) == 1).all()
-    assert main(["replay", str(tmp_path / "run" / "run.pansrec")]) == 0
+    assert main(["replay", str(tmp_path / "run.pansrec")]) == 0
