@@ -377,8 +377,7 @@ def _check_projector(profile: Profile, bundle: Bundle) -> None:
 
 def _hold(shots: int, ticks: Ticks) -> int:
     """How long one display lasts in pattern-major order: enough whole refresh periods for all its exposures."""
-    periods = max(1, up(shots * ticks.spacing / ticks.refresh))
-    return max(shots * ticks.spacing, up(periods * ticks.refresh))
+    return up(max(1, up(shots * ticks.spacing / ticks.refresh)) * ticks.refresh)
 
 
 def _shot_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
