@@ -14,7 +14,6 @@ import pytest
 from heads import head_bundle, random_layers
 from plans import parallel
 
-from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
@@ -22,7 +21,6 @@ from pans.runtime.decide.kernels import winner
 from pans.runtime.decide.verdict import log_evidence, softmax_winner, softmax_winners
 from pans.runtime.intervals import binomial_tail, wilson_interval
 from pans.runtime.kernel.calls import StreamCore
-from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import FrameBlock
@@ -49,22 +47,21 @@ def test_winning_probabilities() -> None:
     assert worst <= 4 * 2**-52
 
 
-@pytest.mark.parametrize("bad", [[np.nan, 1.0], [1.0, np.nan], [np.inf, 0.0], [-np.inf, -np.inf]])
-def test_scores_that_are_not_finite(bad: list[float]) -> None:
-    row = np.array(bad, np.float32)
-    assert softmax_winner(row).probability == 0.0
-    assert winner(row[None], 0, 2)[1] == 0.0
-    assert softmax_winners(row[None]).probabilities[0] == 0.0
-
-
-def test_infinitely_unlikely_classes_are_no_fault() -> None:
-    row = np.array([-np.inf, 2.0], np.float32)
-    for label, probability in (softmax_winner(row), winner(row[None], 0, 2)):
-        assert (label, probability) == (1, 1.0)
+@pytest.mark.parametrize(
+    ("scores", "probability"),
+    [([np.nan, 1], 0), ([1, np.nan], 0), ([np.inf, 0], 0), ([-np.inf, -np.inf], 0), ([-np.inf, 2], 1)],
+)
+def test_scores_that_are_not_finite(scores: list[float], probability: float) -> None:
+    """An infinitely unlikely class is no fault."""
+    row = np.array(scores, np.float32)
+    bulk = softmax_winners(row[None])
+    for label, found in (softmax_winner(row), winner(row[None], 0, 2), (bulk.labels[0], bulk.probabilities[0])):
+        assert found == probability
+        assert label == 1 or not probability
 
 
 @pytest.mark.parametrize("p", [0.0, 1e-9, 1e-3, 0.3, 0.9, 1.0])
-@pytest.mark.parametrize("n", [1, 20, 400])
+@pytest.mark.parametrize("n", [1, 20, 150])
 def test_dark_alarm_probabilities_are_exact(p: float, n: int) -> None:
     """Relative error at most 1e-10 above the mean (at or below it the alarm does not ask)."""
     exact_p = Fraction(p)
@@ -88,22 +85,6 @@ def test_dark_rates_after_a_thousand_million_frames() -> None:
         half = z / (1 + z * z / n) * mpmath.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
         assert abs(low - (centre - half)) <= 1e-15 * centre
         assert abs(high - (centre + half)) <= 1e-15 * centre
-
-
-def test_int8_scales_against_exact_rationals() -> None:
-    """A weight is off by at most half its column's scale (and a rounding of the scale to float32)."""
-    layers = random_layers([9, 20, 5], seed=6)
-    head = quantise_head(layers)
-    whole, scale, bias = head.matrices()[0]
-    step = Fraction(1)
-    for k in range(20):
-        column = [Fraction(float(w)) for w in layers[0].weights[:, k]]
-        unit = max(abs(w) for w in column) / 127
-        step = Fraction(float(scale[k])) / unit  # scale = unit / hidden step
-        for i, weight in enumerate(column):
-            assert abs(int(whole[i, k]) * unit - weight) <= unit / 2 * (1 + Fraction(1, 10**9))
-        exact_bias = Fraction(float(layers[0].bias[k])) * step
-        assert abs(Fraction(float(bias[k])) - exact_bias) <= abs(exact_bias) * Fraction(3, 2**24)
 
 
 def test_counters_and_ticks_far_beyond_32_bits() -> None:
@@ -131,16 +112,6 @@ def test_counters_and_ticks_far_beyond_32_bits() -> None:
     assert streamed.core.windows.tallies[0] == 2**40 + n_features
 
 
-def test_the_clock_keeps_its_nanoseconds_at_large_ticks() -> None:
-    clock = ClockModel(1_000_000_000)
-    base = 2**60
-    for k in range(20):
-        host = 10**15 + k * 10**8
-        clock.add_probe(host, base + k * 10**8 + 500, base + k * 10**8 + 600, host + 1100)
-    found, _ = clock.to_host_ns(base + 19 * 10**8 + 550)
-    assert abs(found - (10**15 + 19 * 10**8 + 550)) <= 2
-
-
 def test_folding_of_dead_and_saturated_channels_is_exact() -> None:
     """Folded weights against rationals: worst relative error 8 units in the last place; dead channels give their constant only."""
     pytest.importorskip("torch")
@@ -159,11 +130,7 @@ def test_folding_of_dead_and_saturated_channels_is_exact() -> None:
             size = abs(total)
             for i in range(7):
                 m = mpmath.mpf(float(mean[i]))
-                scale = (
-                    mpmath.mpf(0)
-                    if i < 4
-                    else mpmath.mpf(float(gain[i])) / mpmath.sqrt(m * (1 - m) + mpmath.mpf(EPSILON))
-                )
+                scale = mpmath.mpf(float(gain[i])) / mpmath.sqrt(m * (1 - m) + mpmath.mpf(EPSILON)) if i >= 4 else 0
                 exact = mpmath.mpf(float(weight[h, i])) * scale
                 assert abs(mpmath.mpf(float(folded[h, i])) - exact) <= 8 * abs(exact) * mpmath.mpf(2) ** -52
                 term = mpmath.mpf(float(weight[h, i])) * (mpmath.mpf(float(shift[i])) - m * scale)
