@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -40,9 +40,6 @@ from .lateness import Lateness
 from .run_options import RunOptions
 from .tally import RunTally
 
-if TYPE_CHECKING:
-    from .receiver import Receiver
-
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
 RECEIVE_WINDOW = 4096  # stream messages
@@ -58,10 +55,24 @@ I64 = npt.NDArray[np.int64]
 Rows = npt.NDArray[np.void]
 
 
+class Receives(Protocol):
+    """What a run needs of its receiver (receiver.Receiver)."""
+
+    def prepare(self) -> None: ...
+
+    def receive(self, poll_s: float) -> list[Output]: ...
+
+    def last(self, poll_s: float) -> None: ...
+
+    def rest(self) -> None: ...
+
+    def next_id(self) -> int: ...
+
+
 class LiveRun:
     """One run in progress: what `run_live` calls again and again, and what a live view may look at."""
 
-    receiver: Receiver  # set before the run is armed
+    receiver: Receives  # set before the run is armed
     driver: HostDriver | None = None  # of an automaton that the host follows
     armed: Connection | None = None  # whose session was sent ARM last
     _counted: Connection | None = None
