@@ -1,6 +1,6 @@
 """From recorded messages to decisions, as a lab would write it from docs/reference/formats.md, "From exposures to decisions".
 
-Owns the rules of still runs, in plain loops; the back ends are lab_backends.py's. Imports nothing of the package.
+The back ends that any reader can recompute bit for bit, and the rules of still runs, in plain loops.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from lab_backends import ABSTAINED, BACKENDS, NO_LABEL, Counts, Scores, verdict
 from lab_bundle import Bundle, demand
 from lab_frames import CLICKS, COMMAND, COUNTS, FRAMES, MARK, STATUS, FrameCutter, open_body
 from lab_recording import ROW, Recording
@@ -21,6 +21,61 @@ from numpy.typing import NDArray
 DARK, NO_OBJECT = 0xFFFF, 0xFFFFFFFF
 GAP, WRONG, INCOMPLETE = 1, 2, 4
 IDLE, SAFE, COMPLETED = 0, 3, 1
+NO_LABEL = 0xFFFF
+ABSTAINED, NOT_FINITE = 8, 64
+
+Counts = NDArray[np.int64]
+Scores = Callable[[Counts, int], NDArray[Any]]
+
+
+def table_scores(bundle: Bundle) -> Scores:
+    """Return the back end `table`."""
+    table, base = bundle.parts["table"], bundle.largest + 1
+    return lambda counts, shots: table[sum(int(count) * base**i for i, count in enumerate(counts))]
+
+
+def float64_scores(bundle: Bundle) -> Scores:
+    """Return the back end `float64`."""
+    layers = bundle.layers()
+
+    def scores(counts: Counts, shots: int) -> NDArray[Any]:
+        x = counts / np.float64(shots * bundle.largest)
+        for weights, bias, relu in layers:
+            x = x @ weights.astype(np.float64) + bias.astype(np.float64)
+            x = np.maximum(x, 0.0) if relu else x
+        return x
+
+    return scores
+
+
+def int8_scores(bundle: Bundle) -> Scores:
+    """Return the back end `int8`."""
+    sizes = bundle.parts["int8_sizes"].tolist()
+    scale, bias = bundle.parts["int8_affine"]
+
+    def scores(counts: Counts, shots: int) -> NDArray[Any]:
+        x, unit, weight_at, at = counts, np.float32(1) / np.float32(shots * bundle.largest), 0, 0
+        for n_in, n_out in pairwise(sizes):
+            flat = bundle.parts["int8_weights"][weight_at : weight_at + n_in * n_out]
+            sums = (x @ flat.reshape(n_in, n_out).astype(np.int64)).astype(np.float32)
+            y = sums * (scale[at : at + n_out] * unit) + bias[at : at + n_out]
+            x = (np.clip(y, np.float32(0), np.float32(255)) + np.float32(0.5)).astype(np.int64)
+            weight_at, at, unit = weight_at + n_in * n_out, at + n_out, np.float32(1)
+        return y
+
+    return scores
+
+
+BACKENDS = {"table": table_scores, "float64": float64_scores, "int8": int8_scores}
+
+
+def verdict(scores: NDArray[Any]) -> tuple[int, np.float32, int]:
+    """Return label, probability and flags of one row of scores."""
+    wide = scores.astype(np.float64)
+    if np.isnan(wide).any() or np.isinf(wide.max()):
+        return NO_LABEL, np.float32(0), NOT_FINITE | ABSTAINED
+    label = int(wide.argmax())
+    return label, np.float32(1 / np.exp(wide - wide[label]).sum()), 0
 
 
 @dataclass

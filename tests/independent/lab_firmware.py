@@ -1,21 +1,26 @@
-"""Firmware of an instrument, as a lab would write it from docs/reference/protocol.md alone.
+"""Firmware of an instrument, as a lab would write it from docs/reference/protocol.md alone: bytes and ticks in, bytes out.
 
-Owns one device from power-on: session, commands, states, lease, receive window, stream. Bytes and ticks in, bytes out; the serving of a
-port is lab_port.py's. Its `books` are what it knows it has done, to be held against the host's. Imports nothing of the package.
+Its `books` are what it knows it has done, to be held against the host's.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
+import numpy as np
 from lab_frames import (
     ACK,
+    CLICKS,
     COMMAND,
+    FRAMES,
     GRANT,
     HELLO,
+    MARK,
     PING,
     PONG,
     PROTOCOL,
@@ -26,13 +31,199 @@ from lab_frames import (
     frame,
 )
 from lab_light import Light
-from lab_memory import LATE, MALFORMED, MAX_PIXELS, PATTERN_MEMORY, RANGE, SLOT_MEMORY, STATE, UNKNOWN, Memory, Refused
-from lab_run import Maker, Run
+from numpy.typing import NDArray
 
 IDLE, ARMED, RUNNING, SAFE = range(4)
 NO_REASON, COMPLETED, STOPPED, LEASE_EXPIRED, POWER_ON = range(5)
 U32 = 1 << 32
 HOUR_MS = 3_600_000
+
+
+DARK = 0xFFFF
+Maker = Callable[[int, int], bytes]  # sequence, drops -> payload
+
+
+@dataclass
+class Plan:
+    """A complete plan and how its cycle is cut into blocks: (first slot, exposures)."""
+
+    mode: int
+    patterns: int
+    exposure_ticks: int
+    spacing: int
+    cycle_ticks: int
+    longest_block: int
+    cycles_per_object: int
+    slots: list[tuple[int, int, int]]
+
+    def blocks(self) -> list[tuple[int, int]]:
+        """Consecutive, equally spaced slots, as many as a block may hold."""
+        cut, first = [], 0
+        for slot in range(1, len(self.slots) + 1):
+            ends = slot == len(self.slots) or slot - first == self.longest_block
+            if ends or self.slots[slot][0] - self.slots[slot - 1][0] != self.spacing:
+                cut.append((first, slot - first))
+                first = slot
+        return cut
+
+
+class Run:
+    """One armed run: which stream message is due when, and what is in it."""
+
+    def __init__(self, plan: Plan, start: int, cycles: int, light: Light, channels: int) -> None:
+        self.plan, self.start, self.cycles, self.light, self.channels = plan, start, cycles, light, channels
+        self.over = False
+        self._blocks = plan.blocks()
+        self._cycle = self._block = 0
+        self._marked = -1  # the latest object that has been announced
+
+    def dues(self) -> list[int]:
+        """Tick of the next message, or of the end of the run."""
+        base = self.start + self._cycle * self.plan.cycle_ticks
+        if self.over:
+            return [base]
+        if self._marked < self._cycle // self.plan.cycles_per_object:
+            return [base + self.plan.slots[0][0]]
+        first, count = self._blocks[self._block]
+        return [base + self.plan.slots[first + count - 1][0] + self.plan.exposure_ticks]
+
+    def emit(self) -> tuple[int, int, Maker]:
+        """Return type, exposures and maker of the message that is due; the maker takes sequence and drops."""
+        number = self._cycle // self.plan.cycles_per_object
+        if self._marked < number:
+            self._marked = number
+            truth, photons = self.light.truth(number)
+            exposure, tick = self._cycle * len(self.plan.slots), self._mark_tick()
+            return MARK, 0, lambda seq, drops: struct.pack("<IIhHQQf", seq, number, truth, 0, exposure, tick, photons)
+        first, count = self._blocks[self._block]
+        message = self._message(first, count)
+        self._block += 1
+        if self._block == len(self._blocks):
+            self._block, self._cycle = 0, self._cycle + 1
+            self.over = bool(self.cycles) and self._cycle == self.cycles
+        return message
+
+    def _mark_tick(self) -> int:
+        """Tick of the first exposure on the present object."""
+        return self.start + self._cycle * self.plan.cycle_ticks + self.plan.slots[0][0]
+
+    def cut(self, tick: int) -> tuple[int, int, Maker] | None:
+        """Return the exposures of the block under way that have ended by `tick`."""
+        if self.over:
+            return None
+        first, count = self._blocks[self._block]
+        latest = tick - self.start - self._cycle * self.plan.cycle_ticks - self.plan.exposure_ticks
+        ended = sum(start <= latest for start, _, _ in self.plan.slots[first : first + count])
+        return self._message(first, ended) if ended else None
+
+    def begun(self, tick: int) -> int:
+        """Exposures that have begun by `tick`."""
+        cycle, within = divmod(tick - self.start, self.plan.cycle_ticks)
+        if cycle < 0:
+            return 0
+        if self.cycles and cycle >= self.cycles:
+            return self.cycles * len(self.plan.slots)
+        return cycle * len(self.plan.slots) + sum(start <= within for start, _, _ in self.plan.slots)
+
+    def ended(self, tick: int) -> int:
+        """Exposures that have ended by `tick`."""
+        return self.begun(tick - self.plan.exposure_ticks)
+
+    def _message(self, first: int, count: int) -> tuple[int, int, Maker]:
+        plan = self.plan
+        number = self._cycle // plan.cycles_per_object
+        slots = plan.slots[first : first + count]
+        tick = self.start + self._cycle * plan.cycle_ticks + slots[0][0]
+        exposure = self._cycle * len(plan.slots) + first
+        shown = [pattern for _, pattern, _ in slots]
+        if plan.mode:
+            width = next(size for size in (1, 2, 4, *range(8, 8193, 8)) if 8 * size >= self.channels)
+            bits = np.zeros((count, 8 * width), np.uint8)
+            for row, pattern in zip(bits, shown, strict=True):
+                used = np.full(plan.patterns, -1) if pattern == DARK else np.arange(plan.patterns)
+                row[: plan.patterns] = self.light.clicks(number, used)
+            kind, patterns = FRAMES, b""
+        else:
+            width, kind = 0, CLICKS
+            bits = self.light.clicks(number, np.array([-1 if one == DARK else one for one in shown]))
+            patterns = struct.pack(f"<{count}H", *shown)
+        data = patterns + np.packbits(bits.ravel(), bitorder="little").tobytes()
+
+        def message(sequence: int, drops: int) -> bytes:
+            head = (sequence, drops, tick, exposure, plan.spacing, count, width, number % 0xFFFFFFFF)
+            return struct.pack("<IIQQIHHI", *head) + data
+
+        return kind, count, message
+
+
+UNKNOWN, MALFORMED, RANGE, STATE, LATE = range(1, 6)
+MAX_PIXELS = 1 << 22
+PATTERN_MEMORY = 1024
+SLOT_MEMORY = 1 << 16
+
+
+class Refused(Exception):
+    """A command that is not carried out: status and text."""
+
+
+@dataclass
+class Memory:
+    """Patterns and plan of one session; `channels` is 0 for one detector, `pixels` is the width times the height that it is set to."""
+
+    channels: int
+    levels: int
+    pixels: int
+    patterns: dict[int, tuple[int, list[int]]] = field(default_factory=dict)  # pixels in all, levels so far
+    plan_head: tuple[int, ...] = ()
+    plan_slots: list[tuple[int, int, int]] = field(default_factory=list)
+
+    def load_pattern(self, body: bytes) -> None:
+        """LOAD_PATTERN."""
+        index, _, first, pixels = struct.unpack_from("<HHII", body)
+        count, odd = divmod(len(body) - 12, 2)
+        if odd or not 0 < count <= 4096 or first + count > pixels:
+            raise Refused(MALFORMED, "levels of a pattern")
+        levels = list(struct.unpack_from(f"<{count}H", body, 12))
+        if first == 0:
+            self.patterns[index] = (pixels, [])
+        wanted, held = self.patterns.get(index, (0, []))
+        good = index < PATTERN_MEMORY and pixels <= MAX_PIXELS and max(levels) < self.levels
+        if not good or first != len(held) or pixels != wanted or pixels != self.pixels:
+            raise Refused(RANGE, f"pattern {index}, pixel {first} of {pixels}")
+        held += levels
+
+    def load_plan(self, body: bytes) -> None:
+        """LOAD_PLAN."""
+        head = struct.unpack_from("<BBHIIIIQHHI", body)
+        mode, _, patterns, n_slots, first, exposure, _, cycle, longest, _, per_object = head
+        count, odd = divmod(len(body) - 36, 12)
+        if odd or not 0 < count <= 1024 or first + count > n_slots:
+            raise Refused(MALFORMED, "slots of a plan")
+        slots = list(struct.iter_unpack("<QHH", body[36:]))
+        if first == 0:
+            self.plan_head, self.plan_slots = head, []
+        follows = first == len(self.plan_slots) and (*head[:4], *head[5:]) == (*self.plan_head[:4], *self.plan_head[5:])
+        most = self.channels if self.channels else PATTERN_MEMORY
+        good = bool(mode) == bool(self.channels) and 0 < patterns <= most and n_slots <= SLOT_MEMORY
+        if not (follows and good and exposure and longest and per_object and cycle <= 1 << 48):
+            raise Refused(RANGE, f"plan from slot {first}")
+        shown = [pattern for _, pattern, _ in slots if pattern != DARK]
+        starts = [start for start, _, _ in self.plan_slots[-1:] + slots]
+        apart = all(after - before >= exposure for before, after in pairwise(starts))
+        if not apart or starts[-1] + exposure > cycle or max(shown, default=0) >= patterns:
+            raise Refused(RANGE, f"slots from {first} on")
+        self.plan_slots += slots
+
+    def complete(self) -> tuple[Plan, NDArray[np.uint16]]:
+        """Return plan and patterns, (patterns, pixels), if all of them are here."""
+        if not self.plan_head or len(self.plan_slots) < self.plan_head[3]:
+            raise Refused(STATE, "no complete plan")
+        mode, _, n_patterns, _, _, exposure, spacing, cycle, longest, _, per_object = self.plan_head
+        chosen = [self.patterns.get(index, (1, [])) for index in range(n_patterns)]
+        if any(len(levels) < pixels for pixels, levels in chosen):
+            raise Refused(STATE, "a pattern is missing")
+        plan = Plan(mode, n_patterns, exposure, spacing, cycle, longest, per_object, list(self.plan_slots))
+        return plan, np.array([levels for _, levels in chosen], np.uint16)
 
 
 @dataclass

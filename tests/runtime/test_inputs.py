@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import struct
 import zipfile
@@ -34,12 +35,21 @@ def test_ranges() -> None:
             allowed.checked(value, "x")
 
 
-@pytest.mark.parametrize(
-    "text", ['{"a":1e999}', '{"a":18446744073709551616}', '{"a":-1e309}', '{"a":' + "[" * 80 + "]" * 80 + "}"]
-)
-def test_json_numbers_stay_in_range(text: str) -> None:
-    with pytest.raises(DamagedFileError, match=r"beyond|deep"):
+NOT_JSON = [
+    *('{"a":1e999}', '{"a":18446744073709551616}', '{"a":-1e309}', '{"a":NaN}', '{"a":1,"a":1}', "[1]"),
+    *('{"a":' + "[" * depth + "]" * depth + "}" for depth in (64, 80)),
+]
+
+
+@pytest.mark.parametrize("text", NOT_JSON, ids=lambda text: text[:30])
+def test_json_is_strict(text: str) -> None:
+    with pytest.raises(DamagedFileError, match=r"^x: "):
         parse_json_object(text.encode(), "x")
+
+
+@pytest.mark.parametrize("text", ['{"a":18446744073709551615}', '{"a":1e308}', '{"a":' + "[" * 63 + "]" * 63 + "}"])
+def test_json_up_to_its_limits_is_read(text: str) -> None:
+    assert parse_json_object(text.encode(), "x") == json.loads(text)
 
 
 def test_only_regular_files_are_read(tmp_path: Path) -> None:

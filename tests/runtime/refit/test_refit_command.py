@@ -38,11 +38,12 @@ def recorded(folder: Path, name: str, seed: int, *more: str) -> Path:
     return folder / name
 
 
-def labels(folder: Path, name: str, skip: int = 0, **changed: str) -> Path:
-    """Write the scene's truth, the first `skip` objects without a line, and the `changed` ones (o3="Bag") as told."""
+def labels(folder: Path, name: str, recording: str = "", **changed: str) -> Path:
+    """Write the scene's truth, and the `changed` ones (o3="Bag") as given; each line may name its `recording`."""
     scene = load_scene("fashion200")
     rows = [f"{number},{changed.get(f'o{number}', scene.classes[label])}" for number, label in enumerate(scene.labels)]
-    (folder / name).write_text("\n".join(["object,label", *rows[skip:]]) + "\n")
+    lines = [f"{recording},{row}" if recording else row for row in ("object,label", *rows)]
+    (folder / name).write_text("\n".join(lines).replace(recording, "recording", recording != "") + "\n")
     return folder / name
 
 
@@ -92,8 +93,10 @@ def test_labels_from_a_file_are_the_marks(folder: Path) -> None:
         return labelled_clicks(bundle, sha256, [folder / "run.pansrec"], found)
 
     by_file, by_marks = read("truth.csv"), labelled_clicks(bundle, sha256, [folder / "run.pansrec"], None)
+    by_name = read("named.csv", recording="run.pansrec")
     for name in ("counts", "truth", "object_id"):
         assert np.array_equal(getattr(by_file, name), getattr(by_marks, name))
+        assert np.array_equal(getattr(by_file, name), getattr(by_name, name))
     assert by_file.counts.sum(axis=1).tolist() == read_recording(folder / "run.pansrec").decisions()["clicks"].tolist()
     fewer = read("some.csv", **{f"o{number}": "" for number in range(0, 200, 4)}, o5="Bag", o6="8")
     assert (len(fewer.truth), len(np.unique(fewer.object_id)), fewer.left_out["without a label"]) == (300, 150, 100)
@@ -111,26 +114,22 @@ def test_what_cannot_be_refitted_is_refused(folder: Path, capsys: pytest.Capture
     assert "same recording" in refusal(capsys, BUNDLE, run, run, "-o", out)
     assert "is the input" in refusal(capsys, BUNDLE, run, "-o", run)
     assert "exists already" in refusal(capsys, BUNDLE, run, "-o", folder / "shifted.npz")
-    bad = [
-        (labels(folder, "short.csv", skip=3), "3 objects are not in the labels, object 0 first"),
-        (labels(folder, "range.csv", o7="17"), "range.csv:9: the label is '17', allowed: 0 to 9"),
-        (labels(folder, "none.csv", **{f"o{n}": "" for n in range(200)}), "no object has a label"),
-        (labels(folder, "few.csv", **{f"o{n}": "" for n in range(100)}), "too few labelled objects, allowed: 10"),
-    ]
-    text = (
-        (folder / "truth.csv").read_text() if (folder / "truth.csv").exists() else labels(folder, "t.csv").read_text()
-    )
-    for name, more, said in (
-        ("twice.csv", "5,Bag\n", "twice.csv:202: object 5 has a label already"),
-        ("beyond.csv", "200,Bag\n", "labels for 1 objects that the recordings do not have, object 200"),
-        ("minus.csv", "-1,Bag\n", "minus.csv:202: the object is '-1'"),
-        ("wide.csv", "1,2,3\n", "wide.csv:202: 3 values"),
-    ):
-        (folder / name).write_text(text + more)
-        bad.append((folder / name, said))
-    (folder / "head.csv").write_text("what,ever\n")
-    bad.append((folder / "head.csv", "allowed: object,label or recording,object,label"))
-    for path, said in bad:
-        assert said in refusal(capsys, BUNDLE, run, "--labels", path, "-o", out), path.name
+    head, *lines = labels(folder, "t.csv").read_text().splitlines(keepends=True)
+    unknown = [f"{number},\n" for number in range(OBJECTS)]
+    bad = {
+        "3 objects are not in the labels, object 0 first": [head, *lines[3:]],
+        "x.csv:9: the label is '17', allowed: 0 to 9": [head, *lines[:7], "7,17\n", *lines[8:]],
+        "no object has a label": [head, *unknown],
+        "too few labelled objects, allowed: 10": [head, *unknown[:100], *lines[100:]],
+        "x.csv:202: object 5 has a label already": [head, *lines, "5,Bag\n"],
+        "labels for 1 objects that the recordings do not have, object 200": [head, *lines, "200,Bag\n"],
+        "x.csv:202: the object is '-1'": [head, *lines, "-1,Bag\n"],
+        "x.csv:202: 3 values": [head, *lines, "1,2,3\n"],
+        "allowed: object,label or recording,object,label": ["what,ever\n"],
+        "labels of 'a', which 0 of the recordings are called": ["recording," + head, *(f"a,{line}" for line in lines)],
+    }
+    for said, text in bad.items():
+        (folder / "x.csv").write_text("".join(text))
+        assert said in refusal(capsys, BUNDLE, run, "--labels", folder / "x.csv", "-o", out)
     assert "is once of class" in refusal(capsys, BUNDLE, run, "--cycle", 7, "-o", out)
     assert not out.exists()
