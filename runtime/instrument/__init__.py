@@ -10,23 +10,7 @@ time, for trainer and simulator too); cusum.py, channel_health.py and light_leve
 """
 
 from .calibration import Calibration, load_calibration
-from .channel_health import DeadChannelTest
-from .click_law import ClickLaw, click_law, click_probability
-from .cusum import ChannelWatch
-from .dead_time import DeadTime
-from .profile import Profile, load_profile, parse_profile, shipped_profiles
+from .click_law import ClickLaw, click_law
+from .profile import Profile, load_profile, shipped_profiles
 
-__all__ = [
-    "Calibration",
-    "ChannelWatch",
-    "ClickLaw",
-    "DeadChannelTest",
-    "DeadTime",
-    "Profile",
-    "click_law",
-    "click_probability",
-    "load_calibration",
-    "load_profile",
-    "parse_profile",
-    "shipped_profiles",
-]
+__all__ = ["Calibration", "ClickLaw", "Profile", "click_law", "load_calibration", "load_profile", "shipped_profiles"]

@@ -166,7 +166,7 @@ class Connection:
 
     def settle(self) -> None:
         """Wait until every command has been acknowledged."""
-        while not self.session.settled:
+        while self.session.in_flight:
             self.pump(SETUP_POLL_S)
 
     def upload(self, plan: Plan, bundle: Bundle) -> None:

@@ -18,6 +18,7 @@ from pans.runtime.timing.ledger import LatencyHistogram
 from pans.runtime.wire.commands import Show, pack_command
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.schema import HEADER, STRUCTS
+from pans.runtime.wire.session import COMMAND_WINDOW
 
 CRC_BYTES = 4
 _EXPOSURE_BYTES = 8  # of SHOW: the exposure, u64, stands first
@@ -110,7 +111,7 @@ class HostDriver:
         if following == self._sent or following[0] >= core.end_exposure:
             return False
         if (
-            not connection.session.sends_at_once
+            connection.session.in_flight >= COMMAND_WINDOW
         ):  # what waits for acknowledgements comes late: the next walk is named in time
             return False
         exposure, state = self._sent = following

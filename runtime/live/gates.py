@@ -119,7 +119,7 @@ class SecondInstrument:
         self.connection.pump(0.0)
         status = session.status
         lapsed = status is not None and status.state in (DeviceState.SAFE, DeviceState.IDLE)
-        if lapsed and session.settled and now_ns - self._arm_sent_ns > NS_PER_S:
+        if lapsed and not session.in_flight and now_ns - self._arm_sent_ns > NS_PER_S:
             session.submit(Opcode.RESET)
             self._arm()
 
@@ -140,12 +140,12 @@ class SecondInstrument:
         """Let the pulses that are still to come happen and be answered, within a second, then stop the instrument."""
         session = self.connection.session
         until_ns = self.now_ns() + SETTLE_NS
-        while self.now_ns() < min(until_ns, self._last_pulse_ns) or not session.settled:
+        while self.now_ns() < min(until_ns, self._last_pulse_ns) or session.in_flight:
             self.connection.pump(0.005)
             if self.now_ns() >= until_ns:
                 break
         session.submit(Opcode.STOP)
-        while not session.settled and self.now_ns() < until_ns + SETTLE_NS:
+        while session.in_flight and self.now_ns() < until_ns + SETTLE_NS:
             self.connection.pump(0.005)
 
     def close(self) -> None:

@@ -200,7 +200,7 @@ class LiveRun:
         try:
             session.submit(Opcode.STOP)
             self.stops = True
-            while self.now_ns() < give_up_ns and not (session.settled and self._is_dark()):
+            while self.now_ns() < give_up_ns and (session.in_flight or not self._is_dark()):
                 self.receiver.last(POLL_S)
         except LinkError as error:
             self.lose_link(error)

@@ -9,49 +9,10 @@ specification; start with framing.py, then messages.py, commands.py and session.
 [('MARK', 1)]
 """
 
-from .framing import Frame, FrameDecoder, Messages, encode_frame
-from .messages import (
-    ClickBlock,
-    FrameBlock,
-    Mark,
-    Status,
-    Welcome,
-    decode_clicks,
-    decode_frames,
-    decode_mark,
-    decode_status,
-    encode_clicks,
-    encode_frames,
-    encode_mark,
-    encode_status,
-)
-from .schema import DeviceState, MalformedMessage, MessageType, Opcode
+from .framing import FrameDecoder
+from .messages import Mark, encode_mark
+from .schema import MalformedMessage, MessageType
 from .session import HostSession
-from .tracker import Gap, StreamTracker
+from .tracker import StreamTracker
 
-__all__ = [
-    "ClickBlock",
-    "DeviceState",
-    "Frame",
-    "FrameBlock",
-    "FrameDecoder",
-    "Gap",
-    "HostSession",
-    "MalformedMessage",
-    "Mark",
-    "MessageType",
-    "Messages",
-    "Opcode",
-    "Status",
-    "StreamTracker",
-    "Welcome",
-    "decode_clicks",
-    "decode_frames",
-    "decode_mark",
-    "decode_status",
-    "encode_clicks",
-    "encode_frame",
-    "encode_frames",
-    "encode_mark",
-    "encode_status",
-]
+__all__ = ["FrameDecoder", "HostSession", "MalformedMessage", "Mark", "MessageType", "StreamTracker", "encode_mark"]

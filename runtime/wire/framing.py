@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -22,7 +22,6 @@ SMALLEST_FRAME_BYTES = 14  # on the wire: header, CRC, a code byte and the delim
 U8 = npt.NDArray[np.uint8]
 I64 = npt.NDArray[np.int64]
 Scalar = TypeVar("Scalar", bound=np.generic)
-_LONG = 512  # from about here on arrays are quicker: ten microseconds in any case
 _CODES = tuple(bytes((length + 1,)) for length in range(254))
 _CRC_SEEDS = tuple(0 if message_type in UNSEEDED else SCHEMA for message_type in range(256))
 
@@ -97,13 +96,6 @@ def read_only(array: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
 
 def cobs_encode(data: bytes) -> bytes:
     """Return `data` without any zero byte (Cheshire and Baker 1999), at most 1 + len/254 bytes longer; no delimiter added."""
-    if len(data) >= _LONG:
-        coded = np.frombuffer(b"\0" + data, np.uint8).copy()
-        zeros = np.flatnonzero(coded == 0)
-        steps = np.diff(zeros, append=len(coded))
-        if steps.max() <= 254:
-            coded[zeros] = steps
-            return coded.tobytes()
     runs = data.split(b"\0")
     if len(data) < 254 or len(max(runs, key=len)) < 254:
         # The plain form: every zero becomes the code of the run behind it, which is what makes short frames quick.
@@ -137,41 +129,28 @@ class FrameDecoder:
     def __init__(self) -> None:
         from . import wire_kernels as kernels  # numba is loaded only by who decodes
 
-        self._kernels = kernels
-        self._raw = bytearray(MAX_FRAME_BYTES + CHUNK_BYTES)
-        self.buffer: U8 = np.frombuffer(self._raw, np.uint8)
-        self.buffer[:] = 0  # touched: else each page is a fault when it is first used
-        self._view = memoryview(self._raw)
+        self._take_in = kernels.take_in
+        # filled, not zeroed: a page that was touched is no fault when it is first used
+        self.buffer: U8 = np.full(MAX_FRAME_BYTES + CHUNK_BYTES, 0, np.uint8)
+        self._view = self.buffer.data
         self._bodies: I64 = np.full((len(self.buffer) // SMALLEST_FRAME_BYTES + 1, 2), 0, np.int64)
         self._tally: I64 = np.zeros(kernels.N_TALLIES, np.int64)
 
     @property
     def counters(self) -> DecoderCounters:
         """What has been seen since the decoder was made."""
-        kernels, tally = self._kernels, self._tally.tolist()
-        return DecoderCounters(
-            frames=tally[kernels.GOOD_FRAMES],
-            bytes_in=tally[kernels.BYTES_IN],
-            crc_errors=tally[kernels.CRC_ERRORS],
-            cobs_errors=tally[kernels.COBS_ERRORS],
-            short_frames=tally[kernels.SHORT_FRAMES],
-            oversized_frames=tally[kernels.OVERSIZED],
-            bytes_discarded=tally[kernels.DISCARDED],
-        )
+        return DecoderCounters(*self._tally[: len(fields(DecoderCounters))].tolist())
 
     @property
     def arrays(self) -> tuple[U8, I64, I64]:
-        """The buffer, the spans of its bodies and the tally: what compiled code continues (turn/kernels.py)."""
+        """The buffer, the spans of its bodies and the tally: what compiled code continues (kernel/receive.py)."""
         return self.buffer, self._bodies, self._tally
-
-    @property
-    def held_bytes(self) -> int:
-        """Bytes of a frame whose delimiter has not come yet."""
-        return int(self._tally[self._kernels.HELD])
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
         """Return the frames that `data` completes, in order; damaged ones are counted and dropped."""
-        return [self.frame(first, stop) for spans in self.bodies(data) for first, stop in spans.tolist()]
+        return [
+            unpack_body(bytes(self._view[first:stop])) for spans in self.bodies(data) for first, stop in spans.tolist()
+        ]
 
     def bodies(self, data: bytes | bytearray | memoryview | U8) -> Iterator[I64]:
         """Yield, chunk by chunk, the spans (n, 2) of header + payload in `buffer`, valid until the next chunk.
@@ -179,23 +158,10 @@ class FrameDecoder:
         The iterator must be used up: it takes `data` in as it goes.
         """
         for piece in self.pieces(bytes(data)):
-            yield self.take(piece)
+            count = self._take_in(piece, self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, self._tally)
+            yield self._bodies[:count]
 
     @staticmethod
     def pieces(data: bytes) -> list[bytes]:
-        """Return `data` in pieces that `take` takes."""
+        """Return `data` in pieces of CHUNK_BYTES."""
         return [data[first : first + CHUNK_BYTES] for first in range(0, max(1, len(data)), CHUNK_BYTES)]
-
-    def take(self, data: bytes) -> I64:
-        """Return the spans (n, 2) in `buffer` of what at most CHUNK_BYTES of `data` complete, valid until the next bytes."""
-        count = self._kernels.take_in(data, self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, self._tally)
-        return self._bodies[:count]
-
-    def frame(self, first: int, stop: int) -> Frame:
-        """Return what lies between `first` and `stop` in `buffer` as a frame of its own."""
-        kind, flags, session = HEADER.unpack_from(self._raw, first)
-        return Frame(kind, flags, session, bytes(self._view[first + HEADER.size : stop]))
-
-    def warm_up(self) -> None:
-        """Compile or load the kernels, without counting anything."""
-        self._kernels.take_in(b"", self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, np.zeros_like(self._tally))

@@ -408,20 +408,8 @@ STRUCTS = {name: _struct(fields) for name, fields in _WHOLE.items()}
 HEADER = STRUCTS["HEADER"]
 UNSEEDED = (MessageType.HELLO, MessageType.WELCOME)  # readable across versions, so that a mismatch can be named
 SLOT_DTYPE = np.dtype([("offset_ticks", "<u8"), ("pattern", "<u2"), ("shot", "<u2")])
-# What CLICKS, FRAMES and COUNTS begin with, and MARK, behind the header of their frame; `width` is word_bytes, largest or nothing.
-BLOCK_DTYPE = np.dtype(
-    [
-        *(("type", "u1"), ("flags", "u1"), ("reserved", "<u2"), ("session", "<u4")),
-        *(("seq", "<u4"), ("drops", "<u4"), ("tick", "<u8"), ("exposure_index", "<u8")),
-        *(("period_ticks", "<u4"), ("count", "<u2"), ("width", "<u2"), ("object_index", "<u4")),
-    ]
-)
-MARK_DTYPE = np.dtype(
-    [
-        *BLOCK_DTYPE.descr[:4],
-        *(("seq", "<u4"), ("object_index", "<u4"), ("truth", "<i2"), ("half_exposures", "<u2")),
-        *(("exposure_index", "<u8"), ("tick", "<u8"), ("photons", "<f4")),
-    ]
+BLOCK_DTYPE, MARK_DTYPE = (  # bodies: header, then FRAMES up to its words (CLICKS and COUNTS alike), or MARK
+    np.dtype([(one.name, f"<{one.code}") for one in (*_WHOLE["HEADER"], *_WHOLE[name])]) for name in ("FRAMES", "MARK")
 )
 BLOCK_HEADER_BYTES = STRUCTS["CLICKS"].size
 MAX_FRAME_BYTES = HEADER.size + MAX_PAYLOAD_BYTES + 4 + (MAX_PAYLOAD_BYTES + 12) // 254 + 2

@@ -23,7 +23,6 @@ HELLO_GIVE_UP_NS = 5_000 * NS_PER_MS
 COMMAND_WINDOW = 8
 STREAM_TYPES = frozenset(map(int, wire.STREAM_DECODERS))
 ANSWER_TYPES = frozenset((int(MessageType.WELCOME), int(MessageType.ACK), int(MessageType.PONG)))
-GRANT, _GRANT = int(MessageType.GRANT), wire.STRUCTS["GRANT"]
 RETRY_FIRST_NS = 250 * NS_PER_MS
 RETRY_LONGEST_NS = 2_000 * NS_PER_MS
 RETRY_GIVE_UP_NS = 10_000 * NS_PER_MS
@@ -119,7 +118,7 @@ class HostSession:
 
     def grant(self, stream_limit: int, lease_ms: int) -> None:
         """Move the receive window and renew the lease."""
-        self._output.append(wire.encode_frame(GRANT, _GRANT.pack(stream_limit & 0xFFFFFFFF, lease_ms), self.nonce))
+        self._output.append(wire.encode_grant(wire.Grant(stream_limit & 0xFFFFFFFF, lease_ms), self.nonce))
 
     def stop_frames(self, next_id: int = 0) -> bytes:
         """Return bytes that stop the device, whatever it has of the commands so far: those that it may lack, in order, then STOP.
@@ -136,24 +135,14 @@ class HostSession:
         return len(self._waiting) < MAX_WAITING
 
     @property
-    def sends_at_once(self) -> bool:
-        """Whether a command that is submitted now leaves at the next `poll`, and waits for no acknowledgement."""
-        return len(self._unacknowledged) + len(self._waiting) < COMMAND_WINDOW
-
-    @property
     def in_flight(self) -> int:
-        """Commands that the device has not dealt with, waiting ones too."""
+        """Commands that the device has not dealt with, waiting ones too; of fewer than COMMAND_WINDOW the next leaves at once."""
         return len(self._waiting) + len(self._unacknowledged)
 
     @property
     def answered(self) -> int:
         """Every command up to this id has been dealt with: done, or in `refusals`."""
         return self.next_id - 1 - self.in_flight
-
-    @property
-    def settled(self) -> bool:
-        """True when every submitted command has been acknowledged."""
-        return not self._waiting and not self._unacknowledged
 
     def take_output(self) -> bytes:
         """Return the bytes to send now, and forget them."""

@@ -31,9 +31,9 @@ LARGEST = np.uint64(1 << 62)  # ticks and exposure numbers beyond are left to Py
 _INFINITE = np.uint64(0x7F800000)  # float32's bits: numbers from 0 on lie below, NaN above once the sign is taken away
 _MAGNITUDE = np.uint64(0x7FFFFFFF)
 _SCHEMA, _WINDOW = np.int64(SCHEMA), RECEIVE_WINDOW
-# columns of a decoder's tally
-GOOD_FRAMES, CRC_ERRORS, COBS_ERRORS, SHORT_FRAMES, OVERSIZED, DISCARDED = range(6)
-SKIPPING, CONSUMED, HELD, BYTES_IN, N_TALLIES = range(6, 11)
+# columns of a decoder's tally: those of DecoderCounters, then what is under way
+GOOD_FRAMES, BYTES_IN, CRC_ERRORS, COBS_ERRORS, SHORT_FRAMES, OVERSIZED, DISCARDED = range(7)
+SKIPPING, CONSUMED, HELD, N_TALLIES = range(7, 11)
 SMALLEST_BODY = 12  # header and CRC
 _U = np.uint64
 _ONE, _EIGHT, _SIXTEEN, _BYTE = _U(1), _U(8), _U(16), _U(0xFF)
@@ -151,7 +151,8 @@ def _unstuff_moving(data, pos, stop, code):  # type: ignore[no-untyped-def]
         if out == pos + _ONE:
             out = end
         else:
-            out = _move_down(data, pos + _ONE, end, out)
+            copy_span(data, pos + _ONE, end, data, out)
+            out += end - pos - _ONE
         pos = end
         if pos >= stop:
             return out
@@ -165,22 +166,6 @@ def _unstuff_moving(data, pos, stop, code):  # type: ignore[no-untyped-def]
                 data[out + _U(k)] = 0
             pos += _EIGHT
             out += _EIGHT
-
-
-@inner
-def _move_down(data, source, end, out):  # type: ignore[no-untyped-def]
-    """Copy data[source:end] to data[out:], out < source; return where it ends."""
-    while source + _EIGHT <= end:
-        word = load8(data, source)
-        for k in range(8):
-            data[out + _U(k)] = (word >> _U(8 * k)) & _BYTE
-        source += _EIGHT
-        out += _EIGHT
-    while source < end:
-        data[out] = data[source]
-        source += _ONE
-        out += _ONE
-    return out
 
 
 @outer

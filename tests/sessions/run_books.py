@@ -16,9 +16,20 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
 from pans.firmware_sim.ports.virtual import VirtualLink
 from pans.runtime.link.base import Link
-from pans.runtime.wire import DeviceState, FrameDecoder, MessageType, Opcode, Status, decode_status
 from pans.runtime.wire.commands import Gate, unpack_command
-from pans.runtime.wire.messages import ClickBlock, Mark, decode_ack, decode_command, pack_body
+from pans.runtime.wire.messages import (
+    ClickBlock,
+    DeviceState,
+    FrameDecoder,
+    Mark,
+    MessageType,
+    Opcode,
+    Status,
+    decode_ack,
+    decode_command,
+    decode_status,
+    pack_body,
+)
 from pans.runtime.wire.session import ANSWER_TYPES, STREAM_TYPES
 
 RECORDED = STREAM_TYPES | {MessageType.STATUS}

@@ -97,12 +97,12 @@ def test_commands_go_out_in_order_and_at_most_eight_wait() -> None:
     deliver(session, wire.encode_ack(Ack(3, 0, 0, ""), NONCE))
     session.poll(1 * MS)
     assert ids(sent(session)) == [9, 10, 11]
-    assert not session.settled
+    assert session.in_flight
     deliver(session, wire.encode_ack(Ack(11, 0, 0, ""), NONCE))
     session.poll(2 * MS)
     assert ids(sent(session)) == [12]
     deliver(session, wire.encode_ack(Ack(12, 0, 0, ""), NONCE))
-    assert session.settled
+    assert session.in_flight == 0
 
 
 def test_unacknowledged_commands_repeat_at_a_slowing_pace_and_then_give_up() -> None:
@@ -230,7 +230,7 @@ def test_a_command_that_may_be_refused_is_reported_and_the_session_goes_on() -> 
     deliver(session, wire.encode_ack(Ack(2, 2, wire.AckStatus.TOO_LATE, "gone", 0b11), NONCE))
     assert [refusal.command_id for refusal in session.refusals] == [first, second]
     assert [refusal.status for refusal in session.refusals] == [session_module.UNKNOWN_STATUS, wire.AckStatus.TOO_LATE]
-    assert session.settled
+    assert session.in_flight == 0
 
 
 def test_a_device_that_restarts_within_the_session_is_told() -> None:
