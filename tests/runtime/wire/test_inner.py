@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 from numba import njit
+from tree import ROOT
 
 from pans.runtime.wire import inner as wire_inner
 from pans.runtime.wire.bare import as_float32, copy_span, load4, load8
@@ -82,27 +85,32 @@ def test_a_cached_kernel_is_for_the_files_that_kernels_are_made_from(
     assert found == [0, 1, 0, 0]
 
 
-def test_the_digest_knows_every_file_of_the_packages(tmp_path: Path) -> None:
+def test_the_digest_is_of_every_file_of_the_packages(tmp_path: Path) -> None:
     for package in SOURCES:
         (tmp_path / package).mkdir()
         (tmp_path / package / "kernels.py").write_text("x = 1")
-    digests = [_digest(tmp_path)]
-    (tmp_path / SOURCES[-1] / "kernels.py").write_text("x = 12")
-    digests.append(_digest(tmp_path))
-    os.utime(tmp_path / SOURCES[0] / "kernels.py", ns=(1, 1))
-    digests.append(_digest(tmp_path))
-    (tmp_path / SOURCES[0] / "more.py").touch()
-    digests.append(_digest(tmp_path))
-    (tmp_path / SOURCES[0] / "notes.txt").touch()
-    assert _digest(tmp_path) == digests[-1]
-    assert len(set(digests)) == 4
-    (tmp_path / SOURCES[0] / "kernels.py").unlink()
-    (tmp_path / SOURCES[0] / "more.py").unlink()
-    (tmp_path / SOURCES[0] / "notes.txt").unlink()
-    (tmp_path / SOURCES[0]).rmdir()
-    assert _digest(tmp_path) == ""
+    first, last = (tmp_path / package for package in (SOURCES[0], SOURCES[-1]))
+    changes: list[Callable[[], object]] = [
+        lambda: (last / "kernels.py").write_text("x = 12"),
+        lambda: os.utime(first / "kernels.py", ns=(1, 1)),
+        lambda: (first / "more.py").touch(),
+        lambda: (first / "notes.txt").touch(),
+    ]
+    digests = [digest_of.__wrapped__(tmp_path)]
+    for change in changes:
+        change()
+        digests.append(digest_of.__wrapped__(tmp_path))
+    assert (len(set(digests)), digests[-1]) == (4, digests[-2])
 
 
-def _digest(folder: Path) -> str:
-    digest_of.cache_clear()
-    return digest_of(folder)
+def test_with_another_numba_kernels_are_ordinary_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire_inner, "TRIED", ())
+    kernels = [decorate(lambda x: 3 * x) for decorate in (wire_inner.inner, wire_inner.outer)]
+    assert [kernel(2) for kernel in kernels] == [6, 6]
+
+
+def test_the_numba_that_is_installed_with_the_package_was_tried() -> None:
+    (pinned,) = re.findall(r"^numba==(\d+)\.(\d+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    assert tuple(map(int, pinned)) in TRIED
+    (least,) = re.findall(r'"numba>=(\d+)\.(\d+)"', (ROOT / "pyproject.toml").read_text())
+    assert tuple(map(int, least)) <= min(TRIED)
