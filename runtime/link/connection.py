@@ -127,18 +127,13 @@ class Connection:
         """
         if self.on_answer is not None and frame.type in ANSWER_TYPES:
             self.on_answer(arrival_ns, pack_body(frame))
-        is_cores = self.digest(frame, arrival_ns)
+        try:
+            is_cores = self.session.on_frame(frame, arrival_ns)
+        except PansError as error:
+            self._failure, is_cores = self._failure or error, False
         self.delivered += is_cores
         self.answers += not is_cores
         return is_cores
-
-    def digest(self, frame: Frame, arrival_ns: int) -> bool:
-        """Give a frame to the session and return whether it is the core's too; what ends the session waits for `raise_failure`."""
-        try:
-            return self.session.on_frame(frame, arrival_ns)
-        except PansError as error:
-            self._failure = self._failure or error
-            return False
 
     def flush(self) -> bool:
         """Send what the session has to say; return whether that was anything."""

@@ -10,6 +10,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_commands
@@ -28,6 +29,7 @@ from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA, COUNT_SCHEMA
 
 NAMES_SHOWN = 5
+OTHER_RELEASE = "its firmware is older or newer than this runtime"
 TEXT_MAX_BYTES = 240  # a receiver of WELCOME takes at most 256 bytes of text
 
 
@@ -43,7 +45,7 @@ def upload_commands(plan: Plan, bundle: Bundle, facts: Mapping[str, Any]) -> Ite
     yield from plan_commands(plan)
 
 
-def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
+def check_device(facts: Mapping[str, Any], plan: Plan, bundle: Bundle, tick_hz: int) -> None:
     """Raise DeviceError when what the device says of itself cannot carry out the plan."""
     limits = {
         "pattern_memory": ("pattern memory (patterns)", bundle.n_shown),
@@ -61,13 +63,11 @@ def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
     if facts["mode"] != plan.mode:
         raise DeviceError(f"the device measures in {facts['mode']} mode, the profile says {plan.mode}")
     if int(facts["tick_hz"]) != tick_hz:
-        raise DeviceError(
-            f"the device counts {facts['tick_hz']} ticks per second, the profile says {tick_hz}",
-            remedy="give the profile of this device with --profile",
-        )
+        words = f"the device counts {facts['tick_hz']} ticks per second, the profile says {tick_hz}"
+        raise DeviceError(words, remedy="give the profile of this device with --profile")
 
 
-def _check_optics(facts: Any, bundle: Bundle) -> None:
+def _check_optics(facts: Mapping[str, Any], bundle: Bundle) -> None:
     """A device may say which passive optics it looks through (their fingerprint); it must then be the bundle's."""
     held = facts.get("optics_sha256")
     wanted = None if bundle.analyser is None else bundle.analyser.fingerprint
@@ -83,79 +83,63 @@ def _check_optics(facts: Any, bundle: Bundle) -> None:
 
 def check_automaton(facts: Mapping[str, Any], plan: Plan) -> None:
     """Raise DeviceError when the device cannot run the plan's automaton in the way that the plan says."""
-    automaton = plan.automaton
-    if automaton is None:
-        return
-    extension = announced(facts)
+    if plan.automaton is not None:
+        for words, remedy in _automaton_faults(facts, plan, plan.automaton):
+            raise DeviceError(words, remedy=remedy)
+
+
+def _automaton_faults(facts: Mapping[str, Any], plan: Plan, automaton: Automaton) -> Iterator[tuple[str, str]]:
+    """What the device cannot do of the automaton, and what to do about it."""
+    extension, largest, at_once = announced(facts), announced_counts(facts), announced_channels(facts)
     if extension is None:
-        found = facts.get("automaton_schema")
-        says = "no automata" if found is None else f"automata of schema {found:#010x}"
-        raise DeviceError(
-            f"the device announces {says}, needed {AUTOMATON_SCHEMA:#010x}: its firmware is older or newer than this runtime",
-            remedy="install firmware that knows them (docs/reference/protocol.md, section 11), or run a bundle with fixed patterns",
-        )
-    if plan.drive == "device" and automaton.n_states > extension.states:
-        raise DeviceError(
-            f"the device follows automata of up to {extension.states} states, needed {automaton.n_states}",
-            remedy="--drive host: the host names each state",
-        )
-    if extension.dwell_steps % automaton.dwell_steps:
-        raise DeviceError(
-            f"the device divides an exposure into {extension.dwell_steps} dwell steps, needed a multiple of {automaton.dwell_steps}",
-            remedy="retrain for the device's profile",
-        )
-    _check_counts(facts, plan)
-
-
-def _check_counts(facts: Mapping[str, Any], plan: Plan) -> None:
-    """Raise DeviceError when the device cannot tell the photon numbers, or read the detectors, that the plan's automaton asks for."""
-    told, at_once = announced_counts(facts), announced_channels(facts)
-    if plan.channels_at_once > at_once:
-        older = "it has fewer, or its firmware is older or newer than this runtime"
-        raise DeviceError(
-            f"the device reads {at_once} detector(s) at once, needed {plan.channels_at_once}: {older}",
-            remedy="use a device that announces them (docs/reference/protocol.md, section 14), or train with fewer --channels",
-        )
-    if plan.channels_at_once > 1 or plan.largest <= told:
+        words = f"the device announces {_announced_as(facts, 'automaton_schema', 'automata')}, needed {AUTOMATON_SCHEMA:#010x}"
+        remedy = "install firmware that knows them (docs/reference/protocol.md, section 11), or run a bundle with fixed patterns"
+        yield f"{words}: {OTHER_RELEASE}", remedy
         return
-    found = facts.get("count_schema")
-    if told == 1:
-        says = "no photon numbers" if found is None else f"photon numbers of schema {found:#010x}"
-        what = (
-            f"{says}, needed {COUNT_SCHEMA:#010x}: it tells clicks, or its firmware is older or newer than this runtime"
+    if plan.drive == "device" and automaton.n_states > extension.states:
+        words = f"the device follows automata of up to {extension.states} states, needed {automaton.n_states}"
+        yield words, "--drive host: the host names each state"
+    if extension.dwell_steps % automaton.dwell_steps:
+        steps = f"{extension.dwell_steps} dwell steps, needed a multiple of {automaton.dwell_steps}"
+        yield f"the device divides an exposure into {steps}", "retrain for the device's profile"
+    if plan.channels_at_once > at_once:
+        words = f"the device reads {at_once} detector(s) at once, needed {plan.channels_at_once}"
+        remedy = (
+            "use a device that announces them (docs/reference/protocol.md, section 14), or train with fewer --channels"
         )
-    else:
-        what = f"photon numbers up to {told}, needed {plan.largest}"
-    raise DeviceError(
-        f"the device announces {what}",
-        remedy="use a device that counts (docs/reference/protocol.md, section 13), or train with --outcomes 2",
-    )
+        yield f"{words}: it has fewer, or {OTHER_RELEASE}", remedy
+    if plan.channels_at_once == 1 and plan.largest > largest:
+        what = f"photon numbers up to {largest}, needed {plan.largest}"
+        if largest == 1:
+            says = _announced_as(facts, "count_schema", "photon numbers")
+            what = f"{says}, needed {COUNT_SCHEMA:#010x}: it reads clicks, or {OTHER_RELEASE}"
+        remedy = "use a device that counts (docs/reference/protocol.md, section 13), or train with --outcomes 2"
+        yield f"the device announces {what}", remedy
+
+
+def _announced_as(facts: Mapping[str, Any], key: str, what: str) -> str:
+    return f"{what} of schema {facts[key]:#010x}" if key in facts else f"no {what}"
 
 
 def scene_facts(shape: tuple[int, int] | None, classes: Sequence[str]) -> dict[str, Any]:
     """Return the facts of a scene of images of `shape` (height, width; None: of any) with class names (none: unlabelled)."""
-    facts: dict[str, Any] = {}
-    if shape is not None:
-        facts |= {"scene_height_px": shape[0], "scene_width_px": shape[1]}
+    facts: dict[str, Any] = {} if shape is None else {"scene_height_px": shape[0], "scene_width_px": shape[1]}
     if classes:
-        facts |= {
-            "scene_n_classes": len(classes),
-            "scene_classes": _names(classes),
-            "scene_classes_sha256": _digest(classes),
-        }
+        names = {"scene_classes": _names(classes), "scene_classes_sha256": _digest(classes)}
+        facts |= {"scene_n_classes": len(classes), **names}
     return facts
 
 
 def check_scene(facts: Mapping[str, Any], bundle: Bundle) -> None:
     """Raise UsageError, with the sizes and class names of both, when the scene is not one that `bundle` was made for."""
     height, width = facts.get("scene_height_px"), facts.get("scene_width_px")
-    ours = bundle.image_shape
-    fits = height is None or width is None or (int(height), int(width)) == tuple(ours)
-    if height is not None and width is not None and ours[0] == 1:  # made of patterns without a shape
-        fits = ours[1] == int(height) * int(width)
+    ours, size = bundle.image_shape, "any size"
+    fits = height is None or width is None
+    if height is not None and width is not None:  # patterns without a shape are one row of pixels
+        size = f"{height} x {width} pixels"
+        fits = ours in ((int(height), int(width)), (1, int(height) * int(width)))
     if fits and _same_classes(facts, bundle.classes):
         return
-    size = f"{height} x {width} pixels" if height is not None else "any size"
     raise UsageError(
         f"the scene {one_line(facts.get('scene', ''), 60)!r} and the bundle {one_line(bundle.name, 60)!r} do not belong together: "
         f"the scene has {size} and the classes {one_line(facts.get('scene_classes', 'unknown'), TEXT_MAX_BYTES)}; "
@@ -177,9 +161,8 @@ def scene_words(facts: Mapping[str, Any], device: str) -> str:
     """Return which scene a simulated instrument shows, "" where it does not say; `device` is the URL, which may have named it."""
     if not facts.get("scene"):
         return ""
-    chosen = (
-        "" if "scene=" in device or not device.startswith("sim:") else " (the default: no scene= in the device URL)"
-    )
+    by_default = "scene=" not in device and device.startswith("sim:")
+    chosen = " (the default: no scene= in the device URL)" if by_default else ""
     objects = f", {facts['objects']} objects" if facts.get("objects") else ""
     return f"simulated scene {one_line(facts['scene'], 60)}{chosen}{objects}"
 

@@ -1,7 +1,7 @@
 """pyserial behind the Link protocol: device files, COM ports, pseudo-terminals, `socket://`, and URL handlers of other packages.
 
-Devices are named by VID:PID:SERIAL, since ttyUSB0 may be another
-one tomorrow. Opening raises LinkError that tells apart: not there, no permission, busy.
+Devices are named by VID:PID:SERIAL, since ttyUSB0 may be another one tomorrow. Opening raises LinkError that tells apart: not there,
+no permission, busy.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.errors import LinkError
+from pans.runtime.errors import LinkError, UsageError
 
 READ_BYTES = 1 << 16
 READ_POLL_S = 0.05
@@ -40,7 +40,7 @@ class SerialLink:
         try:
             self._port = serial.serial_for_url(port_of(target), timeout=0, write_timeout=WRITE_TIMEOUT_S, **options)
         except (serial.SerialException, OSError, ValueError) as error:
-            raise _not_opened(self.name, target, error) from error
+            raise not_opened(self.name, error) from error
         # pyserial's own in_waiting says 1 for socket:// whatever has arrived. Windows COM handles have no descriptor.
         self._selectable = hasattr(self._port, "fileno") and (sys.platform != "win32" or "://" in target)
         if not self._selectable:
@@ -94,40 +94,56 @@ class SerialLink:
                 setter(True)
 
 
-def _not_opened(name: str, target: str, error: BaseException) -> LinkError:
-    number = getattr(error, "errno", None)
-    text = str(error)
-    if number in (errno.EACCES, errno.EPERM) or "Permission denied" in text:
-        return LinkError(
-            f"cannot open {name}: no permission",
-            remedy="`pans doctor --udev` prints a rule to install, or: sudo usermod -aG dialout $USER, then log in again",
-        )
-    if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
-        return LinkError(
-            f"cannot open {name}: it is busy", remedy="close the other program; `pans devices` looks who it is"
-        )
-    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return LinkError(
-            f"cannot open {name}: it is not there", remedy="check cable and name; `pans devices` lists the ports"
-        )
+_REASONS = (  # numbers of the system, what they say, and the remedy
+    (
+        (errno.EACCES, errno.EPERM),
+        "no permission",
+        "`pans doctor --udev` prints a rule to install; for a serial port also: sudo usermod -aG dialout $USER, then log in again",
+    ),
+    ((errno.EBUSY, errno.EAGAIN), "it is busy", "close the other program; `pans devices` looks who it is"),
+    (
+        (errno.ENOENT, errno.ENODEV, errno.ENXIO),
+        "it is not there",
+        "check cable and name; `pans devices` lists what is connected",
+    ),
+)
+
+
+def not_opened(name: str, error: BaseException) -> LinkError:
+    """Return why the device `name` could not be opened, from the system's error."""
+    text = str(error)  # pyserial has put some into words
+    in_words = errno.EACCES if "Permission denied" in text else errno.EBUSY if "exclusively lock" in text else None
+    number = in_words or getattr(error, "errno", None)
+    for numbers, words, remedy in _REASONS:
+        if number in numbers:
+            return LinkError(f"cannot open {name}: {words}", remedy=remedy)
     return LinkError(
         f"cannot open {name}: {text}", remedy="check the name, the cable and that no other program holds it"
     )
 
 
-def port_of(target: str) -> str:
-    """Kernel VID:PID[:SERIAL] into the port that carries it; leave every other target as it is."""
-    fields = target.split(":")
-    if "://" in target or "/" in target or not 2 <= len(fields) <= 3:
-        return target
+def usb_target(target: str) -> tuple[int, int, str]:
+    """Read VID:PID[:SERIAL] (hex); UsageError for anything else."""
+    fields = target.split(":", 2)
     try:
-        vid, pid = (int(field, 16) for field in fields[:2])
-    except ValueError:
+        vid, pid = int(fields[0], 16), int(fields[1], 16)
+    except (ValueError, IndexError):
+        raise UsageError(
+            f"usb:{target} is no USB device", remedy="write usb:VID:PID or usb:VID:PID:SERIAL in hex"
+        ) from None
+    return vid, pid, fields[2] if len(fields) == 3 else ""
+
+
+def port_of(target: str) -> str:
+    """Return the port that carries VID:PID[:SERIAL]; every other target as it is."""
+    try:
+        vid, pid, serial_number = usb_target(target)
+    except UsageError:
         return target
     from serial.tools import list_ports
 
     ports = [port for port in list_ports.comports() if (port.vid, port.pid) == (vid, pid)]
-    ports = [port for port in ports if len(fields) == 2 or port.serial_number == fields[2]]
+    ports = [port for port in ports if serial_number in ("", port.serial_number)]
     if len(ports) != 1:
         found = ", ".join(f"{port.device} (serial number {port.serial_number})" for port in ports) or "none"
         raise LinkError(

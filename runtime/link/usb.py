@@ -1,17 +1,17 @@
 """pyusb behind the Link protocol: one bulk endpoint in each direction of the first interface that has both.
 
-Opening raises LinkError that tells apart: no libusb, not
-there, several, no permission, busy.
+Opening raises LinkError that tells apart: no libusb, not there, several, no permission, busy.
 """
 
 from __future__ import annotations
 
-import errno
 import time
 from contextlib import suppress
 from typing import Any
 
-from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.errors import LinkError
+
+from .serial import not_opened, usb_target
 
 READ_BYTES = 1 << 16
 WRITE_TIMEOUT_MS = 2000
@@ -39,7 +39,7 @@ class UsbLink:
                 f"cannot open {self.name}: no libusb", remedy="pip install 'pans-runtime[usb]', or install libusb-1.0"
             ) from error
         except usb.core.USBError as error:
-            raise _not_opened(self.name, error) from error
+            raise not_opened(self.name, error) from error
 
     def read(self, timeout_s: float) -> bytes:
         """See `Link.read`."""
@@ -119,26 +119,3 @@ class UsbLink:
         with suppress(self._error):
             for _ in range(64):
                 self._in.read(READ_BYTES, timeout=1)
-
-
-def usb_target(target: str) -> tuple[int, int, str]:
-    """Read VID:PID[:SERIAL] (hex); UsageError for anything else."""
-    fields = target.split(":", 2)
-    try:
-        vid, pid = int(fields[0], 16), int(fields[1], 16)
-    except (ValueError, IndexError):
-        raise UsageError(
-            f"usb:{target} is no USB device", remedy="write usb:VID:PID or usb:VID:PID:SERIAL in hex"
-        ) from None
-    return vid, pid, fields[2] if len(fields) == 3 else ""
-
-
-def _not_opened(name: str, error: Any) -> LinkError:
-    number = getattr(error, "errno", None)
-    if number in (errno.EACCES, errno.EPERM):
-        return LinkError(f"cannot open {name}: no permission", remedy="`pans doctor --udev` prints a rule to install")
-    if number == errno.EBUSY:
-        return LinkError(f"cannot open {name}: it is busy", remedy="close the other program that has claimed it")
-    if number in (errno.ENODEV, errno.ENOENT):
-        return LinkError(f"{name} is not there", remedy="check the cable; `pans devices` lists what is connected")
-    return LinkError(f"cannot open {name}: {error}")

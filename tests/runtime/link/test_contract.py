@@ -34,8 +34,8 @@ from pans.runtime.link import reader as link_reader
 from pans.runtime.link.base import Link, open_link
 from pans.runtime.link.connection import Connection
 from pans.runtime.link.reader import LinkReader
-from pans.runtime.link.serial import SerialLink, latency_timer_ms, port_of
-from pans.runtime.link.usb import UsbLink, usb_target
+from pans.runtime.link.serial import SerialLink, latency_timer_ms, port_of, usb_target
+from pans.runtime.link.usb import UsbLink
 from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.wire import messages as wire
 
