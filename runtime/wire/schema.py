@@ -408,8 +408,10 @@ STRUCTS = {name: _struct(fields) for name, fields in _WHOLE.items()}
 HEADER = STRUCTS["HEADER"]
 UNSEEDED = (MessageType.HELLO, MessageType.WELCOME)  # readable across versions, so that a mismatch can be named
 SLOT_DTYPE = np.dtype([("offset_ticks", "<u8"), ("pattern", "<u2"), ("shot", "<u2")])
-BLOCK_DTYPE, MARK_DTYPE = (  # bodies: header, then FRAMES up to its words (CLICKS and COUNTS alike), or MARK
-    np.dtype([(one.name, f"<{one.code}") for one in (*_WHOLE["HEADER"], *_WHOLE[name])]) for name in ("FRAMES", "MARK")
+# What CLICKS, FRAMES and COUNTS begin with, and MARK, behind the header of their frame; `width` is word_bytes, largest or nothing.
+BLOCK_DTYPE, MARK_DTYPE = (
+    np.dtype([(one.name.replace("word_bytes", "width"), f"<{one.code}") for one in (*_WHOLE["HEADER"], *_WHOLE[name])])
+    for name in ("FRAMES", "MARK")
 )
 BLOCK_HEADER_BYTES = STRUCTS["CLICKS"].size
 MAX_FRAME_BYTES = HEADER.size + MAX_PAYLOAD_BYTES + 4 + (MAX_PAYLOAD_BYTES + 12) // 254 + 2

@@ -19,6 +19,6 @@ from pans.runtime.wire import FrameDecoder
 
 _, _bundle, _plan = small_setup("sequential")
 Core(_plan, make_decider(_bundle), 1, 1).warm_up()
-FrameDecoder().warm_up()
+FrameDecoder().feed(b"")
 with tempfile.TemporaryDirectory() as _folder, Recorder(Path(_folder) / "warm.pansrec", {}) as _recorder:
     _recorder.close({})

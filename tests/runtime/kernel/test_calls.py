@@ -50,6 +50,7 @@ from pans.runtime.wire.commands import Show, unpack_command
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, Ack, Opcode, decode_command, encode_ack, pack_body
 from pans.runtime.wire.session import HostSession
+from pans.runtime.wire.wire_kernels import HELD
 
 LONG_NS = 10_000_000_000
 OBJECTS = 12
@@ -233,7 +234,7 @@ def test_the_other_end_goes() -> None:
         theirs.send(clean[0] + clean[1][:10])
         theirs.close()
         assert ring.WHY[streamed.turn.run(ours.fileno())] == "gone"
-        assert (streamed.turn.counts.messages, streamed.decoder.held_bytes) == (1, 10)
+        assert (streamed.turn.counts.messages, streamed.decoder.arrays[2][HELD]) == (1, 10)
     leader, follower = os.openpty()
     tty.setraw(follower)
     os.close(leader)
