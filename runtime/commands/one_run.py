@@ -447,7 +447,7 @@ def _load_ahead() -> None:
     from pans.runtime.wire.framing import FrameDecoder
 
     load_kernels()
-    FrameDecoder().warm_up()
+    FrameDecoder().feed(b"")
     unpack_blocks(np.zeros(8, np.uint8), np.zeros((0, 4), np.int64), np.zeros(1, np.uint16), np.zeros(1, np.uint8))
     for name in ("live.loop", "monitor.snapshot", "watch.watchers"):
         import_module(f"pans.runtime.{name}")
