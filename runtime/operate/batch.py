@@ -20,8 +20,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -156,46 +156,27 @@ def _end_with_parent() -> Any:
     return lambda: prctl(_DIES_WITH_PARENT, signal.SIGKILL)
 
 
-def results_here(items: Sequence[Item], folder: str, workers: int = 1) -> Iterator[tuple[Item, dict[str, Any]]]:
-    """Yield each item with its result as it comes, `workers` processes at a time."""
-    pool = ThreadPoolExecutor(workers)
+@contextmanager
+def workers(number: int, dask: str) -> Iterator[Executor]:
+    """Yield what runs `number` items at a time here, or as many as the scheduler at the address `dask` can; LinkError without one."""
+    if not dask:
+        pool = ThreadPoolExecutor(number)
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
+        return
     try:
-        futures = {pool.submit(run_item, item.words, folder): item for item in items}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def results_of_dask(items: Sequence[Item], folder: str, address: str) -> Iterator[tuple[Item, dict[str, Any]]]:
-    """Yield each item with its result as it comes, from the workers of the scheduler at `address`.
-
-    An item that fails on several workers, each of which died, has an error and no exit code. LinkError without a scheduler.
-    """
-    distributed = need_distributed()
-    try:
-        client = distributed.Client(address, timeout=CONNECT_S)
+        client = need_distributed().Client(dask, timeout=CONNECT_S)
     except (OSError, ValueError) as error:
-        what = f"--dask {address}: no scheduler answers: {error}"
+        what = f"--dask {dask}: no scheduler answers: {error}"
         raise LinkError(what, remedy="start one with `dask scheduler`, or use --workers") from error
     with client:
-        futures = {
-            client.submit(run_item, item.words, folder, key=f"pans-{number}", pure=False, retries=RETRIES): item
-            for number, item in enumerate(items)
-        }
-        by_key = {future.key: item for future, item in futures.items()}
+        pool = client.get_executor(pure=False, retries=RETRIES)
         try:
-            for future in distributed.as_completed(list(futures)):
-                try:
-                    row = future.result()
-                except Exception as error:  # a worker that died again and again, or that has no pans
-                    row = {"exit": None, "seconds": None, "host": "", "answer": None}
-                    row["error"] = f"{type(error).__name__}: {error}"[:2000]
-                yield by_key[future.key], row
-                future.release()
-        except BaseException:
-            client.cancel(list(futures), force=True)
-            raise
+            yield pool
+        finally:
+            pool.shutdown(wait=False)
 
 
 def need_distributed() -> Any:
@@ -294,7 +275,8 @@ def _run(args: argparse.Namespace) -> int:
         say(f"{len(items) - len(todo)} of {len(items)} are done already")
     began_s = time.monotonic()
     try:
-        _work(args, journal, todo)
+        if todo:
+            _work(args, journal, todo)
     except KeyboardInterrupt:
         say(f"interrupted; finished results are in {journal.path}\n  continue: the same command with --resume")
         return EXIT_INTERRUPTED
@@ -342,14 +324,17 @@ def _check_words(command: str, item: Item) -> None:
 
 
 def _work(args: argparse.Namespace, journal: Journal, todo: list[Item]) -> None:
-    if not todo:
-        return
     folder, began_s = str(Path.cwd()), time.monotonic()
-    results = results_of_dask(todo, folder, args.dask) if args.dask else results_here(todo, folder, args.workers or 1)
     reported_s = began_s
-    with closing(results), progress_bar("batch", len(todo)) as report:  # type: ignore[type-var]
-        for number, (item, row) in enumerate(results, 1):
-            journal.add(item, row)
+    with workers(args.workers or 1, args.dask) as pool, progress_bar("batch", len(todo)) as report:
+        items = {pool.submit(run_item, item.words, folder): item for item in todo}
+        for number, future in enumerate(as_completed(items), 1):
+            try:
+                row = future.result()
+            except Exception as error:  # a worker of Dask that died again and again, or that has no pans
+                row = {"exit": None, "seconds": None, "host": "", "answer": None}
+                row["error"] = f"{type(error).__name__}: {error}"[:2000]
+            journal.add(items.pop(future), row)
             report(number)
             now_s = time.monotonic()
             if not sys.stderr.isatty() and now_s - reported_s > REPORT_EVERY_S and number < len(todo):

@@ -7,6 +7,8 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from commands import json_of
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
+from pans.runtime.errors import UsageError
 from pans.runtime.operate import batch
 from pans.runtime.operate.batch import FORMAT, items_of, run_item
 
@@ -37,11 +40,10 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
 
     def answer(words: tuple[str, ...], folder: str) -> dict[str, Any]:
         ran.append(tuple(words))
-        bad = "b/" in words[1]
-        row = {"exit": 1 if bad else 0, "seconds": 0.1, "host": "here", "error": None}
+        row = {"exit": int("b/" in words[1]), "seconds": 0.1, "host": "here", "error": None}
         return row | {"answer": {"accuracy": 0.5, "latency_us": {"p50": 2.0}, "rows": [1, 2], "exit": 9}}
 
-    monkeypatch.setattr("pans.runtime.operate.batch.run_item", answer)
+    monkeypatch.setattr(batch, "run_item", answer)
     return ran
 
 
@@ -49,14 +51,22 @@ def test_items_are_inputs_times_values(lab: Path) -> None:
     items = items_of("evaluate", ["*/grid.pans", "a/grid.pans"], ["seed=0-2", "--eta=0.5,1"], "", files=True)
     assert len(items) == len({item.key for item in items}) == 3 * 3 * 2
     assert items[1].words == ("evaluate", "a/grid.pans", "--seed", "0", "--eta", "1")
-    item, *_ = items_of("report", ["b/grid.pans"], ["seed=7"], "-o '{folder}/my {stem}-{seed}.html'", files=True)
+    extra = "-o '{folder}/my {stem}-{seed}.html'"
+    (item,) = items_of("report", ["b/grid.pans"], ["seed=7"], extra, files=True)
     assert item.words == ("report", "b/grid.pans", "-o", "b/my grid-7.html")
     assert items_of("reproduce", ["alpha", "eta"], [], "", files=False)[1].words == ("reproduce", "eta")
     Path("b/grid.pans").write_bytes(b"changed")
-    assert (
-        items_of("report", ["b/grid.pans"], ["seed=7"], "-o '{folder}/my {stem}-{seed}.html'", files=True)[0].key
-        != item.key
-    )
+    assert items_of("report", ["b/grid.pans"], ["seed=7"], extra, files=True)[0].key != item.key
+
+
+@pytest.mark.parametrize(
+    ("inputs", "vary", "extra"),
+    [("none*", "seed=1", ""), ("a/grid.pans", "seed", ""), ("a/grid.pans", "seed=", ""), ("a/grid.pans", "=1", ""),
+     ("a/grid.pans", "seed=0-999999", ""), ("a/grid.pans", "seed=1", "'open")],
+)  # fmt: skip
+def test_what_makes_no_items(inputs: str, vary: str, extra: str, lab: Path) -> None:
+    with pytest.raises(UsageError):
+        items_of("evaluate", [inputs], [vary], extra, files=True)
 
 
 def test_a_batch_goes_on_where_it_was(
@@ -84,14 +94,15 @@ def test_a_batch_goes_on_where_it_was(
 def test_an_interrupted_batch_keeps_what_is_done(
     lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    in_this_process(monkeypatch)
-    results = batch.results_here
+    ran = in_this_process(monkeypatch)
+    answer = batch.run_item
 
-    def interrupted(items: Any, folder: str, workers: int) -> Any:
-        yield next(results(items, folder))
-        raise KeyboardInterrupt
+    def interrupted(words: tuple[str, ...], folder: str) -> dict[str, Any]:
+        if ran:
+            raise KeyboardInterrupt
+        return answer(words, folder)
 
-    monkeypatch.setattr(batch, "results_here", interrupted)
+    monkeypatch.setattr(batch, "run_item", interrupted)
     assert main(["batch", "info", "*/grid.pans", "-o", "r.jsonl"]) == 130
     assert "--resume" in capsys.readouterr().err
     assert len(Path("r.jsonl").read_text().splitlines()) == 1
@@ -127,8 +138,7 @@ def test_an_item_is_a_process_with_an_answer_or_an_error(lab: Path) -> None:
     good, bad = run_item(("info", "a/grid.pans"), str(lab)), run_item(("info", "none"), str(lab))
     assert (good["exit"], good["error"]) == (0, None)
     assert good["answer"]["classes"]
-    assert (bad["exit"], bad["answer"]) == (2, None)
-    assert "none" in bad["error"]
+    assert (bad["exit"], bad["answer"], "none" in bad["error"]) == (2, None, True)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills a process")
@@ -137,24 +147,23 @@ def test_two_workers_share_a_batch_and_a_killed_one_costs_no_result(lab: Path) -
     for number in range(4):
         (lab / f"more{number}").mkdir()
         (lab / f"more{number}" / "grid.pans").write_bytes((lab / "a" / "grid.pans").read_bytes())
-    pans = [sys.executable, "-m", "pans"]
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    dask = [sys.executable, "-m", "distributed.cli"]
-    place = ["--scheduler-file", "place.json"]
-    alone = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
-    started = [
-        subprocess.Popen([*dask[:2], f"{dask[2]}.dask_scheduler", "--port", "0", "--no-dashboard", *place], **quiet)
-    ]
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*words: str, stdout: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", *words]
+        started.append(subprocess.Popen(command, stdout=stdout, stderr=subprocess.DEVNULL, text=True))
+        return started[-1]
+
+    place = ("--scheduler-file", "place.json", "--no-dashboard")
     try:
+        start("distributed.cli.dask_scheduler", "--port", "0", *place)
         address = _wait_for(lambda: json.loads(Path("place.json").read_text())["address"])
-        workers = [subprocess.Popen([*dask[:2], f"{dask[2]}.dask_worker", *place, *alone], **quiet) for _ in range(2)]
-        started += workers
-        words = ["batch", "info", "*/grid.pans", "--dask", address, "-o", "r.jsonl", "--json"]
-        process = subprocess.Popen([*pans, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        started.append(process)
+        worker, _ = (start("distributed.cli.dask_worker", *place, "--nthreads", "1", "--no-nanny") for _ in range(2))
+        words = ("pans", "batch", "info", "*/grid.pans", "--dask", address, "-o", "r.jsonl", "--json")
+        process = start(*words, stdout=subprocess.PIPE)
         _wait_for(lambda: process.poll() is not None or Path("r.jsonl").read_text().splitlines()[0])
         assert process.poll() is None
-        workers[0].kill()  # in the middle of its next item
+        worker.kill()  # in the middle of its next item
         found = json.loads(process.communicate(timeout=300)[0])
     finally:
         for one in started:
@@ -166,12 +175,10 @@ def test_two_workers_share_a_batch_and_a_killed_one_costs_no_result(lab: Path) -
     assert all(row["answer"]["classes"] for row in rows)
 
 
-def _wait_for(look: Any) -> Any:
+def _wait_for(look: Callable[[], Any]) -> Any:
     for _ in range(1500):
-        try:
+        with suppress(OSError, ValueError, IndexError, KeyError):
             if found := look():
                 return found
-        except (OSError, ValueError, IndexError, KeyError):
-            pass
         time.sleep(0.1)
     raise AssertionError("it never came")
