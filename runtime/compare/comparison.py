@@ -1,7 +1,7 @@
 """What two runs have in common, in what they differ, and which of the differences are larger than chance.
 
-Owns which test fits which figure. Results of the same objects are compared in pairs; otherwise as two samples in which each object counts
-once, however often it was shown. P-values of one comparison are corrected for their number (Holm), and 0.05 is the limit.
+Results of the same objects are compared in pairs; otherwise as two samples in which each object counts once, however often it was shown.
+P-values of one comparison are corrected for their number (Holm), and 0.05 is the limit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from .statistics import (
 ALPHA = 0.05
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 LEAST_BEYOND = 10  # decisions slower than a quantile, or nothing is said about it
-PAIRINGS = ("auto", "same", "different")
 # Facts that differ between any two runs, or that follow from others.
 _ALWAYS_DIFFERENT = ("created_utc", "command", "format_version", "toml", "decisions_sha256", "tick", "part")
 _DERIVED = (

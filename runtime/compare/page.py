@@ -1,7 +1,4 @@
-"""A comparison as an HTML page: what changed, the figures with their intervals, curves side by side.
-
-Owns the order; layout and charts are pages'.
-"""
+"""A comparison as an HTML page: what changed, the figures with their intervals, curves side by side."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """One side of a comparison: a run as it was recorded, or as its summary tells.
 
-Owns which files a path stands for: a folder of a run (its recording, or the parts of it), a recording, or the JSON object that `pans run
---json` printed. A summary alone has no decisions: its figures are compared, but not object by object.
+A path stands for a folder of a run (its recording, or the parts of it), a recording, or the JSON object that `pans run --json` printed. A
+summary alone has no decisions: its figures are compared, but not object by object.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Tests of two samples that a lean installation must compute itself: exact where counts are compared, bootstrap for quantiles.
-
-Owns the numbers alone; which test fits is comparison.py's. All p-values are two-sided.
+"""Tests of two samples, two-sided, that a lean installation must compute itself: exact for counts, bootstrap for quantiles.
 
 Sources: McNemar, Psychometrika 12 (1947), exact form; Fisher's exact test, two-sided by the probabilities that are not larger (Agresti,
 Categorical Data Analysis, 3.5); Newcombe, Statistics in Medicine 17 (1998), method 10; Przyborowski and Wilenski, Biometrika 31 (1940) for

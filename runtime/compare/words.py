@@ -1,7 +1,4 @@
-"""A comparison in words: the lines for a terminal, and the rows and sentences that the page shares.
-
-Owns wording alone.
-"""
+"""A comparison in words: the lines for a terminal, and the rows and sentences that the page shares."""
 
 from __future__ import annotations
 

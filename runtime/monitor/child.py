@@ -1,7 +1,6 @@
-"""The process that draws: reads pictures from its input, one JSON object per line, and shows them until the input ends.
+"""The process that draws: it reads pictures from its input, one JSON object per line, and shows them until the input ends.
 
-Owns the command line between the two processes: `python -m pans.runtime.monitor.child [--panel] [--serve HOST:PORT]`; its first line of
-output says which port it serves, or why it cannot. Never writes a file; Ctrl-C is the run's to handle.
+`python -m pans.runtime.monitor.child [--panel] [--serve HOST:PORT]`; its first line of output says which port it serves, or why it cannot.
 """
 
 from __future__ import annotations

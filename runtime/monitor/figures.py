@@ -1,7 +1,6 @@
-"""The figures of a live view, in words: the same rows for the terminal and the web page, and the curves of the page.
+"""A `History` in, the figures of a live view out: the same rows in words for terminal and web page, and the curves of the page.
 
-Owns wording, units and when a figure is marked as a warning or worse; it reads a `History` and never measures. All text that comes from
-files or devices is made inert here (safe_text).
+All text that comes from files or devices is made inert here (safe_text).
 """
 
 from __future__ import annotations

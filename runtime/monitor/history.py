@@ -1,7 +1,7 @@
-"""A run's figures over its whole time, in bounded memory: sums per bin, and bins twice as long whenever there are too many.
+"""A run's figures over its whole time, from its pictures in their order, in bounded memory: sums per bin of time.
 
-Owns the sums; it takes pictures (snapshot.py) in their order and never formats. An hour and a month take the same memory: at most MAX_BINS
-bins. Loads no numpy: the process that draws shall start at once and stay small.
+Whenever there are more than MAX_BINS, bins become twice as long. No numpy is loaded: the process that draws shall start at once and stay
+small.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Who watches one run for people: a thread that takes pictures of it, and the process that draws them.
+"""The live view of one run: a thread that takes pictures of it, and the process that draws them.
 
-Owns both, from before the run until after it. The loop hands over its decisions (one call per block) and waits for nothing: a drawing
-process that hangs or dies only stops drawing. Without a terminal and without a page there is no process, only a plain line now and then.
+The loop hands over its decisions (one call per block) and waits for nothing: a drawing process that hangs or dies only stops drawing.
+Without a terminal and without a page there is no process, only a plain line now and then.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The live view as a web page: one file without a build step, and server-sent events that fill it.
 
-Owns what is sent to browsers; the server and its limits are watch/http.py's, figures and words figures.py's. The page works without any
-network but this server: its policy (CSP) allows its own script and style, by their SHA-256, and nothing else.
+The page works without any network but this server: its policy (CSP) allows its own script and style, by their SHA-256, and nothing else.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Pictures of a run in progress, taken beside the loop: plain numbers, JSON-able, units in the keys.
+"""Pictures of a run in progress, taken alongside the loop: plain numbers, JSON-able, units in the keys.
 
-Owns what is read from a run and how: only what is there already, by short calls with pauses between, so that the loop never waits long for
-the interpreter. `Snapshots.take` returns one picture; `begin_facts` what does not change. A figure that changes while it is read is that of
-one moment or the next.
+Only what is there already is read, by short calls with pauses between, so that the loop never waits long for the interpreter. A figure
+that changes while it is read is that of one moment or the next.
 """
 
 from __future__ import annotations

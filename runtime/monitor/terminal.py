@@ -1,7 +1,4 @@
-"""The live view in a terminal: one panel, redrawn a few times per second by the drawing process.
-
-Owns its layout and colours; figures and words are figures.py's. On a narrow terminal the parts stand below each other.
-"""
+"""The live view in a terminal: one panel, redrawn a few times per second by the drawing process; parts below each other if it is narrow."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The report page of a bundle, and the pictures of its patterns or optics.
-
-Owns what stands on it; drawings are charts.py's.
-"""
+"""The report page of a bundle, and the pictures of its patterns or optics."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Charts as inline SVG: curves with bands, bars, shaded tables, with axes, units and words for screen readers.
 
-Owns geometry; colours are classes of the page's style, so that they follow light and dark. A chart is drawn for a given width in pixels: a
-page holds a wide and a narrow form, so that letters keep their size on a telephone.
+Colours are classes of the page's style, so that they follow light and dark. A chart is drawn for a given width in pixels: a page holds a
+wide and a narrow form, so that letters keep their size on a telephone.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The page's part on what happened during a run: each event as a sentence, the raw records folded away.
+"""The section on what happened during a run: each recorded event as a sentence, the raw records folded away.
 
-Owns the sentences; events are those of the recording, whose kinds stand in docs/reference/formats.md.
+The kinds of events stand in docs/reference/formats.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""The report page's part on objects that passed by: what they were worth, what became of pulses, what was late and why.
+"""The sections on objects that passed by: what they were worth, what became of pulses, what was late and why.
 
-Owns the sums behind these sections; the order of the page is run.py's. Figures come from a replay of
-the recorded messages, so that a recording that was cut, or one part of a longer one, has them too.
+Figures come from a replay of the recorded messages, so that a recording that was cut, or one part of a longer one, has them too.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """One self-contained HTML page: text, tables, drawings and pictures in a single file that needs nothing else.
 
-Owns layout; never measures. Every text is escaped here. Nothing in the page is loaded from elsewhere and nothing in it runs: no script, no
-font, no style sheet of another.
+Every text is escaped here. Nothing in the page is loaded from elsewhere and nothing in it runs: no script, no font, no other style sheet.
 """
 
 from __future__ import annotations
@@ -58,10 +57,6 @@ class Page:
     def heading(self, text: str) -> None:
         """Begin a section."""
         self._parts.append(f"<h2>{safe_text.html(text)}</h2>")
-
-    def subheading(self, text: str) -> None:
-        """Begin a part of a section."""
-        self._parts.append(f"<h3>{safe_text.html(text)}</h3>")
 
     def text(self, text: str, kind: str = "") -> None:
         """Add a paragraph; `kind` is pass, fail, warn, note or nothing."""

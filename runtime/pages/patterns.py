@@ -1,6 +1,6 @@
-"""The pages' part on patterns: each large enough to be seen, with its light, how often it clicked, and what a click on it means.
+"""The section on patterns: each large enough to be seen, with its light, how often it clicked, and what a click on it means.
 
-Owns how patterns become pictures. What a click means is counted, not modelled: how often the objects of each true class made it click.
+What a click means is counted, not modelled: how often the objects of each true class made it click.
 """
 
 from __future__ import annotations

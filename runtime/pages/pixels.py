@@ -1,7 +1,4 @@
-"""Small pictures as PNG bytes (W3C PNG, third edition): grey values, and numbers as shades of blue.
-
-Owns the file format; sizes are those of the arrays, and pages scale them without smoothing.
-"""
+"""Small pictures as PNG bytes (W3C PNG, third edition): grey values, and numbers as shades of blue, one pixel per number."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The report page's part on clicks over time: rates of patterns, channels or steps of a walk, and dark counts.
-
-Owns the sums per time bin and per class, from recorded messages.
-"""
+"""The section on clicks over time, from recorded messages: rates of patterns, channels or steps of a walk, and dark counts."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A page about one registration: the target as stated and as it is seen, the light of all patterns, and what the model leaves.
-
-Owns the page; every figure is registration's.
-"""
+"""A page about one registration: the target as stated and as it is seen, the light of all patterns, and what the model leaves."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The page's part on decisions about still objects: accuracy over time, and truth against decision.
+"""The section on decisions about still objects, from the decision log: accuracy over time, and truth against decision.
 
-Owns the sums per stretch of time, from the decision log; the figures of the whole run are the summary's.
+The figures of the whole run are the summary's.
 """
 
 from __future__ import annotations

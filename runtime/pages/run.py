@@ -1,7 +1,6 @@
-"""The report page of any file that has one, and that of a recording: which sections stand on it, and in which order.
+"""The report page of any file that has one, and that of a recording: its sections, from the verdict to the raw facts.
 
-Owns the order, from the verdict to the raw facts, and never judges: the verdict and the figures of the whole run are those of its summary.
-Curves are computed from the recorded messages, decisions and times.
+The verdict and the figures of the whole run are those of its summary; curves are computed from recorded messages, decisions and times.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The page's part on time: latency as curves, the clock.
-
-Owns the curves, from TIMINGS and CLOCK blocks; the table's figures are the summary's where the run wrote one.
-"""
+"""The section on time: latency as curves, and the clock, from TIMINGS and CLOCK blocks; the table is the summary's where there is one."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The first steps of an automaton's walks as a drawing: patterns at the places of their states, with the ways between them.
 
-Owns where states stand. Levels go from the top down on a wide page and on a narrow one; on the latter fewer of them are drawn.
+Levels go from the top down on a wide page and on a narrow one; on the latter fewer of them are drawn.
 """
 
 from __future__ import annotations

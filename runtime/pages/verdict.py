@@ -1,7 +1,7 @@
 """The top of a run's page: the verdict with its reasons and what to do about each, what was run, the main figures.
 
-Owns the advice; verdict, faults and figures are those that the run recorded. A recording that was cut has no summary:
-then the top says so, and only what the header knows.
+Verdict, faults and figures are those that the run recorded. A recording that was cut has no summary: then the top says so, and only what
+the header knows.
 """
 
 from __future__ import annotations

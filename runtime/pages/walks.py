@@ -1,7 +1,4 @@
-"""The report page's part on an automaton's walks: the tree of their first steps, their lengths, how sure their decisions were.
-
-Owns the sums behind the drawings, from recorded clicks and decisions; the tree is tree.py's.
-"""
+"""The section on an automaton's walks, from recorded clicks and decisions: the tree of their first steps, lengths, and reliability."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A recording as CSV files, units in the headers, and a JSON file about them.
-
-Owns columns and rows; never changes or judges a recording.
-"""
+"""A recording as CSV files, units in the headers, and a JSON file about them."""
 
 from __future__ import annotations
 

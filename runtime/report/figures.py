@@ -1,6 +1,6 @@
 """Pictures that are files of their own, as PNG bytes (extra `plot`): patterns and reliability; the pages draw theirs themselves.
 
-Owns axes, units and colours; never measures. matplotlib is imported by name when something is drawn: the lean runtime does not know it.
+matplotlib is imported when something is drawn: the lean runtime works without it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""What a file of this project holds, as plain facts for `pans info`.
-
-Owns the choice of what to show; never judges it (verify.py) and never prints. `file_facts` returns a JSON-able dict, units in
-the keys, and reads a damaged recording as far as it goes.
-"""
+"""What a file of this project holds, as a JSON-able dict for `pans info`, units in the keys; a damaged recording as far as it goes."""
 
 from __future__ import annotations
 

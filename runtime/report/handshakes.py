@@ -1,7 +1,6 @@
-"""What the device said of itself and of the commands that it was sent, session by session: for whoever audits a recording.
+"""What the device said in WELCOME, ACK and PONG, session by session: JSON-able rows, bounded in number, for whoever audits a recording.
 
-Owns the choice of what to show of WELCOME, ACK and PONG; never judges it. `handshakes` returns JSON-able rows, bounded in number. The
-texts are the device's: whoever prints them makes them safe (text.py).
+The texts are the device's: whoever prints them makes them safe (safe_text).
 """
 
 from __future__ import annotations

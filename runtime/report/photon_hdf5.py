@@ -1,13 +1,11 @@
 """A recording as Photon-HDF5, the open format of photon-counting experiments (photon-hdf5.org, version 0.5).
 
-Owns the mapping onto that format; never reads a message (exposures.py). Needs h5py (extra `export`), imported by name when a file
-is written: the lean runtime does not know it.
-
-Each field of the format has the title that the format's definition gives it: readers such as phconvert refuse other words.
+Needs h5py (extra `export`), imported when a file is written. Each field has the title that the format's definition gives it: readers such
+as phconvert refuse other words.
 
 A binary click becomes a photon: its timestamp is the **begin of its exposure** in device ticks (when in the exposure it fell is not known),
-its detector the channel that clicked. Which pattern was shown, which object stood there and what was decided is in `/user/pans`; the format
-leaves `/user` to its users.
+its detector the channel that clicked. Which pattern was displayed, which object stood there and what was decided is in `/user/pans`; the
+format leaves `/user` to its users.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The summary of a run: its figures, its faults and the verdict, as facts and as the JSON of the contract.
-
-Owns what stands in it and in which order; never measures and never words a page (summary_page.py, words.py).
-"""
+"""The summary of a run: its figures, its faults and the verdict, as facts and as the JSON of the contract."""
 
 from __future__ import annotations
 

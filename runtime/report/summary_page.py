@@ -1,7 +1,4 @@
-"""The summary of a run as a Markdown page for people, written beside the recording.
-
-Owns how results are worded there; never measures. A simulated run says SIMULATED.
-"""
+"""The summary of a run as a Markdown page for people, written beside the recording. A simulated run says SIMULATED."""
 
 from __future__ import annotations
 

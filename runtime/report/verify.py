@@ -1,7 +1,7 @@
 """The checks behind `pans verify`: is this file whole, and can what it says be true?
 
-Owns the judgement on files, never their format. `verify_file` never raises for what a file holds: it returns a `Verdict` with
-alerts (odd, usable), violations (a claim that does not hold) and damage (not readable as it was written).
+`verify_file` never raises for what a file holds: it returns a `Verdict` with alerts (odd, usable), violations (a claim that does not hold)
+and damage (not readable as it was written).
 """
 
 from __future__ import annotations

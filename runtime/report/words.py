@@ -1,7 +1,4 @@
-"""A run's figures in words: closing lines for a terminal, rows for pages.
-
-Owns wording alone; never measures. Each call returns text.
-"""
+"""A run's figures in words: closing lines for a terminal, rows for pages."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def tags_of(text: str) -> Tags:
     curves = [Curve([0, 1], [0, 1], text), Curve([0, 1], [1, 0], text, "b")]
     page.figure(Chart(text, axis, axis, curves=curves, marks=[Mark(0.5, text), Mark(0.5, text, True)]), text)
     with page.folded(text):
-        page.subheading(text)
+        page.text(text)
     tags = Tags()
     tags.feed(page.html().decode())
     return tags
