@@ -58,12 +58,7 @@ class PageServer(ThreadingTCPServer):
     request_queue_size = 128  # in the kernel, where they cost nothing
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        page: Callable[[], bytes],
-        headers: dict[str, str],
-        feed: Feed | None = None,
+        self, host: str, port: int, page: Callable[[], bytes], headers: dict[str, str], feed: Feed | None = None
     ) -> None:
         self.headers, self.feed, self.local = headers, feed, is_loopback(host)
         self.ending, self.listeners = threading.Event(), threading.BoundedSemaphore(MAX_LISTENERS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import time
 from collections.abc import Iterator
@@ -27,24 +26,22 @@ def a_history(pictures: int = 30) -> History:
     history.take({"kind": "begin", "simulated": True, "deadline_us": 2000.0, "encoder": "automaton", **begin})
     for k in range(1, pictures + 1):
         facts: dict[str, Any] = {
-            **{"state": "running", "ended": "", "decisions": 20 * k, "abstained": k, "known": 20 * k, "right": 15 * k},
+            **dict.fromkeys(("lost", "gaps", "reconnects", "contradictions"), 0),
+            **{name: 20 * k for name in ("decisions", "known", "objects", "photons_known")},
             **{
-                "objects": 20 * k,
+                "state": "running",
+                "ended": "",
+                "abstained": k,
+                "right": 15 * k,
                 "clicks": 90 * k,
                 "photons": 160.0 * k,
-                "photons_known": 20 * k,
-                "walk_light": 7e3 * k,
             },
-            **{"exposures": 600 * k, "lost": 0, "gaps": 0, "late": k // 10, "reconnects": 0, "contradictions": 0},
-            **{"latency": [[520 + k % 5, 18], [560, 2]], "latency_max_us": 1500.0, "trouble": NASTY},
+            **{"walk_light": 7e3 * k, "exposures": 600 * k, "late": k // 10, "trouble": NASTY},
+            **{"latency": [[520 + k % 5, 18], [560, 2]], "latency_max_us": 1500.0, "recording": "run.pansrec"},
             **{"dark_exposures": 50 * k, "dark_clicks": k, "dark_expected": 0.015, "dark_high": 0.02, "dark_words": ""},
             **{"clock_drift_ppm": -20 + k % 3, "clock_uncertainty_us": 70.0, "disk_free_bytes": 1 << 36},
-            **{"recording": "run.pansrec", "recording_bytes": 1 << 22, "class_decided": list(range(10))},
-            **{
-                "class_truth": [10] * 10,
-                "class_right": [5] * 10,
-                "latest": [[k, k, 0, 0.9, 4, 0, 0], [k, k, 1, 0.5, 2, 0, 0]],
-            },
+            **{"recording_bytes": 1 << 22, "class_decided": list(range(10)), "class_truth": [10] * 10},
+            **{"class_right": [5] * 10, "latest": [[k, k, 0, 0.9, 4, 0, 0], [k, k, 1, 0.5, 2, 0, 0]]},
             **{"word": {"patterns": list(range(32)), "clicks": [0, 1] * 16}},
             **{"pixels": {str(n): {"shape": [4, 4], "grey": GREY} for n in range(32)}},
         }
@@ -59,35 +56,17 @@ def served() -> Iterator[LivePage]:
     live.close()
 
 
-def ask(live: LivePage, words: bytes, most: int = 1 << 16) -> bytes:
-    with socket.create_connection(("127.0.0.1", live.port), timeout=5) as client:
-        client.sendall(words)
-        data = b""
-        while len(data) < most and (piece := client.recv(1 << 16)):
-            data += piece
-        return data
-
-
-def events(data: bytes) -> dict[str, Any]:
-    found = {}
-    for part in data.partition(b"\r\n\r\n")[2].decode().split("\n\n"):
-        name, _, rest = part.partition("\n")
-        if name.startswith("event: "):
-            found[name[7:]] = json.loads(rest.removeprefix("data: "))
-    return found
-
-
-def follow(live: LivePage) -> socket.socket:
+def ask(live: LivePage, words: str) -> socket.socket:
     client = socket.create_connection(("127.0.0.1", live.port), timeout=5)
-    client.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    client.sendall(f"{words} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
     return client
 
 
-def read_events(client: socket.socket) -> dict[str, Any]:
+def until(client: socket.socket, mark: bytes) -> bytes:
     data = b""
-    while b"event: curves" not in data or not data.endswith(b"\n\n"):
-        data += client.recv(1 << 16)
-    return events(data)
+    while mark not in data and (piece := client.recv(1 << 16)):
+        data += piece
+    return data
 
 
 def test_the_page_is_one_small_file_that_loads_nothing() -> None:
@@ -100,25 +79,25 @@ def test_the_page_is_one_small_file_that_loads_nothing() -> None:
 
 
 def test_the_policy_lets_nothing_else_run(served: LivePage) -> None:
-    head = ask(served, b"HEAD / HTTP/1.1\r\nHost: localhost\r\n\r\n").decode()
+    with ask(served, "HEAD /") as client:
+        head = until(client, b"\r\n\r\n").decode()
     assert "default-src 'none'; script-src 'sha256-" in head
     assert "unsafe" not in head
     assert "frame-ancestors 'none'" in head
 
 
 def test_more_than_a_few_followers_are_refused_and_a_gone_one_makes_room(served: LivePage) -> None:
-    held = [follow(served) for _ in range(MAX_LISTENERS)]
+    held = [ask(served, "GET /events") for _ in range(MAX_LISTENERS)]
     for client in held:
-        read_events(client)
-    assert ask(served, b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")[9:12] == b"503"
+        assert until(client, b"event: curves")[9:12] == b"200"
+    with ask(served, "GET /events") as client:
+        assert until(client, b"\n")[9:12] == b"503"
     held.pop().close()
     for _ in range(100):
-        client = follow(served)
-        first = client.recv(100)
-        if first[9:12] == b"200":
-            held.append(client)
+        held.append(ask(served, "GET /events"))
+        if until(held[-1], b"\n")[9:12] == b"200":
             break
-        client.close()
+        held.pop().close()
         time.sleep(0.02)
     assert len(held) == MAX_LISTENERS
     for client in held:

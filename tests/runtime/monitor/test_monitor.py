@@ -14,6 +14,7 @@ import time
 import urllib.request
 from collections import Counter, deque
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -48,16 +49,8 @@ def picture(elapsed_s: float, **more: Any) -> dict[str, Any]:
 def test_a_month_takes_the_memory_of_an_hour_and_loses_no_decision() -> None:
     history, n = History(), 10_000
     for step in range(1, n + 1):
-        history.take(
-            picture(
-                65.0 * step,
-                decisions=100 * step,
-                known=100 * step,
-                right=80 * step,
-                late=step // 1000,
-                latency=[[200, 100]],
-            )
-        )
+        sums = {"decisions": 100 * step, "known": 100 * step, "right": 80 * step, "late": step // 1000}
+        history.take(picture(65.0 * step, **sums, latency=[[200, 100]]))
     assert len(history.bins) <= MAX_BINS
     assert sum(one.sums["decisions"] for one in history.bins) == 100 * n
     assert sum(one.sums["late"] for one in history.bins) == n // 1000
@@ -87,16 +80,10 @@ def test_trials_of_one_visit_do_not_narrow_the_interval() -> None:
 def test_what_is_wrong_is_marked_and_in_words() -> None:
     history = History()
     history.take({"kind": "begin", "deadline_us": 1000.0, "classes": ["a\x1b[2J", "b"], "expected": 100})
-    late = picture(
-        10.0, decisions=50, known=50, right=25, objects=50, clicks=100, late=3, lost=7, gaps=2, latency=[[600, 50]]
-    )
-    late |= {
-        "class_decided": [30, 20],
-        "class_truth": [25, 25],
-        "class_right": [20, 10],
-        "latest": [[49, 3, 0, 0.5, 2, 1, 0]],
-    }
+    late = picture(10.0, decisions=50, known=50, right=25, objects=50, clicks=100, late=3, lost=7, gaps=2)
+    late |= {"class_decided": [30, 20], "class_truth": [25, 25], "class_right": [20, 10], "latency": [[600, 50]]}
     late |= {"disk_free_bytes": 1 << 20, "recording_bytes": 1 << 20, "recording": "run.pansrec"}
+    late |= {"latest": [[49, 3, 0, 0.5, 2, 1, 0]]}
     history.take(late | {"trouble": "lost\n\x1b[31m", "dark_words": "", "dark_exposures": 100, "dark_clicks": 3})
     rows = {row.name: row for row in rows_of(history)}
     assert rows["late"].level == rows["lost"].level == rows["disk"].level == rows["budget"].level == "bad"
@@ -112,10 +99,7 @@ def test_what_is_wrong_is_marked_and_in_words() -> None:
 
 @pytest.mark.parametrize(
     ("clicks", "words", "level"),
-    [
-        (2, "higher than expected, not yet sure (alarm after about", "note"),
-        (0, "as expected", "good"),
-    ],
+    [(2, "higher than expected, not yet sure (alarm after about", "note"), (0, "as expected", "good")],
 )
 def test_a_rate_whose_interval_excludes_the_expected_one_is_not_called_expected(
     clicks: int, words: str, level: str
@@ -219,27 +203,18 @@ def test_without_a_terminal_there_are_plain_lines(
 
     monkeypatch.setattr(module, "LINE_EVERY_S", 0.0)
     monkeypatch.setattr(module, "EVERY_S", 0.01)
-    shown = Monitor(panel=False)
+    shown, pictures = Monitor(panel=False), deque(picture(float(k), decisions=k) for k in range(1, 10_000))
+    facts = {"kind": "begin", "title": "a bundle on an instrument", "simulated": True, "expected": 500}
     with shown:
         assert shown._child is None
-        shown.begin(
-            None, None, {"kind": "begin", "title": "a bundle on an instrument", "simulated": True, "expected": 500}
-        )  # type: ignore[arg-type]
-        pictures = deque(picture(float(k), decisions=k) for k in range(1, 10_000))
-
-        class Pictures:
-            def take(self) -> dict[str, Any]:
-                return pictures.popleft()
-
-        shown._snapshots = Pictures()  # type: ignore[assignment]
-        deadline = time.monotonic() + 30
-        while len(pictures) > 9_990 and time.monotonic() < deadline:
+        shown.begin(None, None, facts)  # type: ignore[arg-type]
+        shown._snapshots = SimpleNamespace(take=pictures.popleft)  # type: ignore[assignment]
+        give_up_s = time.monotonic() + 30
+        while len(pictures) > 9_990 and time.monotonic() < give_up_s:
             time.sleep(0.01)
     lines = capfd.readouterr().err.splitlines()
-    assert (
-        lines[0]
-        == "SIMULATED · a bundle on an instrument: 1 of 500 decisions · 0.00 clicks each · p99 0.00 ms · late 0 · lost 0"
-    )
+    figures = "1 of 500 decisions · 0.00 clicks each · p99 0.00 ms · late 0 · lost 0"
+    assert lines[0] == f"SIMULATED · a bundle on an instrument: {figures}"
     assert len(lines) > 5
 
 
@@ -252,27 +227,10 @@ def test_a_panel_is_drawn_on_a_terminal_and_removed(tmp_path: Path) -> None:
         words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=theirs, text=True, env=environment
     )
     assert child.stdin is not None
-    messages = [
-        {
-            "kind": "begin",
-            "title": "a bundle on a device",
-            "classes": ["shoe", "bag"],
-            "expected": 10,
-            "deadline_us": 100.0,
-        }
-    ]
-    told = picture(
-        3.0,
-        decisions=4,
-        known=4,
-        right=3,
-        objects=4,
-        clicks=8,
-        class_decided=[3, 1],
-        class_truth=[2, 2],
-        class_right=[2, 1],
-    )
-    for message in [*messages, told | {"latest": [[3, 7, 0, 0.9, 2, 0, 0]]}]:
+    sums = {"decisions": 4, "known": 4, "right": 3, "objects": 4, "clicks": 8, "latest": [[3, 7, 0, 0.9, 2, 0, 0]]}
+    classes = {"class_decided": [3, 1], "class_truth": [2, 2], "class_right": [2, 1]}
+    begin = {"kind": "begin", "title": "a bundle on a device", "classes": ["shoe", "bag"], "deadline_us": 100.0}
+    for message in (begin | {"expected": 10}, picture(3.0, **sums, **classes)):
         child.stdin.write(json.dumps(message) + "\n")
     child.stdin.close()
     assert child.wait(20) == 0

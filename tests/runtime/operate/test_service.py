@@ -18,14 +18,7 @@ from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
-from pans.runtime.operate.service import (
-    Heard,
-    check_name,
-    command_line,
-    command_of,
-    start_and_hear,
-    unit_text,
-)
+from pans.runtime.operate.service import Heard, check_name, command_line, command_of, start_and_hear, unit_text
 
 NASTY = ["/a b/pans", "50%.pans", "$HOME", 'say "hi"', "a\\b", "tab\tend", "Größe", "%n%%", "$$", "line\nend", ""]
 
