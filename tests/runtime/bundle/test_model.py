@@ -15,10 +15,9 @@ import pytest
 from bundles import made_bundle, resealed
 from heads import affine_head
 
-from pans.runtime.bundle import facts, onnx_model
+from pans.runtime.bundle import facts
 from pans.runtime.bundle import format as bundle_format
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle, word_means, write_bundle
-from pans.runtime.bundle.onnx_check import check_head
 from pans.runtime.errors import DamagedFileError, UsageError
 
 
@@ -72,32 +71,17 @@ def test_the_bytes_are_those_of_the_document() -> None:
     assert start + last["offset"] + last["length"] + 32 == len(data)
 
 
-def test_any_flipped_byte_is_detected() -> None:
+def test_any_flipped_byte_any_truncation_and_any_rest_is_detected() -> None:
     data = bundle_bytes(small_bundle(d_f=1))
     parse_bundle(data, "whole")
     for position in range(len(data)):
-        for flip in (0x01, 0x80, 0xFF):
-            changed = bytearray(data)
-            changed[position] ^= flip
+        flipped = (data[:position] + bytes([data[position] ^ flip]) + data[position + 1 :] for flip in (1, 0x80, 0xFF))
+        for changed in (data[:position], *flipped):
             with pytest.raises(DamagedFileError, match=r"^here: "):
-                parse_bundle(bytes(changed), "here")
-
-
-def test_any_truncation_and_any_rest_is_detected() -> None:
-    data = bundle_bytes(small_bundle(d_f=1))
-    for length in range(len(data)):
-        with pytest.raises(DamagedFileError):
-            parse_bundle(data[:length], "cut")
+                parse_bundle(changed, "here")
     for rest in (b"\0", b"x" * 40, data):
         with pytest.raises(DamagedFileError, match="too many"):
             parse_bundle(data + rest, "long")
-
-
-def test_the_altered_part_is_named() -> None:
-    data = bytearray(bundle_bytes(small_bundle()))
-    data[-40] ^= 1
-    with pytest.raises(DamagedFileError, match="golden_scores"):
-        parse_bundle(bytes(data), "x")
 
 
 @pytest.mark.parametrize("version", [0, 2, 0xFFFFFFFF])
@@ -204,15 +188,6 @@ def test_what_is_beyond_a_budget_is_refused(name: str, limit: int, monkeypatch: 
         parse_bundle(data, "x")
 
 
-def test_a_model_beyond_its_bytes_is_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    head = random_head(2, 2)[0]
-    monkeypatch.setattr(onnx_model, "MODEL_MAX_BYTES", len(head))
-    check_head(head, 2, 2)
-    monkeypatch.setattr(onnx_model, "MODEL_MAX_BYTES", len(head) - 1)
-    with pytest.raises(ValueError, match=f"{len(head)} bytes, allowed: 1 to {len(head) - 1}"):
-        check_head(head, 2, 2)
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -255,14 +230,11 @@ def test_missing_files_are_a_matter_of_usage(tmp_path: Path) -> None:
             load_bundle(path)
 
 
-def test_units_of_patterns_and_illumination() -> None:
+def test_units_of_patterns_and_bit_i_of_a_word_is_pattern_i() -> None:
     made = small_bundle()
     np.testing.assert_array_equal(made.patterns(), [[0.0, 0.25, 0.5], [0.75, 0.0, 0.25]])
     assert made.illumination() == pytest.approx(1.75)
     assert (made.n_features, made.n_pixels, made.n_classes) == (2, 3, 2)
-
-
-def test_bit_i_of_a_word_is_pattern_i() -> None:
     np.testing.assert_array_equal(word_means([0b001, 0b110], 3), [[1, 0, 0], [0, 1, 1]])
 
 
@@ -278,12 +250,8 @@ def test_the_table_is_built_from_the_head() -> None:
     assert len(fractions) >= 8  # means over several shots are among the golden vectors
 
 
-def test_beyond_twelve_patterns_there_is_no_table() -> None:
-    head, _, _ = random_head(13, 2)
-    assert small_bundle(d_f=13, table=None, head_onnx=head).table is None
-
-
-def test_head_and_table_must_agree() -> None:
+def test_head_and_table_must_agree_and_beyond_twelve_patterns_there_is_no_table() -> None:
+    assert small_bundle(d_f=13, table=None, head_onnx=random_head(13, 2)[0]).table is None
     head, weights, bias = random_head(4, 2)
     table = word_means(np.arange(16), 4) @ weights + bias
     small_bundle(d_f=4, head_onnx=head, table=table)

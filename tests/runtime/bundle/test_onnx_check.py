@@ -18,6 +18,7 @@ from models import hostile_models, model, random_model
 from onnx import helper
 from onnx.parser import parse_model
 
+from pans.runtime.bundle import onnx_model
 from pans.runtime.bundle.head import open_head
 from pans.runtime.bundle.onnx_check import ROWS, check_head, shapes_of
 from pans.runtime.bundle.onnx_model import read_model
@@ -121,6 +122,12 @@ def test_the_cost_of_a_chain_is_its_products() -> None:
     cost = check_head(onnx_chain(random_layers([10, 512, 10])), 10, 10)
     assert cost.operations == 10 * 512 + 512 * 10 + 8 * (512 + 512 + 10)
     assert cost.values == 10 + 512 + 512 + 10
+
+
+def test_a_model_beyond_its_bytes_is_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(onnx_model, "MODEL_MAX_BYTES", len(AFFINE) - 1)
+    with pytest.raises(ValueError, match=f"{len(AFFINE)} bytes, allowed: 1 to {len(AFFINE) - 1}"):
+        check_head(AFFINE, 2, 2)
 
 
 def check_random_models(seed: int, count: int) -> int:
