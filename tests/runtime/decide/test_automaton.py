@@ -15,7 +15,7 @@ from bundles import made_bundle
 from pans.runtime.bundle import Automaton
 from pans.runtime.decide import make_decider
 from pans.runtime.decide.automaton import AutomatonDecider, walk_words
-from pans.runtime.decide.expectation import expected_walk
+from pans.runtime.decide.expectation import ExpectedWalk, expected_walk
 from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import DamagedFileError, UsageError
@@ -58,17 +58,16 @@ def test_ties_go_to_the_lowest_label() -> None:
 
 
 def test_what_cannot_answer_is_refused() -> None:
-    bundle = automaton_bundle()
-    for backend in ("table", "onnx", "sparse", "int8", "float64", "count-table"):
-        with pytest.raises(UsageError, match="its automaton decides"):
-            make_decider(bundle, backend=backend)
-    with pytest.raises(UsageError, match="not on 3 shots"):
-        make_decider(bundle, shots=3)
-    fixed = made_bundle(table=np.zeros((4, 2)))
-    with pytest.raises(UsageError, match="has no automaton"):
-        make_decider(fixed, backend="automaton")
-    with pytest.raises(UsageError, match=r"confidence is 0\.9"):
-        make_decider(fixed, confidence=0.9)
+    bundle, fixed = automaton_bundle(), made_bundle(table=np.zeros((4, 2)))
+    others = ("table", "onnx", "sparse", "int8", "float64", "count-table")
+    for asked, facts, words in (
+        *((bundle, {"backend": backend}, "its automaton decides") for backend in others),
+        (bundle, {"shots": 3}, "not on 3 shots"),
+        (fixed, {"backend": "automaton"}, "has no automaton"),
+        (fixed, {"confidence": 0.9}, r"confidence is 0\.9"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            make_decider(asked, **facts)
     decider = make_decider(bundle, backend="automaton")
     for counts in ([2, 0, 0], [-1, 0, 0]):
         with pytest.raises(UsageError, match="numbers of 0 to 1"):
@@ -123,6 +122,10 @@ def light_of(automaton: Automaton, whole: np.ndarray, brightness: float) -> list
     ]
 
 
+def totals_of(found: ExpectedWalk) -> list[np.ndarray]:
+    return [found.clicks, found.exposures, found.photons, found.illumination]
+
+
 LAWS = [ClickLaw(), ClickLaw(0.02), ClickLaw(0.01, 0.3, 0.6), ClickLaw(0.0, 0.2, 1.5)]
 
 
@@ -137,14 +140,11 @@ def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLa
         light = light_of(automaton, patterns @ seen, 1.5)
         click = [float(click_probability(law, mu)) for mu in light]
         wanted = naive.expectation(automaton, [Fraction(p) for p in click], Fraction(1), Fraction(afterpulse))
-        assert found.clicks[i] == pytest.approx(float(wanted["clicks"]), rel=1e-12)
-        assert found.exposures[i] == pytest.approx(float(wanted["exposures"]), rel=1e-12)
-        assert found.leaves[i] == pytest.approx([float(chance) for chance in wanted["leaves"]], rel=1e-11, abs=1e-300)
-        photons = sum(float(chance) * mu for chance, mu in zip(wanted["shown"], light))
-        assert found.photons[i] == pytest.approx(photons, rel=1e-12)
         whole = light_of(automaton, patterns.sum(axis=1), 1.5)
-        illumination = sum(float(chance) * e for chance, e in zip(wanted["shown"], whole))
-        assert found.illumination[i] == pytest.approx(illumination, rel=1e-12)
+        photons, illumination = (sum(float(p) * e for p, e in zip(wanted["shown"], each)) for each in (light, whole))
+        totals = [float(wanted["clicks"]), float(wanted["exposures"]), photons, illumination]
+        assert [sums[i] for sums in totals_of(found)] == pytest.approx(totals, rel=1e-12)
+        assert found.leaves[i] == pytest.approx([float(chance) for chance in wanted["leaves"]], rel=1e-11, abs=1e-300)
         assert found.leaves[i].sum() == pytest.approx(1.0, abs=1e-13)
 
 
@@ -172,25 +172,23 @@ def test_objects_in_pieces_are_objects_together(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("pans.runtime.decide.expectation._NUMBERS_AT_ONCE", 5 * len(automaton.posteriors))
     monkeypatch.setattr("pans.runtime.decide.expectation._PATTERNS_AT_ONCE", 2)
     pieces = expected_walk(automaton, patterns, objects, ClickLaw(0.01), afterpulses=Afterpulses(0.1))
-    for name in ("clicks", "photons", "illumination", "exposures", "leaves"):
-        assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-13)
+    assert np.array(totals_of(pieces)) == pytest.approx(np.array(totals_of(whole)), rel=1e-13)
+    assert pieces.leaves == pytest.approx(whole.leaves, rel=1e-13)
 
 
 def test_expectations_refuse_what_does_not_fit() -> None:
-    automaton = diamond()
+    automaton, counting, two = diamond(), random_automaton(5, outcomes=3), AUTOMATA[3]
     patterns, objects = of_objects(automaton)
-    with pytest.raises(ValueError, match="the same pixels"):
-        expected_walk(automaton, patterns[:, 1:], objects, ClickLaw())
-    with pytest.raises(ValueError, match="shows pattern 2 of 2"):
-        expected_walk(automaton, patterns[:2], objects, ClickLaw())
-    with pytest.raises(ValueError, match="the same outcomes, and no afterpulses"):
-        counting = random_automaton(5, outcomes=3)
-        expected_walk(counting, *of_objects(counting), CountLaw(0.0, 0.2, (0.5, 1.5)), afterpulses=Afterpulses(0.1))
-    with pytest.raises(ValueError, match="no afterpulses"):
-        expected_walk(AUTOMATA[3], *of_objects(AUTOMATA[3]), ClickLaw(), afterpulses=Afterpulses(0.1))
-    with pytest.raises(ValueError, match="a state shows pattern"):
-        patterns, objects = of_objects(AUTOMATA[3])
-        expected_walk(AUTOMATA[3], patterns[:-1], objects, ClickLaw())
+    pulses, counts = Afterpulses(0.1), CountLaw(0.0, 0.2, (0.5, 1.5))
+    for walked, seen, law, afterpulses, words in (
+        (automaton, (patterns[:, 1:], objects), ClickLaw(), Afterpulses(0.0), "the same pixels"),
+        (automaton, (patterns[:2], objects), ClickLaw(), Afterpulses(0.0), "shows pattern 2 of 2"),
+        (two, (of_objects(two)[0][:-1], objects), ClickLaw(), Afterpulses(0.0), "a state shows pattern"),
+        (counting, of_objects(counting), counts, pulses, "the same outcomes, and no afterpulses"),
+        (two, of_objects(two), ClickLaw(), pulses, "no afterpulses"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            expected_walk(walked, *seen, law, afterpulses=afterpulses)
 
 
 @pytest.mark.parametrize("channels", [2, 3])
@@ -200,7 +198,7 @@ def test_expectations_of_several_channels_are_sums_over_all_words(channels: int)
     patterns, objects = of_objects(automaton)
     found = expected_walk(automaton, patterns, objects, law, photons_per_level=1.5)
     for i, seen in enumerate(objects):
-        sums, leaves = np.zeros(4), np.zeros(automaton.n_leaves)  # clicks, photons, illumination, exposures
+        sums, leaves = np.zeros(4), np.zeros(automaton.n_leaves)  # as totals_of
         going = [(0, Fraction(1), np.zeros(4))]
         while going:
             node, chance, met = going.pop()
@@ -213,8 +211,7 @@ def test_expectations_of_several_channels_are_sums_over_all_words(channels: int)
             light = [float(part @ seen) for part in lit]
             click = [Fraction(float(click_probability(law, mu))) for mu in light]
             for word, part in enumerate(naive.word_chances(click, Fraction(1))):
-                here = np.array([bin(word).count("1"), sum(light), sum(part.sum() for part in lit), 1.0])
+                here = np.array([bin(word).count("1"), 1.0, sum(light), sum(part.sum() for part in lit)])
                 going.append((int(automaton.successors[node, word]), chance * part, met + here))
-        totals = [found.clicks[i], found.photons[i], found.illumination[i], found.exposures[i]]
-        np.testing.assert_allclose(totals, sums, rtol=1e-11)
+        np.testing.assert_allclose([totals[i] for totals in totals_of(found)], sums, rtol=1e-11)
         np.testing.assert_allclose(found.leaves[i], leaves, rtol=1e-10, atol=1e-300)
