@@ -112,9 +112,6 @@ def _is_journal() -> bool:
     return wanted == f"{found.st_dev}:{found.st_ino}"
 
 
-# ---- lines ----
-
-
 def _time_of(record: logging.LogRecord) -> str:
     return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
 
@@ -150,9 +147,6 @@ class _Lines(logging.Formatter):
 def plain(value: Any) -> Any:
     """Return numpy's scalars and arrays as JSON has them, anything else as text: the `default` of json.dumps."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
-
-
-# ---- handlers ----
 
 
 class _BoundedQueue(logging.handlers.QueueHandler):

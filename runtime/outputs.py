@@ -25,9 +25,6 @@ FORCE_REMEDY = "choose another name, or replace it with --force"
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
 
 
-# ---- before a command begins ----
-
-
 def check_outputs(
     outputs: Iterable[str | Path],
     *,
@@ -123,9 +120,6 @@ def _refusing(what: str, remedy: str) -> Iterator[None]:
         raise UsageError(f"{what}: {error.strerror or error}", remedy=remedy) from error
 
 
-# ---- creating ----
-
-
 def write_file(path: str | Path, data: bytes | memoryview, *, force: bool = False) -> None:
     """Write `data` to `path` whole or not at all, synced; UsageError if that fails, or if `path` exists, unless `force`.
 
@@ -211,9 +205,6 @@ def _sync(path: Path, mode: int) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-# ---- folders of runs ----
 
 
 def new_run_folder(name: str, root: Path = RUNS) -> Path:

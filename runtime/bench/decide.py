@@ -138,9 +138,6 @@ def _backend_row(
     return row
 
 
-# -- limits ------------------------------------------------------------------------------------------------------------
-
-
 def _limits(bundle: Bundle, counts: I64, shots: int) -> list[Row]:
     """The same decisions by others: our kernel alone, onnxruntime as one would call it, torch eager."""
     import onnxruntime

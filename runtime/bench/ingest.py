@@ -95,9 +95,6 @@ def _rate_mb(n_bytes: int, seconds: float) -> int:
     return round(n_bytes / seconds / 1e6)
 
 
-# -- sequential streams ------------------------------------------------------------------------------------------------
-
-
 def stream_rows(bundle: Bundle, quick: bool) -> list[Row]:
     """Return rows of `bundle`'s sequential stream: compiled steps, and the replay of a recording."""
     try:
@@ -154,9 +151,6 @@ def _replay_row(bundle: Bundle, plan: Plan, decider: Decider, frames: list[bytes
         exposures = len(frames) // 2 * plan.slots_per_cycle
         row = _rates(spent, exposures, found.decisions) | {"bytes": recording.size}
     return row | {"changed_percent": 0.0 if found.as_recorded else 100.0}
-
-
-# -- the whole way -----------------------------------------------------------------------------------------------------
 
 
 def _whole_row(bundle: Bundle, shots: int, backend: str, quick: bool) -> Row:

@@ -66,9 +66,6 @@ def made_automaton() -> Bundle:
     )
 
 
-# -- one detector ------------------------------------------------------------------------------------------------------
-
-
 def sequential_plan(bundle: Bundle, decider: Decider) -> Plan:
     """Return one dark slot and all patterns, or the longest walk, in each cycle; one cycle per object."""
     automaton: Automaton | None = getattr(decider, "automaton", None)
@@ -113,9 +110,6 @@ def visits(plan: Plan, n_visits: int) -> Iterator[bytes]:
             facts = (seq, 0, TICKS * (first + slot), first + slot, TICKS, visit)
             yield encode_clicks(ClickBlock(*facts, stamps[visit, part], clicks[visit, part]), SESSION)
         seq += 1
-
-
-# -- parallel channels -------------------------------------------------------------------------------------------------
 
 
 def parallel_plan(n_patterns: int, shots: int) -> Plan:
@@ -168,9 +162,6 @@ def flow_blocks(n_patterns: int, blocks: int) -> Iterator[bytes]:
         clicks = rng.random((FLOW_BLOCK, n_patterns)) < np.where(lit, FLOW_CLICK, FLOW_DARK)[:, None]
         facts = (block, 0, first * FLOW_TICKS, first, FLOW_TICKS, NO_OBJECT)
         yield encode_frames(FrameBlock(*facts, packed_words(clicks)), SESSION)
-
-
-# -- comparing ---------------------------------------------------------------------------------------------------------
 
 
 def reads_of(data: bytes, size: int = READ_BYTES) -> list[NDArray[np.uint8]]:

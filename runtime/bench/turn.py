@@ -86,9 +86,6 @@ def built_device(folder: Path) -> Path | str:
     return f"{compiler} failed: {done.stderr.strip().splitlines()[-1:]}" if done.returncode else made
 
 
-# -- work --------------------------------------------------------------------------------------------------------------
-
-
 def block_row(bundle: Bundle, quick: bool) -> Row:
     """Return the row of a walk driven by the host, a mark and a block for each exposure."""
     decider = make_decider(bundle)
@@ -154,9 +151,6 @@ def _flow_core(bundle: Bundle, plan: Plan) -> FlowCore:
     core = make_flow_core(plan, decider, settings, bundle.classes, shots=1, dark_probability=streams.FLOW_DARK)
     core.warm_up()
     return core
-
-
-# -- round trips -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

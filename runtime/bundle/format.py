@@ -54,9 +54,6 @@ _ROWS_AT_ONCE = 1024
 _REMEDY = "take the file from its source again, or export it again with `pans train` or `pans bundle`"
 
 
-# ---- writing ----
-
-
 def bundle_bytes(bundle: Bundle) -> bytes:
     """Return the file of `bundle`; the same bundle always gives the same bytes. UsageError above 64 MiB."""
     rows, blobs, offset = [], [], 0
@@ -145,9 +142,6 @@ def _walk_parts(bundle: Bundle, automaton: Automaton) -> dict[str, NDArray[Any]]
 def _packed(values: NDArray[Any]) -> NDArray[np.uint8]:
     """Zeros and ones (n, k) as bits: number j is bit j % 8 of byte j // 8."""
     return np.packbits(values.astype(np.bool_), axis=1, bitorder="little")
-
-
-# ---- reading ----
 
 
 def parse_bundle(data: bytes, where: str) -> Bundle:

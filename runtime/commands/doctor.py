@@ -64,9 +64,6 @@ class PortState:
     remedy: str = ""
 
 
-# -- ports -------------------------------------------------------------------------------------------------------------
-
-
 def serial_ports() -> list[PortState]:
     """Return the serial ports with their state, without opening one."""
     from serial.tools import list_ports
@@ -129,9 +126,6 @@ def usb_devices() -> list[PortState]:
 def schemes() -> list[str]:
     """Return the URL schemes that this installation opens."""
     return sorted({"serial", "usb", *(point.name for point in entry_points(group="pans.devices"))})
-
-
-# -- the machine -------------------------------------------------------------------------------------------------------
 
 
 def check_python() -> Iterator[Finding]:
@@ -311,9 +305,6 @@ def examine(checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
     return findings
 
 
-# -- what each real-time setting brings --------------------------------------------------------------------------------
-
-
 # Row, the arms without and with it ("base": bound, at the best priority that is granted), the quantile that is compared, and what to do by
 # effect; "refused" for an arm that was not granted.
 COMPARED: tuple[tuple[str, str, str, float, dict[str, str]], ...] = (
@@ -410,9 +401,6 @@ def _cell(values: dict[str, Any]) -> str:
     if "p50_us" not in values:
         return "not tried"
     return f"{values['p50_us']:.1f} / {values['p99_us']:.1f} / {values['p999_us']:.0f} / {values['max_us']:.0f}"
-
-
-# -- the commands ------------------------------------------------------------------------------------------------------
 
 
 def _configure_devices(parser: argparse.ArgumentParser) -> None:

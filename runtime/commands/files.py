@@ -29,9 +29,6 @@ ANY_FILE = "a bundle, a recording, a calibration, or a profile (file or shipped 
 VALUE_CHARACTERS = 200
 
 
-# ---- verify ----
-
-
 def _configure_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("paths", nargs="+", metavar="PATH", help=ANY_FILE)
 
@@ -65,9 +62,6 @@ def _verdict_lines(verdict: FileVerdict) -> Iterator[str]:
         yield "          remedy: do not rely on this file; make it again with the present version"
 
 
-# ---- info ----
-
-
 def _configure_info(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", metavar="PATH", help=ANY_FILE)
 
@@ -94,9 +88,6 @@ def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str
             yield name, "SIMULATED"
         elif value is not None and value != "":
             yield name, one_line(value, VALUE_CHARACTERS)
-
-
-# ---- bundle ----
 
 
 def _configure_bundle(parser: argparse.ArgumentParser) -> None:

@@ -142,9 +142,6 @@ def run_once(
             raise
 
 
-# ---- check ----
-
-
 def check_together(options: RunOptions) -> None:
     """Raise UsageError for options that are out of range, or make no sense together."""
     check_options(options)
@@ -219,9 +216,6 @@ def dose_of(options: RunOptions, bundle: Bundle, profile: Profile) -> DoseCap | 
             remedy="pans order BUNDLE --by dose --dose-cap N makes a bundle of as many patterns as stay below; or fewer shots or trials",
         )
     return None
-
-
-# ---- prepare and run ----
 
 
 class _Run:
@@ -399,9 +393,6 @@ def _same_bundle(path: Path, sha256: str) -> bytes:
     return data
 
 
-# ---- open ----
-
-
 def _prepare_and_run(options: RunOptions, profile: Profile, around: _Around) -> Outcome:
     opening = _in_background(lambda: open_link(options.device))
     if around.monitor.url:
@@ -481,9 +472,6 @@ def _monitor_of(options: RunOptions) -> Monitor:
 
     panel = options.display and not state.quiet and sys.stderr.isatty()
     return Monitor(panel=panel, address=options.serve, lines=options.display)
-
-
-# ---- report ----
 
 
 def process_start_ns() -> int:

@@ -36,9 +36,6 @@ FORMATS = (*OF_RECORDINGS, *OF_BUNDLES)
 EITHER = "a recording (file, or folder of its parts), or a bundle"
 
 
-# ---- replay ----
-
-
 def _configure_replay(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("recording", type=Path, help="a recording (.pansrec), or a folder with one in parts")
@@ -115,9 +112,6 @@ REPLAY = Command(
     _replay,
     examples=("pans replay pans-runs/latest/run.pansrec", "pans replay run.pansrec --bundle other.pans"),
 )
-
-
-# ---- export ----
 
 
 def _configure_export(parser: argparse.ArgumentParser) -> None:
@@ -211,9 +205,6 @@ EXPORT = Command(
         "pans export fashion10.pans --format onnx -o head.onnx",
     ),
 )
-
-
-# ---- report and compare ----
 
 
 def _configure_report(parser: argparse.ArgumentParser) -> None:

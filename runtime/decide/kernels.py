@@ -28,9 +28,6 @@ LANES = 16  # hidden widths are padded to it: one vector of float32 or int32 at 
 # decision: `work` (3, widest), whose last row holds the clicks that fired, `rows` int64, and for int8 `hidden` int16.
 
 
-# ------------------------------------------------------------------------------------------------------------ float32 heads
-
-
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _add_rows(weights, width, n_rows, rows, f, out):  # type: ignore[no-untyped-def]
     """out[0, j] += sum over r < n_rows (padded to STEP) of f[r] * row rows[r] of the matrix at the start of weights.
@@ -178,9 +175,6 @@ def float_run(counts, shots, meta, numbers, room, scores, labels, probabilities)
         for k in range(n_classes):
             scores[i, k] = work[last, k]
         labels[i], probabilities[i] = winner(scores, i, n_classes)
-
-
-# --------------------------------------------------------------------------------------------------------------- int8 heads
 
 
 @inner

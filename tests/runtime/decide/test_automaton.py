@@ -107,9 +107,6 @@ def test_below_the_confidence_nothing_is_decided(seed: int) -> None:
         assert exposures[i] == (automaton.depth[sure[0]] if sure else len(states))
 
 
-# ---- exact expectations ----
-
-
 def of_objects(automaton: Automaton, seed: int = 3, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     return rng.random((int(automaton.pattern.max()) + automaton.channels, 6)) * 0.6, rng.random((n, 6))

@@ -124,9 +124,6 @@ def test_golden_means_are_told_as_counts() -> None:
     assert (counts.tolist(), shots.tolist()) == ([[0, 1], [1, 3], [2, 1]], [1, 3, 4])
 
 
-# -- tables of counts ------------------------------------------------------------------------------------------------------
-
-
 def test_a_table_of_counts_is_exactly_the_head() -> None:
     bundle = head_bundle(random_layers([4, 16, 5]))
     decider = count_table(bundle, 3)
@@ -146,9 +143,6 @@ def test_tables_of_counts_stay_small() -> None:
     assert not fits_count_table(4000, 60000)
     with pytest.raises(UsageError, match="rows"):
         count_table(head_bundle(random_layers([13, 4])), 4)
-
-
-# -- int8 ------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.uncompiled("5-sizes1")
