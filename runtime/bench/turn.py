@@ -102,9 +102,8 @@ def frame_row(bundle: Bundle, quick: bool) -> Row:
     frames = list(streams.parallel_visits(plan, n_visits))
     few = frames[: 4 * len(frames) // n_visits]
     core, name = StreamCore(plan, decider, 1, 0, streams.SESSION), f"work per parallel frame, {bundle.name}, K = 1"
-    return _work_row(
-        name, core, frames, n_visits * plan.slots_per_cycle, streams.decided_one_by_one(plan, decider, few)
-    )
+    wanted = streams.decided_one_by_one(plan, decider, few)
+    return _work_row(name, core, frames, n_visits * plan.slots_per_cycle, wanted)
 
 
 def _work_row(name: str, core: StreamCore, frames: list[bytes], n: int, wanted: Rows) -> Row:
@@ -112,9 +111,8 @@ def _work_row(name: str, core: StreamCore, frames: list[bytes], n: int, wanted: 
     reads, found = streams.reads_of(b"".join(frames), READ_BYTES), list[Rows]()
     streams.decided_in_stream(core, reads, found)
     changed = streams.percent_changed([np.concatenate(found)[: len(wanted)]], wanted)
-    return {"name": name, "changed_percent": changed} | per_item_ns(
-        cpu_time(lambda: streams.decided_in_stream(core, reads)), n
-    )
+    spent = cpu_time(lambda: streams.decided_in_stream(core, reads))
+    return {"name": name, "changed_percent": changed} | per_item_ns(spent, n)
 
 
 def flow_row(bundle: Bundle, quick: bool) -> Row:

@@ -26,12 +26,8 @@ from .optics import LIGHT_RANGE, Analyser, check_analyser
 
 _TEXTS = ("profile", "task", "split")
 EXPECTED_RANGES = {
-    "objects": Range(1, 1 << 53, whole=True),
-    "accuracy": Range(0.0, 1.0),
-    "clicks": Range(0.0, 8 * 1024),
-    "photons": Range(0.0, 1e30),
-    "illumination": Range(0.0, 1e30),
-    "exposures": Range(1.0, 1024),
+    **{"objects": Range(1, 1 << 53, whole=True), "accuracy": Range(0.0, 1.0), "clicks": Range(0.0, 8 * 1024)},
+    **{"photons": Range(0.0, 1e30), "illumination": Range(0.0, 1e30), "exposures": Range(1.0, 1024)},
 }
 EXPECTED_KEYS = (*_TEXTS, *EXPECTED_RANGES)
 EXPECTED_TOLERANCE = 1e-6  # of an exact figure, times max(1, |figure|): the sums are float64
@@ -233,10 +229,8 @@ def _check_text(text: Any, what: str) -> None:
 def check_table_shape(shape: Sequence[int], n_features: int, n_classes: int, outcomes: int = 2) -> None:
     most = int(math.log(TABLE_ROWS_MAX, outcomes) + 1e-9)
     demand(n_features <= most, f"a table for {n_features} patterns, allowed at most {most} of {outcomes} readings each")
-    wanted = (outcomes**n_features, n_classes)
-    demand(
-        tuple(shape) == wanted, f"the table has shape {tuple(shape)}, allowed: ({outcomes}**d_f, classes) = {wanted}"
-    )
+    found, wanted = tuple(shape), (outcomes**n_features, n_classes)
+    demand(found == wanted, f"the table has shape {found}, allowed: ({outcomes}**d_f, classes) = {wanted}")
 
 
 def _check_facts(bundle: Bundle) -> None:
@@ -306,9 +300,8 @@ def _check_back_ends(bundle: Bundle) -> None:
     demand(decides, "neither a head nor a table, allowed: either or both")
     for model, what in ((bundle.head_onnx, "head"), (bundle.int8_onnx, "int8 model")):
         if model is not None:
-            demand(
-                0 < len(model) <= HEAD_MAX_BYTES, f"the {what} has {len(model)} bytes, allowed: 1 to {HEAD_MAX_BYTES}"
-            )
+            size = len(model)
+            demand(0 < size <= HEAD_MAX_BYTES, f"the {what} has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
             _check_cost(model, what, bundle)
     if bundle.int8_head is not None:
         _check_int8(bundle.int8_head, bundle.n_features, bundle.n_outputs)
@@ -384,9 +377,8 @@ def _check_golden(bundle: Bundle) -> None:
     means, scores = bundle.golden_means, bundle.golden_scores
     count = means.shape[0]
     demand(1 <= count <= GOLDEN_MAX, f"{count} golden vectors, allowed: 1 to {GOLDEN_MAX}")
-    demand(
-        means.shape == (count, bundle.n_features), f"golden_means has shape {means.shape}, d_f is {bundle.n_features}"
-    )
+    fits = means.shape == (count, bundle.n_features)
+    demand(fits, f"golden_means has shape {means.shape}, d_f is {bundle.n_features}")
     wanted = (count, bundle.n_outputs)
     demand(scores.shape == wanted, f"golden_scores has shape {scores.shape}, allowed: {wanted}")
     for what, array, most in (("means", means, GOLDEN_MEANS_MAX), ("scores", scores, GOLDEN_SCORES_MAX)):

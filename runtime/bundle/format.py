@@ -27,7 +27,6 @@ from .optics import Analyser
 
 MAGIC = b"PANSBNDL"
 VERSION = 1
-VERSIONS = (VERSION,)
 HEADER_MAX_BYTES = MIB
 _PROLOGUE = struct.Struct("<8sII")
 _DIGEST_BYTES = 32
@@ -57,25 +56,14 @@ _REMEDY = "take the file from its source again, or export it again with `pans tr
 def bundle_bytes(bundle: Bundle) -> bytes:
     """Return the file of `bundle`; the same bundle always gives the same bytes. UsageError above 64 MiB."""
     rows, blobs, offset = [], [], 0
-    for name, array in (
-        _fixed_parts(bundle) if bundle.automaton is None else _walk_parts(bundle, bundle.automaton)
-    ).items():
+    parts = _fixed_parts(bundle) if bundle.automaton is None else _walk_parts(bundle, bundle.automaton)
+    for name, array in parts.items():
         dtype, blob = _PARTS[name][0], array.astype(_PARTS[name][0]).tobytes()
         row = {"name": name, "dtype": dtype, "shape": list(array.shape), "offset": offset, "length": len(blob)}
         rows.append(row | {"sha256": hashlib.sha256(blob).hexdigest()})
         blobs.append(blob)
         offset += len(blob)
-    facts = {
-        "name": bundle.name,
-        "task": bundle.task,
-        "encoder": bundle.encoder,
-        "classes": list(bundle.classes),
-        "image_shape": list(bundle.image_shape),
-        "levels": bundle.levels,
-        "photons_per_level": bundle.photons_per_level,
-        "provenance": bundle.provenance,
-        "parts": rows,
-    }
+    facts = {name: getattr(bundle, name) for name in sorted(_KEYS - {"parts"})} | {"parts": rows}
     header = canonical_json(facts | _more_facts(bundle))
     total = _PROLOGUE.size + len(header) + offset + _DIGEST_BYTES
     if len(header) > HEADER_MAX_BYTES or total > FILE_MAX_BYTES:
@@ -208,11 +196,9 @@ def _check_prologue(source: _Source) -> tuple[int, bytes]:
     smallest = _PROLOGUE.size + 2 + _DIGEST_BYTES
     demand(size >= smallest, f"truncated: {size} bytes, a bundle has at least {smallest}")
     _, version, header_length = _PROLOGUE.unpack_from(start)
-    if version not in VERSIONS:
+    if version != VERSION:
         remedy = "install the pans-runtime that wrote it, or export the bundle again with this one"
-        raise DamagedFileError(
-            f"bundle format version {version}, allowed: {', '.join(map(str, VERSIONS))}", remedy=remedy
-        )
+        raise DamagedFileError(f"bundle format version {version}, allowed: {VERSION}", remedy=remedy)
     demand(header_length <= HEADER_MAX_BYTES, f"a header of {header_length} bytes, allowed at most {HEADER_MAX_BYTES}")
     header_end = _PROLOGUE.size + header_length
     demand(header_end + _DIGEST_BYTES <= size, f"truncated: {size} bytes, the header alone needs {header_end}")
@@ -256,9 +242,8 @@ def _read_parts(header: Mapping[str, Any], source: _Source, header_end: int) -> 
     if "automaton" in header:
         needed, more = {_pattern_part(levels if _is_count(levels) else 2), *_OF_AUTOMATON}, set[str]()
     else:
-        optics = (
-            ("matrix_complex" if "matrix_complex" in parts else "matrix") if "sensor" in header else "pattern_levels"
-        )
+        matrix = "matrix_complex" if "matrix_complex" in parts else "matrix"
+        optics = matrix if "sensor" in header else "pattern_levels"
         needed, more = {optics, "golden_means", "golden_scores"}, {*_MODELS, *_INT8, "table"}
     whole = needed <= set(parts) <= needed | more
     demand(whole, f"the parts {_quoted(parts)}, needed: {_quoted(needed)}, allowed besides: {_quoted(more)}")
@@ -330,20 +315,14 @@ def _analyser(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> A
 
 
 def _with_automaton(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]], n_pixels: int) -> dict[str, Any]:
-    automaton, name, expected = (
-        _automaton(header["automaton"], parts),
-        _pattern_part(header["levels"]),
-        header.get("expected"),
-    )
-    demand(
-        ("expected" in header) == isinstance(expected, dict), f"expected is {ascii(expected)[:80]}, allowed: an object"
-    )
+    automaton, name = _automaton(header["automaton"], parts), _pattern_part(header["levels"])
+    expected = header.get("expected")
+    fits = ("expected" in header) == isinstance(expected, dict)
+    demand(fits, f"expected is {ascii(expected)[:80]}, allowed: an object")
     check_pattern_cells(len(parts[name]), n_pixels)
     patterns = parts[name] if name != "pattern_bits" else _unpacked(parts[name], n_pixels, name, np.dtype(np.uint16))
-    demand(
-        patterns.shape[1] == n_pixels,
-        f"{name} has rows of {patterns.shape[1]}, patterns of {n_pixels} pixels need {n_pixels}",
-    )
+    row = patterns.shape[1]
+    demand(row == n_pixels, f"{name} has rows of {row}, patterns of {n_pixels} pixels need {n_pixels}")
     return {
         **{"head_onnx": None, "table": None, "automaton": automaton, "expected": expected},
         "pattern_levels": frozen(patterns.astype(np.uint16, copy=False)),
@@ -360,10 +339,8 @@ def _automaton(facts: Any, parts: Mapping[str, NDArray[Any]]) -> Automaton:
     value = facts.get(key, 1)
     whole = isinstance(value, int) and not isinstance(value, bool) and (key != "channels" or 2 <= value <= CHANNELS_MAX)
     wanted = value if key == "outcomes" else 1 << value if whole else 0
-    demand(
-        columns == wanted and whole,
-        f"automaton.{key or 'channels'} is {ascii(value)[:80]}, successors has {columns} columns",
-    )
+    found = f"automaton.{key or 'channels'} is {ascii(value)[:80]}"
+    demand(columns == wanted and whole, f"{found}, successors has {columns} columns")
     states = (parts["state_pattern"], parts["state_dwell"], facts["dwell_steps"])
     return Automaton(*states, parts["successors"], parts["posteriors"], key == "outcomes")
 

@@ -86,10 +86,8 @@ def _append(layers: list[Layer], node: Node, current: str, tensors: Mapping[str,
     if node.op not in ("Gemm", "MatMul") or node.inputs[0] != current:
         raise ValueError(f"operator {node.op}")
     weights = tensors[node.inputs[1]]
-    plain = {
-        name: node.attributes.get(name, default) for name, default in (("alpha", 1.0), ("beta", 1.0), ("transA", 0))
-    }
-    if plain != {"alpha": 1.0, "beta": 1.0, "transA": 0} or weights.ndim != 2:
+    plain = {"alpha": 1.0, "beta": 1.0, "transA": 0}
+    if plain != {name: node.attributes.get(name, plain[name]) for name in plain} or weights.ndim != 2:
         raise ValueError("a Gemm that scales")
     if node.attributes.get("transB", 0):
         weights = weights.T

@@ -272,10 +272,8 @@ def load_bundle(name_or_path: str | Path) -> tuple[Bundle, str]:
     """
     path = bundle_path(name_or_path)
     if not os.path.lexists(path):
-        shipped = ", ".join(shipped_bundles())
-        raise UsageError(
-            f"{path}: there is no such bundle", remedy=f"name a .pans file, or a shipped bundle: {shipped}"
-        )
+        remedy = f"name a .pans file, or a shipped bundle: {', '.join(shipped_bundles())}"
+        raise UsageError(f"{path}: there is no such bundle", remedy=remedy)
     try:
         with open_regular(path) as file:
             return read_bundle(file, os.fstat(file.fileno()).st_size, str(path))

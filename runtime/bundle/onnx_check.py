@@ -23,9 +23,7 @@ VALUES_MAX = 1 << 22  # of all intermediate results and workspace per decision: 
 VALUE_OPERATIONS = 8  # multiply-adds that take as long as one value of an element-wise operator, such as an exponential
 ROWS = 2_147_483_629  # stands for the number of decisions at once: a prime that no constant has room for
 Dims = tuple[int, ...]
-Tensor = NDArray[
-    Any
-]  # int64: few integers whose values are known; else only the shape counts, and nothing is allocated
+Tensor = NDArray[Any]  # int64: few integers with known values; else only the shape counts, and nothing is allocated
 
 
 class HeadCost(NamedTuple):

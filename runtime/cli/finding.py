@@ -19,7 +19,7 @@ GROUPS = {
     "Run and look": ("demo", "run", "replay", "verify", "info", "report", "compare", "export", "runs", "service"),
     "Instruments": ("profile", "calibrate", "refit", "tune", "simulate", "devices", "doctor"),
     "Train and compare": ("train", "evaluate", "order", "baseline", "reproduce", "sweep", "batch", "data", "bundle"),
-    "Measure and test": ("bench", "conform", "trials", "fuzz"),
+    "Measure and test": ("bench", "conform"),
     "Shell": ("completion",),
 }
 OTHERS = "Others"
@@ -47,9 +47,8 @@ def load_command(point: EntryPoint) -> Command:
 
 def missing_extra(what: str, package: str, extra: str) -> UsageError:
     """Return the error for a package that `what` needs and that is not installed."""
-    return UsageError(
-        f"{what} needs the package {package}, which is not installed", remedy=f"pip install 'pans-runtime[{extra}]'"
-    )
+    remedy = f"pip install 'pans-runtime[{extra}]'"
+    return UsageError(f"{what} needs the package {package}, which is not installed", remedy=remedy)
 
 
 def overview(commands: Mapping[str, EntryPoint]) -> str:

@@ -99,9 +99,8 @@ def refuse_without(options: object, needed: str, defaults: Mapping[str, Any]) ->
     """Refuse options that have no effect without the option `needed`."""
     for name, default in defaults.items():
         if getattr(options, name, default) != default:
-            raise UsageError(
-                f"--{name.replace('_', '-')} has no effect without {needed}", remedy=f"add {needed}, or leave it out"
-            )
+            what = f"--{name.replace('_', '-')} has no effect without {needed}"
+            raise UsageError(what, remedy=f"add {needed}, or leave it out")
 
 
 def words_of(options: object) -> list[str]:

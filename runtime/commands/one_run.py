@@ -150,9 +150,8 @@ def check_together(options: RunOptions) -> None:
         of_flow = {one.name: one.default for one, _ in option_fields(options) if one.metadata["group"] == FLOW}
         refuse_without(options, "--flow", of_flow)
     elif flow_of(options) is not None and (options.decisions or options.trials != 1):
-        raise UsageError(
-            "a flow has as many decisions as objects pass", remedy="--seconds, in place of --decisions and --trials"
-        )
+        remedy = "--seconds, in place of --decisions and --trials"
+        raise UsageError("a flow has as many decisions as objects pass", remedy=remedy)
     if options.calibration is None and options.registration is None:
         refuse_without(options, "--calibration or --registration", {"calibration_max_age_h": MAX_AGE_H})
     if options.keep_mb and not options.rotate_mb:
@@ -248,9 +247,7 @@ class _Run:
         self.dark = DarkRun.of(options, placed)
         n_objects = -(-options.decisions // options.trials)
         self.expected_decisions = n_objects * options.trials
-        self.frames = shots * (
-            1 if flow is None else flow.pool
-        )  # of a decision: shots, times the windows of a flow that are added
+        self.frames = shots if flow is None else shots * flow.pool  # of a decision; a flow adds windows
         self.core: Follower
         self.flow_run: FlowRun | None = None
         if flow is not None:

@@ -17,15 +17,10 @@ DEFAULT_BASE = "oled-qcmos"
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "action", choices=ACTIONS, help="list the shipped ones, show or check profiles, or write a new one"
-    )
-    parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="shipped names or .toml files; of new: the file to write"
-    )
-    parser.add_argument(
-        "--from", dest="base", metavar="NAME", help=f"of new: the profile to begin with (default {DEFAULT_BASE})"
-    )
+    add = parser.add_argument
+    add("action", choices=ACTIONS, help="list the shipped ones, show or check profiles, or write a new one")
+    add("names", nargs="*", metavar="NAME", help="shipped names or .toml files; of new: the file to write")
+    add("--from", dest="base", metavar="NAME", help=f"of new: the profile to begin with (default {DEFAULT_BASE})")
     add_force(parser)
 
 

@@ -172,9 +172,7 @@ def _export_bundle(args: argparse.Namespace) -> int:
     for path, data in files.items():
         write_file(path, data, force=args.force)
     payload = {"format": args.format, "files": [str(path) for path in files], "sha256": digest, **about(bundle)}
-    emit(
-        args, payload, f"{bundle.name}: {len(files)} files in {args.out}" if is_folder else f"{bundle.name}: {args.out}"
-    )
+    emit(args, payload, f"{bundle.name}: {f'{len(files)} files in ' * is_folder}{args.out}")
     return EXIT_FINE
 
 

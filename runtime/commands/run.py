@@ -38,9 +38,8 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
 
 def _configure_demo(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=SEED.option, default=1, help="seed of the simulated detector (default 1)")
-    parser.add_argument(
-        "--pace", default="real", choices=("real", "fast"), help="real time in a process of its own, or virtual"
-    )
+    pace = "real time in a process of its own, or virtual"
+    parser.add_argument("--pace", default="real", choices=("real", "fast"), help=pace)
     add_options(parser, RunOptions, defaults=DEMO_DEFAULTS, omit=NOT_OF_DEMO)
 
 

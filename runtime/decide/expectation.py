@@ -100,9 +100,8 @@ def _check_arguments(automaton: Automaton, patterns: NDArray[Any], transmission:
         raise ValueError(f"a state shows pattern {last} of {len(patterns)}")
     if len(transmission) * automaton.n_leaves > LEAF_NUMBERS_MAX:
         most = LEAF_NUMBERS_MAX // automaton.n_leaves
-        raise ValueError(
-            f"{len(transmission)} objects and {automaton.n_leaves} leaves, allowed: {most} objects at once"
-        )
+        found = f"{len(transmission)} objects and {automaton.n_leaves} leaves"
+        raise ValueError(f"{found}, allowed: {most} objects at once")
 
 
 def _check_law(automaton: Automaton, law: ClickLaw | CountLaw, afterpulses: Afterpulses) -> None:

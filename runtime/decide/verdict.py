@@ -143,16 +143,13 @@ class ScoredDecider:
 
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
         """Return the scores, float32 (n, classes), of click counts, integers (n, d_f)."""
-        exposures = shots * self.largest
-        return self._scores(checked_counts(counts, exposures, self.n_features), exposures).astype(
-            np.float32, copy=False
-        )
+        checked = checked_counts(counts, shots * self.largest, self.n_features)
+        return self._scores(checked, shots * self.largest).astype(np.float32, copy=False)
 
     def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
         """Return the labels, int64 (n,), of click counts, integers (n, d_f)."""
-        return self.verdicts(checked_counts(counts, shots * self.largest, self.n_features), shots).labels.astype(
-            np.int64
-        )
+        checked = checked_counts(counts, shots * self.largest, self.n_features)
+        return self.verdicts(checked, shots).labels.astype(np.int64)
 
     def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
         """Return labels and probabilities of click counts, int64 (n, d_f), that are known to be 0..shots * largest."""
