@@ -1,6 +1,6 @@
 """A headless chromium for tests of pages: widths, light and dark, console errors, axe-core, and the Tab key.
 
-axe-core is the one that axe-core-python (extra `browser`) brings; `AXE_CORE` names another: an archive (axe-core-*.tgz) or an axe.min.js.
+axe-core is the one that axe-core-python (extra `browser`) brings; `AXE_CORE` names another axe.min.js.
 Without both, accessibility is not checked, with a warning.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import os
 import shutil
-import tarfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,16 +20,8 @@ from typing import Any
 import pytest
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
-FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
+FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync")
+FLAGS += ("--disable-background-networking", "--disable-component-update")
 
 
 @contextmanager
@@ -101,18 +92,11 @@ def console(driver: Any) -> list[str]:
 
 def axe_source() -> str | None:
     """Return axe-core's script, None where it is not there."""
-    named = os.environ.get("AXE_CORE")
-    if named is None:
-        if find_spec("axe_core_python") is None:
-            return None
-        return files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
-    place = Path(named)
-    if place.suffix != ".tgz":
-        return place.read_text(encoding="utf-8")
-    with tarfile.open(place) as archive:
-        member = archive.extractfile("package/axe.min.js")
-        assert member is not None
-        return member.read().decode()
+    if named := os.environ.get("AXE_CORE"):
+        return Path(named).read_text(encoding="utf-8")
+    if find_spec("axe_core_python") is None:
+        return None
+    return files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
 
 
 def serious(driver: Any) -> list[str]:

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import re
+from argparse import Namespace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from nasty import NASTY
 from pans.firmware_sim.testing import small_setup
 from pans.runtime import cli, safe_text
 from pans.runtime.errors import UsageError
+from pans.runtime.html_card import html_card
 from pans.runtime.pages.charts import Axis, Chart, Curve, Mark
 from pans.runtime.pages.page import Page, Picture
 from pans.runtime.pages.pixels import png
@@ -24,24 +26,33 @@ from pans.runtime.pages.pixels import png
 nasty = pytest.mark.parametrize("text", NASTY, ids=lambda text: ascii(text)[1:30])
 
 
-def is_inert(line: str, most: int = safe_text.LINE_MAX) -> bool:
-    return line.isprintable() and len(line) <= most
-
-
 @nasty
-def test_one_line(text: str) -> None:
-    shown = safe_text.one_line(text)
-    assert is_inert(shown)
+def test_lines_markdown_cells_and_file_names_are_inert(text: str, tmp_path: Path) -> None:
+    shown, marked = safe_text.one_line(text), safe_text.markdown(text)
+    for line, most in ((shown, safe_text.LINE_MAX), (marked, 2 * safe_text.LINE_MAX + 2)):
+        assert line.isprintable()
+        assert len(line) <= most
     assert shown == text or not text.isprintable() or len(text) > safe_text.LINE_MAX
+    assert not re.search(
+        r"(?<!\\)(?:\\\\)*[|<>`*_\[\]!&#$~]", marked
+    )  # each has an odd number of backslashes before it
+    assert not re.match(r"\s*([-+=]|\d+[.)])(\s|$)", marked)
+    out = io.StringIO()
+    csv.writer(out).writerow([safe_text.csv_cell(text), safe_text.csv_cell(-3), safe_text.csv_cell("-3.5e2"), "end"])
+    cell, *others = next(csv.reader(io.StringIO(out.getvalue())))
+    assert others == ["-3", "-3.5e2", "end"]
+    assert cell.isprintable()
+    assert not cell.lstrip().startswith(("=", "+", "-", "@", "＝"))
+    name = safe_text.file_name(text)
+    assert re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,110}", name)
+    (tmp_path / name).write_text("")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 @nasty
 def test_the_terminal(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    class Args:
-        json = False
-
     cli.say(f"pans: {text}")
-    cli.emit(Args(), {}, f"found {text}")  # type: ignore[arg-type]
+    cli.emit(Namespace(json=False), {}, f"found {text}")
     assert cli.printing.fail(UsageError(f"the device says {text}", remedy=text), 2) == 2
     found = capsys.readouterr()
     for line in (found.out + found.err).split("\n"):
@@ -52,14 +63,9 @@ def test_the_terminal(text: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 @nasty
 def test_json_stays_exact(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    class Args:
-        json = True
-
-    cli.emit(Args(), {"serial": text})  # type: ignore[arg-type]
+    cli.emit(Namespace(json=True), {"serial": text})
     out = capsys.readouterr().out
-    assert json.loads(out) == {"serial": text}
-    assert out.isascii()
-    assert out.count("\n") == 1
+    assert (json.loads(out), out.isascii(), out.count("\n")) == ({"serial": text}, True, 1)
 
 
 class Tags(HTMLParser):
@@ -94,7 +100,7 @@ def tags_of(text: str) -> Tags:
     with page.folded(text):
         page.text(text)
     tags = Tags()
-    tags.feed(page.html().decode())
+    tags.feed(page.html().decode() + html_card(text, {text: text}, [(text, b"png")]))
     return tags
 
 
@@ -103,32 +109,6 @@ def test_html(text: str) -> None:
     found, plain = tags_of(text or "x"), tags_of("plain")
     assert found.found == plain.found
     assert found.text.replace("\n", "").isprintable()
-
-
-@nasty
-def test_markdown(text: str) -> None:
-    shown = safe_text.markdown(text)
-    assert is_inert(shown, 2 * safe_text.LINE_MAX + 2)
-    assert not re.search(r"(?<!\\)(?:\\\\)*[|<>`*_\[\]!&#$~]", shown)  # each has an odd number of backslashes before it
-    assert not re.match(r"\s*([-+=]|\d+[.)])(\s|$)", shown)
-
-
-@nasty
-def test_csv(text: str) -> None:
-    out = io.StringIO()
-    csv.writer(out).writerow([safe_text.csv_cell(text), safe_text.csv_cell(-3), safe_text.csv_cell("-3.5e2"), "end"])
-    row = next(csv.reader(io.StringIO(out.getvalue())))
-    assert row[1:] == ["-3", "-3.5e2", "end"]
-    assert row[0].isprintable()
-    assert not row[0].lstrip().startswith(("=", "+", "-", "@", "＝"))
-
-
-@nasty
-def test_file_names(text: str, tmp_path: Path) -> None:
-    name = safe_text.file_name(text)
-    assert re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,110}", name)
-    (tmp_path / name).write_text("")
-    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 @nasty
@@ -144,11 +124,9 @@ def test_the_summary_page_of_a_run(text: str, tmp_path: Path) -> None:
         test_the_summary_page_of_a_run.done = done.summary  # type: ignore[attr-defined]
     summary = replace(test_the_summary_page_of_a_run.done, faults=[text], ended=text)  # type: ignore[attr-defined]
     facts = {"bundle": text, "device": text, "command": text}
-    plain, found = tmp_path / "plain.md", tmp_path / "summary.md"
-    write_markdown(
-        plain, replace(summary, faults=["x"], ended="x"), dict.fromkeys(facts, "x"), np.eye(2, dtype=np.int64), "ab"
-    )
-    write_markdown(found, summary, facts, np.eye(2, dtype=np.int64), [text, "b"])
+    plain, found, confusion = tmp_path / "plain.md", tmp_path / "summary.md", np.eye(2, dtype=np.int64)
+    write_markdown(plain, replace(summary, faults=["x"], ended="x"), dict.fromkeys(facts, "x"), confusion, "ab")
+    write_markdown(found, summary, facts, confusion, [text, "b"])
     assert found.read_text().count("\n") == plain.read_text().count("\n")
     assert all(line.isprintable() for line in found.read_text().split("\n"))
     words = closing_words(summary, text, text)
