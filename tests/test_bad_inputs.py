@@ -26,6 +26,7 @@ from pans.runtime.cli.finding import find_commands, load_command
 from pans.runtime.errors import UsageError
 
 LIMIT_S = 60  # only against waiting for ever: a busy machine may take its time
+SLOW = ("torch", "optuna", "pans.trainer.train.loop")  # loaded before the limit counts, where they are installed
 FAST = "sim:oled-qcmos?pace=fast"
 GOOD = {  # a command line of each command that would work, with its required arguments
     "demo": "--pace fast --seconds 0.01 --out new", "run": f"b.pans --device {FAST} --decisions 1 --out new",
@@ -41,7 +42,7 @@ GOOD = {  # a command line of each command that would work, with its required ar
 NUMBERS = ("nan", "inf", "-inf", "1e999", "9" * 40, "", "three", "0x10", "1,5", "-1")
 MAY_BE_NEGATIVE = {"--offset", "--drift-ppm", "--seed", "--rows", "--seeds"}
 NO_FILES = ("folder.{}", "fifo.{}", "broken.{}", "loop.{}", "x" * 300, "nul\0.{}", "", "b.pans/x.{}")
-INPUTS = ("missing.{}", "empty.{}", "noise.{}", "latin.{}", "half.{}", "other", "/dev/zero", *NO_FILES)
+INPUTS = ("missing.{}", "empty.{}", "noise.{}", "latin.{}", "/dev/zero", *NO_FILES)
 OUTPUTS = ("there.{}", "no/such/new.{}", "/proc/new.{}", "b.pans", *NO_FILES)
 KINDS = {"pans": "b.pans", "pansrec": "r.pansrec", "npz": "s.npz", "toml": "f.toml", "json": "c.json", "npy": "p.npy"}
 READS = {  # the kind of file that an argument names; numbers and choices are known by their type
@@ -49,14 +50,8 @@ READS = {  # the kind of file that an argument names; numbers and choices are kn
     "--act-profile": "toml", "--flow": "toml", "--calibration": "json", "--truth": "npz", "--inputs": "npz", "--task": "npz",
     "task": "npz", "--scene": "npz", "--optics": "pans", "--patterns": "npy", "--table": "npy", "--head": "onnx", "--faults": "toml",
 }  # fmt: skip
-WRITES = {
-    "--out": "txt",
-    "--record": "pansrec",
-    "--trace": "txt",
-    "--state": "json",
-    "--pictures": "npz",
-    "--storage": "log",
-}
+WRITES = {"--out": "txt", "--record": "pansrec", "--trace": "txt", "--state": "json", "--pictures": "npz"}
+WRITES |= {"--storage": "log"}
 SUFFIXES = {"report": "html", "bundle": "pans", "calibrate": "json", "train": "pans", "data": "npz"}
 FOLDERS = {("demo", "--out"), ("run", "--out"), ("export", "--out"), ("reproduce", "--out"), ("service", "--out")}
 FOLDERS |= {("evaluate", "--pictures")}
@@ -129,8 +124,7 @@ def faults_of(name: str) -> list[list[list[str]]]:
             values = [value for value in NUMBERS[: -1 if flag in MAY_BE_NEGATIVE else None] if value not in right]
         elif key in READS and (name, flag) != ("bundle", "--task"):
             kind, other = READS[key], "s.npz" if READS[key] == "pans" else "b.pans"
-            left_out = {"other", "half.{}", *({""} if flag in ("--task", "--profile") else ())}  # "": the usual one
-            values = [value.format(kind) for value in INPUTS if value not in left_out]
+            values = [value.format(kind) for value in INPUTS if value or flag not in ("--task", "--profile")]
             values += [other, f"half.{kind}"] if kind in KINDS else [other]
         elif key in WRITES:
             made = {"folder.{}", "", "no/such/new.{}"} if (name, key) in FOLDERS else set[str]()
@@ -149,11 +143,7 @@ def faults_of(name: str) -> list[list[list[str]]]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The good files and the bad ones of every kind."""
-    for slow in (
-        "torch",
-        "optuna",
-        "pans.trainer.train.loop",
-    ):  # loaded before the limit counts, where they are installed
+    for slow in SLOW:
         with contextlib.suppress(ModuleNotFoundError):
             import_module(slow)
     folder, bundle = tmp_path_factory.mktemp("bad"), SHIPPED / "fashion10.pans"
@@ -163,12 +153,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.save(folder / "t.npy", np.zeros((4, 2)))
     images, labels = np.random.default_rng(0).integers(0, 255, (200, 28, 28)).astype(np.uint8), np.arange(200) % 10
     named = ["T-shirt/top", "Trouser", "Pullover", "Dress", "Coat", "Sandal", "Shirt", "Sneaker", "Bag", "Ankle boot"]
-    for name, part, classes in (
-        ("s", images, named),
-        ("small", images[:, :14, :14], named),
-        ("letters", images, [*"abcdefghij"]),
-    ):
-        np.savez(folder / f"{name}.npz", images=part, labels=labels, classes=np.array(classes))
+    np.savez(folder / "s.npz", images=images, labels=labels, classes=np.array(named))
+    np.savez(folder / "small.npz", images=images[:, :14, :14], labels=labels, classes=np.array(named))
+    np.savez(folder / "letters.npz", images=images, labels=labels, classes=np.array([*"abcdefghij"]))
     (folder / "f.toml").write_text("kind = 1\n")
     (folder / "c.json").write_text("{}\n")
     for suffix in (*KINDS, "onnx", "txt", "html", "log"):
@@ -188,10 +175,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def contents(folder: Path) -> dict[str, tuple[int, ...]]:
     """What tells whether anything has changed."""
-    facts = {path: path.lstat() for path in folder.rglob("*")}
-    return {
-        str(path): (one.st_ino, one.st_size, 0 if path.is_dir() else one.st_mtime_ns) for path, one in facts.items()
-    }
+    facts = [(path, path.lstat()) for path in folder.rglob("*")]
+    return {str(path): (one.st_ino, one.st_size, one.st_mtime_ns * path.is_file()) for path, one in facts}
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,12 @@ import gc
 import os
 import shlex
 import sys
+import threading
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint
+from typing import Any
 
 from pans.runtime import __version__
 from pans.runtime.errors import PansError, UsageError
@@ -19,8 +21,7 @@ from pans.runtime.logs import LOGGER, logging_of
 
 from .command import EXIT_FINE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_USAGE, Command, did_you_mean, parser_of
 from .finding import EXTRAS, find_commands, load_command, missing_extra, overview
-from .first_sign import first_sign
-from .printing import begin, fail, note, state
+from .printing import begin, fail, note, say, state
 from .reading_bar import reading_bar
 
 _REMEDIES = {
@@ -31,6 +32,11 @@ _REMEDIES = {
     errno.ENOENT: "check the path",
     errno.EMFILE: "raise the limit of open files: ulimit -n 4096",
 }
+FIRST_AFTER_S = 0.35
+LOOK_EVERY_S = 0.05
+LOOK_FOR_S = 60.0  # a command that has not loaded numba by then does not wait for it
+COMPILING = "compiling kernels: once per machine, about 15 s"
+_listening: list[Any] = []  # numba keeps listeners for good: one per process
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -83,7 +89,7 @@ def _run(words: list[str]) -> int:
         return _top_level(words, wanted, commands)
     rest = list(words)
     rest.remove(wanted)
-    with first_sign(f"pans {wanted}: loading ..."):
+    with _first_sign(f"pans {wanted}: loading ..."):
         command = load_command(commands[wanted])
         if not gc.isenabled():
             gc.freeze()
@@ -167,3 +173,47 @@ def _silence() -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.close(nowhere)
+
+
+@contextmanager
+def _first_sign(text: str) -> Iterator[None]:
+    """Print `text` unless something else is printed soon; say so when kernels are compiled within the block."""
+    ended = threading.Event()
+    threading.Thread(target=_look, args=(text, ended), name="pans-first-sign", daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
+
+
+def _look(text: str, ended: threading.Event) -> None:
+    said, looked_s = False, 0.0
+    while not (said and _listening) and looked_s < LOOK_FOR_S and not ended.wait(LOOK_EVERY_S):
+        looked_s += LOOK_EVERY_S
+        if not said and (state.said or looked_s >= FIRST_AFTER_S):
+            if not state.said:
+                say(text)
+            said = True
+        if not _listening and "numba.core.dispatcher" in sys.modules:
+            _listen()
+
+
+def _listen() -> None:
+    from numba.core import event
+
+    class Listener(event.Listener):  # type: ignore[misc]
+        """Reports the first compilation only; kernels in the cache make no event."""
+
+        said = False
+
+        def on_start(self, event: Any) -> None:
+            if not self.said:
+                self.said = True
+                say(COMPILING)
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with suppress(AttributeError, ImportError):  # another numba: it compiles without being announced
+        _listening.append(Listener())
+        event.register("numba:compile", _listening[-1])
