@@ -39,7 +39,7 @@ _ROW_BITS, _VERDICT_BITS = (
     for dtype in (DECISION_DTYPE, VERDICT_DTYPE)
 )
 _HEAD = struct.Struct("<III")  # runs, verdicts, decisions
-_FIRST_SLOTS, _SLOTS = 1 << 13, 1 << 19  # see log_kernels.SLOTS_PER_VERDICT
+_SLOTS = 1 << 17  # of the kernel's table of verdicts: two for each
 
 
 class _Parts(NamedTuple):
@@ -60,7 +60,6 @@ class LogEncoder:
         self._encode = kernels.encode_rows
         self._hash = _LogHash()
         self._state = np.zeros(kernels.N_STATE, np.uint64)
-        self._state[kernels.SLOT_MASK] = _FIRST_SLOTS - 1
         self._keys = np.full((LONG_VERDICT, 3), 0, np.uint64)
         self._slots = np.full(_SLOTS, LONG_VERDICT, np.uint16)
         self._runs: NDArray[np.void] = np.full(BLOCK_ROWS, 0, RUN_DTYPE)

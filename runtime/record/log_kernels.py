@@ -9,14 +9,14 @@ from pans.runtime.wire.inner import inner, outer
 
 from .format import LONG_VERDICT, MESSAGE, RUN_ROWS_MAX
 
-# state, uint64 (N_STATE,): the run that is open, as its next row would have to be, the verdicts known so far, and of the block under way
-# its runs and the rows of the last of them. A run of one has no steps yet: they are 0, and its next row is compared with it
-RUN_ROWS, NEXT_INDEX, NEXT_TICK, NEXT_EXPOSURE, NEXT_SHOT, OBJECT, TRUTH = range(7)
-TICK_STEP, EXPOSURE_STEP, SHOT_STEP, N_VERDICTS, SLOT_MASK, N_RUNS, PART, N_STATE = range(7, 15)
+# state, uint64 (N_STATE,): how many rows the open run has, its last row (the index: of the next one), its steps, and how many verdicts are
+# known
+RUN_ROWS, INDEX, TICK, EXPOSURE, SHOT, OBJECT, TRUTH, TICK_STEP, EXPOSURE_STEP, SHOT_STEP, N_VERDICTS, N_STATE = range(
+    12
+)
 
 _MESSAGE_HEAD = MESSAGE.size
 _U = np.uint64
-SLOTS_PER_VERDICT = _U(8)  # at least, so that a look-up hardly ever meets another verdict on its way
 _ZERO, _ONE, _U32, _HALF_LEFT, _TRUTH_MASK = _U(0), _U(1), _U(1 << 32), _U(32), _U(0xFFFF)
 _LONG, _RUN_MAX = _U(LONG_VERDICT), _U(RUN_ROWS_MAX)
 _MIX, _FOLD = _U(0x9E3779B97F4A7C15), _U(40)  # 2^64 over the golden ratio: spreads keys over slots
@@ -26,85 +26,54 @@ _MIX, _FOLD = _U(0x9E3779B97F4A7C15), _U(40)  # 2^64 over the golden ratio: spre
 def encode_rows(rows, state, keys, slots, runs, verdicts, lengths, codes):  # type: ignore[no-untyped-def]
     """Encode rows, DECISION_DTYPE (n,), behind those before; return how many runs and how many verdicts were written.
 
-    state uint64 (N_STATE,), keys uint64 (LONG_VERDICT, 3) and slots uint16 (LONG_VERDICT: free) are the known verdicts;
-    runs RUN_DTYPE, verdicts VERDICT_DTYPE with `lengths` uint32 of walks, and codes uint16 have room for n.
+    state uint64 (N_STATE,), keys uint64 (LONG_VERDICT, 3) and slots uint16 (LONG_VERDICT: free), a power of 2 of them, are the known
+    verdicts; runs RUN_DTYPE, verdicts VERDICT_DTYPE with `lengths` uint32 of walks, and codes uint16 have room for n.
     """
     return _find_runs(rows, state, runs), _find_codes(rows, state, keys, slots, verdicts, lengths, codes)
 
 
 @inner
 def _find_runs(rows, state, runs):  # type: ignore[no-untyped-def]
-    """Tell the runs that rows are made of; return how many were written."""
+    """Find the runs that rows are made of; return how many were written."""
     # Columns are taken out of the rows once: a row at a time would count references for each.
     indices, ticks, exposures, objects = rows["index"], rows["tick"], rows["exposure_index"], rows["object"]
     shots, truths = rows["shot"], rows["truth"]
-    state[N_RUNS], state[PART] = _ZERO, _ZERO
-    i, n = _ZERO, _U(rows.size)
-    while i < n:
-        if state[RUN_ROWS] > _ONE:  # in the middle of a run, up to the first row that does not go on with it
-            index, tick, exposure, shot = state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT]
-            tick_step, exposure_step, shot_step = state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP]
-            truth, number, first = state[TRUTH], state[OBJECT], i
-            stop = min(n, i + (_RUN_MAX - state[RUN_ROWS]))
-            while i < stop:
-                apart = (_U(indices[i]) ^ index) | (_U(ticks[i]) ^ tick) | (_U(exposures[i]) ^ exposure)
-                apart |= (_U(shots[i]) ^ shot) | (_U(objects[i]) ^ number) | ((_U(truths[i]) & _TRUTH_MASK) ^ truth)
-                if apart:
-                    break
-                index, tick, exposure, shot = index + _ONE, tick + tick_step, exposure + exposure_step, shot + shot_step
-                i += _ONE
-            if i > first:
-                _go_on(i - first, state, runs)
-            if i == n:
-                break
-        truth = _U(truths[i]) & _TRUTH_MASK
-        _add_row(_U(indices[i]), _U(ticks[i]), _U(exposures[i]), _U(shots[i]), _U(objects[i]), truth, state, runs)
-        i += _ONE
-    return _close(state, runs)
+    n, part = 0, _ZERO  # runs, and the rows of the last of them, in this block
+    for i in range(rows.size):
+        tick, exposure, shot = _U(ticks[i]), _U(exposures[i]), _U(shots[i])
+        truth, number = _U(truths[i]) & _TRUTH_MASK, _U(objects[i])
+        fits = state[RUN_ROWS] > _ZERO and _U(indices[i]) == state[INDEX]
+        fits = fits and number == state[OBJECT] and truth == state[TRUTH]
+        by, by_exposures, by_shots = tick - state[TICK], exposure - state[EXPOSURE], shot - state[SHOT]
+        if fits and state[RUN_ROWS] == _ONE:  # the second one sets the steps
+            fits = by < _U32 and by_exposures < _U32 and by_shots < _U32
+            if fits:
+                state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = by, by_exposures, by_shots
+        elif fits:
+            fits = by == state[TICK_STEP] and by_exposures == state[EXPOSURE_STEP] and by_shots == state[SHOT_STEP]
+            fits = fits and state[RUN_ROWS] < _RUN_MAX
+        if not fits or part == _ZERO:
+            _close(n, part, state, runs)
+            run = runs[n]
+            run["index"], run["tick"], run["exposure_index"] = indices[i], tick, exposure
+            run["object"], run["shot"], run["truth"], run["continues"] = number, shot, truth, fits
+            n, part = n + 1, _ZERO
+        if not fits:
+            state[RUN_ROWS], state[OBJECT], state[TRUTH] = _ZERO, number, truth
+            state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = _ZERO, _ZERO, _ZERO
+        state[RUN_ROWS], part = state[RUN_ROWS] + _ONE, part + _ONE
+        state[INDEX], state[TICK], state[EXPOSURE], state[SHOT] = _U(indices[i]) + _ONE, tick, exposure, shot
+    _close(n, part, state, runs)
+    return n
 
 
 @inner
-def _add_row(index, tick, exposure, shot, number, truth, state, runs):  # type: ignore[no-untyped-def]
-    """Add one decision: as the second of the open run, whose steps it then says, else as the first of a run of its own."""
-    by = tick - state[NEXT_TICK], exposure - state[NEXT_EXPOSURE], shot - state[NEXT_SHOT]
-    fits = state[RUN_ROWS] == _ONE and index == state[NEXT_INDEX] and number == state[OBJECT] and truth == state[TRUTH]
-    if fits and by[0] < _U32 and by[1] < _U32 and by[2] < _U32:
-        state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = by
-    else:
-        _close(state, runs)
-        state[RUN_ROWS], state[PART], state[OBJECT], state[TRUTH] = _ZERO, _ZERO, number, truth
-        state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = _ZERO, _ZERO, _ZERO  # a single one has none
-    state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = index, tick, exposure, shot
-    _go_on(_ONE, state, runs)
-
-
-@inner
-def _go_on(count, state, runs):  # type: ignore[no-untyped-def]
-    """Count `count` decisions more into the open run, which the next of them fits: it is opened in this block, where it is not yet."""
-    if state[PART] == _ZERO:
-        run = runs[state[N_RUNS]]
-        run["index"], run["tick"], run["exposure_index"] = state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE]
-        run["object"], run["shot"], run["truth"] = state[OBJECT], state[NEXT_SHOT], state[TRUTH]
-        run["continues"] = state[RUN_ROWS] != _ZERO
-        state[N_RUNS] += _ONE
-    state[RUN_ROWS], state[PART], state[NEXT_INDEX] = (
-        state[RUN_ROWS] + count,
-        state[PART] + count,
-        state[NEXT_INDEX] + count,
-    )
-    state[NEXT_TICK] += count * state[TICK_STEP]
-    state[NEXT_EXPOSURE] += count * state[EXPOSURE_STEP]
-    state[NEXT_SHOT] += count * state[SHOT_STEP]
-
-
-@inner
-def _close(state, runs):  # type: ignore[no-untyped-def]
-    """Say how many decisions of this block the last run has, and their steps; return how many runs there are."""
-    if state[PART]:
-        run = runs[state[N_RUNS] - _ONE]
-        run["count"], run["tick_step"] = state[PART], state[TICK_STEP]
+def _close(n, part, state, runs):  # type: ignore[no-untyped-def]
+    """Say how many rows of this block the last of `n` runs has, and their steps."""
+    if n:
+        run = runs[n - 1]
+        run["count"], run["tick_step"] = part, state[TICK_STEP]
         run["exposure_step"], run["shot_step"] = state[EXPOSURE_STEP], state[SHOT_STEP]
-    return np.int64(state[N_RUNS])
 
 
 @inner
@@ -112,78 +81,27 @@ def _find_codes(rows, state, keys, slots, verdicts, lengths, codes):  # type: ig
     """Give each row the number of its verdict; return how many verdicts were written, which no row had before."""
     labels, flags, clicks, walked = rows["label"], rows["flags"], rows["clicks"], rows["exposures"]
     probabilities, checksums = rows["probability_bits"], rows["counts_crc"]
-    mask, n_new = state[SLOT_MASK], 0
-    for i in range(_U(rows.size)):
-        key = _key_of(clicks[i], labels[i], probabilities[i], flags[i], walked[i], checksums[i])
-        at, known = _look_for(key, mask, keys, slots)
+    mask, n_new = _U(slots.size - 1), 0
+    for i in range(rows.size):
+        first, second = _U(clicks[i]) << _HALF_LEFT | _U(labels[i]), _U(probabilities[i]) << _HALF_LEFT | _U(flags[i])
+        third = _U(walked[i]) << _HALF_LEFT | _U(checksums[i])
+        at = ((first ^ (second * _MIX) ^ (third << _U(13))) * _MIX) >> _FOLD & mask
+        known = _U(slots[at])
+        while known != _LONG and (keys[known, 2] ^ third) | (keys[known, 1] ^ second) | (keys[known, 0] ^ first):
+            at = (at + _ONE) & mask
+            known = _U(slots[at])
         if known == _LONG:
-            known = _learn(key, at, state, keys, slots)
-            mask = state[SLOT_MASK]
-            _keep(rows[i], verdicts[n_new])
+            known = state[N_VERDICTS]
+            if known < _LONG:  # there is room for one more number
+                keys[known, 0], keys[known, 1], keys[known, 2] = first, second, third
+                slots[at], state[N_VERDICTS] = known, known + _ONE
+            verdict = verdicts[n_new]
+            verdict["clicks"], verdict["label"], verdict["flags"] = clicks[i], labels[i], flags[i]
+            verdict["probability_bits"], verdict["counts_crc"] = probabilities[i], checksums[i]
             lengths[n_new] = walked[i]
             n_new += 1
         codes[i] = known
     return n_new
-
-
-@inner
-def _key_of(clicks, label, probability_bits, flags, walked, checksum):  # type: ignore[no-untyped-def]
-    """A verdict as three numbers."""
-    first, second = _U(clicks) << _HALF_LEFT | _U(label), _U(probability_bits) << _HALF_LEFT | _U(flags)
-    return first, second, _U(walked) << _HALF_LEFT | _U(checksum)
-
-
-@inner
-def _look_for(key, mask, keys, slots):  # type: ignore[no-untyped-def]
-    """The slot of a verdict, and its number: LONG_VERDICT where it has none yet."""
-    first, second, third = key
-    at = _slot_of(first, second, third) & mask
-    known = _U(slots[at])
-    while known != _LONG and (keys[known, 2] ^ third) | (keys[known, 1] ^ second) | (keys[known, 0] ^ first):
-        at = (at + _ONE) & mask
-        known = _U(slots[at])
-    return at, known
-
-
-@inner
-def _learn(key, at, state, keys, slots):  # type: ignore[no-untyped-def]
-    """Give the verdict that belongs to slot `at` the next number, while there is room, and return it: LONG_VERDICT afterwards."""
-    number = state[N_VERDICTS]
-    if number < _LONG:
-        keys[number, 0], keys[number, 1], keys[number, 2] = key
-        slots[at] = number
-        state[N_VERDICTS] = number + _ONE
-        if SLOTS_PER_VERDICT * state[N_VERDICTS] > state[SLOT_MASK] + _ONE:
-            state[SLOT_MASK] = _widen(state[N_VERDICTS], state[SLOT_MASK], keys, slots)
-    return number
-
-
-@inner
-def _slot_of(first, second, third):  # type: ignore[no-untyped-def]
-    return ((first ^ (second * _MIX) ^ (third << _U(13))) * _MIX) >> _FOLD
-
-
-@inner
-def _widen(n_known, mask, keys, slots):  # type: ignore[no-untyped-def]
-    """Twice as many slots, whose mask is returned: few verdicts stay close together, where the cache has them."""
-    mask = _U(2) * mask + _ONE
-    for at in range(mask + _ONE):
-        slots[at] = _LONG
-    for number in range(n_known):
-        at = _slot_of(keys[number, 0], keys[number, 1], keys[number, 2]) & mask
-        while slots[at] != _LONG:
-            at = (at + _ONE) & mask
-        slots[at] = number
-    return mask
-
-
-@inner
-def _keep(row, verdict):  # type: ignore[no-untyped-def]
-    verdict["clicks"] = row["clicks"]
-    verdict["label"] = row["label"]
-    verdict["flags"] = row["flags"]
-    verdict["probability_bits"] = row["probability_bits"]
-    verdict["counts_crc"] = row["counts_crc"]
 
 
 @outer
