@@ -1,112 +1,87 @@
-"""Recordings in parts: whole runs in virtual time, each part replayed and verified by itself, the chain, the cap, the disk."""
+"""Recordings in parts: each part replayed and verified by itself, the chain, the cap, the disk, and all parts as one recording."""
 
 from __future__ import annotations
 
 import errno
 import shutil
+from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from commands import json_of
+from small_runs import Disk, fails, record_small
 
-from pans.firmware_sim.ports.serve import open_sim
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.cli import main
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
+from pans.runtime.container import open_regular
 from pans.runtime.errors import DamagedFileError, RecordingError, UsageError
-from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
-from pans.runtime.record import PartLimits, Recorder, read_recording
-from pans.runtime.record.parts import chain_violations, first_decision, part_of, part_path, parts_in
+from pans.runtime.live import LiveRun
+from pans.runtime.pages import page_of
+from pans.runtime.record import PartLimits, Recorder, read_recording, recording
+from pans.runtime.record.exposures import click_list
+from pans.runtime.record.parts import (
+    JoinedRecording,
+    chain_violations,
+    first_decision,
+    open_recording,
+    part_of,
+    part_path,
+    parts_in,
+)
 from pans.runtime.record.replaying import replay
+from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.verify import verify_parts
 
 KIB = 1024
-
-
-def record(
-    folder: Path, limits: PartLimits, *, faults: str = "", cycles: int = 3000, prepared: Any = None
-) -> RunResult:
-    """Run in virtual time into parts below `folder`; wait for each part's making, so that virtual time cannot outrun the disk."""
-    profile, bundle, plan = small_setup("sequential")
-    url = f"sim:ideal?scene=uniform&pace=fast&seed=4&faults={faults}"
-    link = open_sim(url)
-    header = {"config": {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": "table"}, "simulated": True}
-    header["profile"] = {"name": profile.name, "sha256": profile.sha256, "toml": profile.text}
-    core = Core(plan, make_decider(bundle, backend="table"), 1, cycles)
-    config = RunOptions(n_cycles=cycles, deadline_us=1e9, realtime=False)
-    folder.mkdir(exist_ok=True)
-    with Recorder(folder / "run.pansrec", header, bundle=bundle_bytes(bundle), limits=limits) as recorder:
-
-        def wait(run: LiveRun, output: Any) -> None:
-            if recorder.open_file.size_bytes >= limits.rotate_bytes:
-                recorder._next.result(timeout=20)
-
-        observers, recovery = Observers(wait, prepared), Recovery.of(link, url, 10.0)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("pans.runtime.live.run.FLUSH_EVERY_NS", 20_000_000)  # small parts need small blocks
-            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
-        result.decisions_sha256 = recorder.close({"decisions": result.tally.decisions})
-    return result
+SMALL = PartLimits(48 * KIB)
 
 
 @pytest.fixture(scope="module")
-def parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("parts")
-    record(folder, PartLimits(48 * KIB))
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same run in parts, `parts`, and in one file, `one`."""
+    folder = tmp_path_factory.mktemp("runs")
+    record_small(folder / "parts/run.pansrec", 3000, limits=SMALL)
+    record_small(folder / "one/run.pansrec", 3000)
     return folder
 
 
+@pytest.fixture
+def parts(runs: Path) -> Path:
+    return runs / "parts"
+
+
+def check_each(folder: Path) -> list[int]:
+    """Replay and verify each part by itself; return the numbers of all decisions."""
+    numbers: list[int] = []
+    for path in parts_in(folder):
+        found = read_recording(path)
+        assert replay(found, found.bundle())[:2] == (found.n_decisions, found.decisions_sha256), path
+        assert first_decision(found) == (found.decisions()["index"][0] if found.n_decisions else len(numbers))
+        numbers += found.decisions()["index"].tolist()
+    assert all(verdict.ok for verdict in verify_parts(folder)), verify_parts(folder)
+    return numbers
+
+
 def test_every_part_replays_and_verifies_by_itself(parts: Path) -> None:
-    paths = parts_in(parts)
-    assert len(paths) > 2
-    numbers = []
-    for path in paths:
-        recording = read_recording(path)
-        assert recording.complete
-        count, sha256 = replay(recording, recording.bundle())[:2]
-        assert (count, sha256) == (recording.n_decisions, recording.decisions_sha256)
-        assert count > (0 if path == paths[-1] else 50)
-        assert recording.decisions()["index"][0] == first_decision(recording)
-        numbers += recording.decisions()["index"].tolist()
-        assert len(recording.clock_samples())
+    numbers, found = check_each(parts), [read_recording(path) for path in parts_in(parts)]
+    assert len(found) > 2
     assert numbers == list(range(len(numbers)))
-    assert all(verdict.ok for verdict in verify_parts(parts)), verify_parts(parts)
+    assert all(part.complete and len(part.clock_samples()) for part in found)
+    assert all(part.n_decisions > 50 for part in found[:-1])
     assert not list(parts.glob(".*"))
-
-
-def test_parts_hold_what_one_recording_would(parts: Path, tmp_path: Path) -> None:
-    record(tmp_path, PartLimits(1 << 30))
-    (whole,) = parts_in(tmp_path)
-    pieces = np.concatenate([read_recording(path).decisions() for path in parts_in(parts)])
-    np.testing.assert_array_equal(read_recording(whole).decisions(), pieces)
-
-
-def test_the_commands_take_a_folder(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert json_of(capsys, "verify", parts)["ok"]
-    payload = json_of(capsys, "replay", parts)
-    assert payload["identical"]
-    assert len(payload["parts"]) == len(parts_in(parts))
-    assert main(["verify", str(parts.parent), "--json"]) in (0, 2)
 
 
 @pytest.mark.parametrize("faults", ["loss:0.01,duplicate:0.01,flip:0.01", "stall:300ms/700ms,disconnect:100ms/900ms"])
 def test_parts_replay_under_faults(tmp_path: Path, faults: str) -> None:
-    result = record(tmp_path, PartLimits(48 * KIB), faults=faults)
-    paths = parts_in(tmp_path)
-    assert len(paths) > 2
-    for path in paths:
-        recording = read_recording(path)
-        assert replay(recording, recording.bundle())[:2] == (recording.n_decisions, recording.decisions_sha256), path
-    assert all(verdict.ok for verdict in verify_parts(tmp_path)), verify_parts(tmp_path)
-    assert sum(read_recording(path).n_decisions for path in paths) == result.tally.decisions
+    result = record_small(tmp_path / "run.pansrec", 3000, limits=SMALL, faults=faults)
+    assert len(parts_in(tmp_path)) > 2
+    assert len(check_each(tmp_path)) == result.tally.decisions
 
 
 def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> None:
-    result = record(tmp_path, PartLimits(48 * KIB, 192 * KIB))
+    result = record_small(tmp_path / "run.pansrec", 3000, limits=PartLimits(48 * KIB, 192 * KIB))
     paths = parts_in(tmp_path)
     first, last = part_of(read_recording(paths[0])), part_of(read_recording(paths[-1]))
     assert first is not None
@@ -114,41 +89,31 @@ def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> No
     assert first["number"] > 1
     assert sum(path.stat().st_size for path in paths) <= 192 * KIB + 48 * KIB
     assert last["deleted"]["parts"] + len(paths) == last["number"]
-    kept = sum(read_recording(path).n_decisions for path in paths)
+    kept = len(check_each(tmp_path))
     assert last["deleted"]["decisions"] == first["first_decision"] == result.tally.decisions - kept
-    assert all(verdict.ok for verdict in verify_parts(tmp_path)), verify_parts(tmp_path)
     assert "part_deleted" in {event["kind"] for event in result.events}
     paths[0].unlink()
     assert f"{paths[0].name} is missing" in " ".join(verify_parts(tmp_path)[-1].violations)
 
 
-def test_a_hole_and_a_strange_part_are_found(parts: Path, tmp_path: Path) -> None:
-    paths = parts_in(parts)
-    recordings = [read_recording(path) for path in paths]
-    assert chain_violations(recordings) == []
-    assert "one is missing between" in chain_violations([recordings[0], recordings[2]])[0]
-    record(tmp_path, PartLimits(48 * KIB), cycles=1500)
-    others = [read_recording(path) for path in parts_in(tmp_path)]
-    text = " ".join(chain_violations([recordings[0], others[1]]))
-    assert "parts of 2 runs" in text
-
-
 def test_a_part_that_is_missing_is_found_wherever_it_was(parts: Path, tmp_path: Path) -> None:
     names = [path.name for path in parts_in(parts)]
-    for name in names[:-1]:
+    for name in (names[0], names[1], names[-1]):
         folder = tmp_path / name
         shutil.copytree(parts, folder)
         (folder / name).unlink()
         *others, found = verify_parts(folder)
         assert all(other.ok for other in others)
         assert "missing" in " ".join(found.violations), name
-    (tmp_path / names[0] / names[-1]).unlink()
-    assert f"{names[-1]} is missing" in " ".join(verify_parts(tmp_path / names[0])[-1].violations)
+    with pytest.raises(DamagedFileError, match="one is missing between"):
+        open_recording(tmp_path / names[1])
+    assert "one is missing" in open_recording(tmp_path / names[1], salvage=True).damage
 
 
 def test_a_surplus_part_is_found_wherever_it_is(parts: Path, tmp_path: Path) -> None:
     paths = parts_in(parts)
-    record(tmp_path / "other", PartLimits(48 * KIB), cycles=1500)
+    assert chain_violations([read_recording(path) for path in paths]) == []
+    record_small(tmp_path / "other/run.pansrec", 1500, limits=SMALL)
     stranger = parts_in(tmp_path / "other")[0]
     for number in (2, len(paths) + 1, 99):
         folder = tmp_path / str(number)
@@ -157,24 +122,14 @@ def test_a_surplus_part_is_found_wherever_it_is(parts: Path, tmp_path: Path) -> 
         text = " ".join(verify_parts(folder)[-1].violations)
         assert "parts of 2 runs" in text, number
         assert "renamed" in text
-        if number > len(paths):
-            assert "is surplus: the run ended with" in text
-
-
-def test_the_name_of_the_recording_stands_for_its_parts(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    name = parts / "run.pansrec"
-    assert json_of(capsys, "verify", name)["ok"]
-    assert json_of(capsys, "replay", name)["identical"]
-    assert main(["verify", str(tmp_path / "run.pansrec")]) == main(["verify", str(tmp_path)]) == 2
+        assert ("is surplus: the run ended with" in text) == (number > len(paths))
 
 
 def test_a_part_without_its_place_is_refused(parts: Path) -> None:
-    recording = read_recording(parts_in(parts)[1])
+    found = read_recording(parts_in(parts)[1])
 
     class Silent:
-        header, path, complete = recording.header, recording.path, True
+        header, path, complete = found.header, found.path, True
 
         def events(self) -> Any:
             return iter(())
@@ -193,38 +148,82 @@ def test_parts_of_another_run_are_not_overwritten(parts: Path, tmp_path: Path) -
     assert parts_in(tmp_path) == [part_path(path, 1)]
 
 
-def test_limits_that_cannot_be_meant() -> None:
-    for rotate, keep in ((0, 0), (100, 150)):
-        with pytest.raises(UsageError):
-            PartLimits(rotate, keep)
+@pytest.mark.parametrize("limits", [(0, 0), (100, 150)])
+def test_limits_that_cannot_be_meant(limits: tuple[int, int]) -> None:
+    with pytest.raises(UsageError):
+        PartLimits(*limits)
 
 
 def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
-    link_states = []
+    runs = []
 
     def prepared(run: LiveRun) -> None:
-        file = run.recorder.open_file._file  # type: ignore[union-attr]
-
-        class Full:
-            closed = False
-
-            def write(self, data: bytes) -> int:
-                raise OSError(errno.ENOSPC, "No space left on device")
-
-            def truncate(self, size: int) -> None:
-                file.truncate(size)
-
-            def close(self) -> None:
-                self.closed = True
-                file.close()
-
-        run.recorder.open_file._file = Full()  # type: ignore[union-attr]
-        link_states.append(run)
+        file = run.recorder.open_file  # type: ignore[union-attr]
+        file._file = Disk(file._file, write=fails(errno.ENOSPC))
+        runs.append(run)
 
     with pytest.raises(RecordingError, match="No space left on device"):
-        record(tmp_path, PartLimits(1 << 30), prepared=prepared)
-    status = link_states[0].connection.session.status
+        record_small(tmp_path / "run.pansrec", 3000, limits=PartLimits(1 << 30), prepared=prepared)
+    status = runs[0].connection.session.status
     assert status is not None
     assert status.state == 0  # IDLE: it was told to stop
-    recording = read_recording(parts_in(tmp_path)[0])
-    assert not recording.complete
+    assert not read_recording(parts_in(tmp_path)[0]).complete
+
+
+# ---- all parts as one recording ----
+
+
+def test_parts_are_one_recording(runs: Path, parts: Path) -> None:
+    one, joined = open_recording(runs / "one"), open_recording(parts)
+    assert one == read_recording(runs / "one/run.pansrec")
+    assert isinstance(joined, JoinedRecording)
+    assert (joined.complete, joined.n_decisions, len(joined.timings())) == (True, one.n_decisions, one.n_decisions)
+    np.testing.assert_array_equal(one.decisions(), joined.decisions())
+    plan, wanted = recorded_plan(joined), recorded_plan(one)
+    for field in fields(plan):
+        assert np.array_equal(getattr(plan, field.name), getattr(wanted, field.name)), field.name
+    for found, expected in zip(click_list(joined, plan), click_list(one, plan), strict=True):
+        assert np.array_equal(found, expected)
+    assert joined.bundle().classes == one.bundle().classes
+    assert open_recording(parts / "run.pansrec").n_decisions == one.n_decisions
+
+
+def test_a_page_reads_each_part_as_often_however_many_there_are(
+    parts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first part, which has the bundle, a few times more."""
+    reads: Counter[str] = Counter()
+
+    def opened(path: Path) -> Any:
+        reads[Path(path).name] += 1
+        return open_regular(path)
+
+    monkeypatch.setattr(recording, "open_regular", opened)
+    paths, found = parts_in(parts), []
+    for n in (2, len(paths)):
+        (tmp_path / str(n)).mkdir()
+        for path in paths[:n]:
+            shutil.copy(path, tmp_path / str(n))
+        page_of(tmp_path / str(n))
+        found.append(dict(reads))
+        reads.clear()
+    few, many = found
+    assert len(many) > len(few) == 2
+    assert all(many[name] == few[name] for name in few)
+    assert {many[path.name] for path in paths[1:]} == {few[paths[1].name]}
+    assert few[paths[1].name] < 25
+
+
+def test_commands_take_a_folder_or_the_name_of_the_recording(
+    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for place in (parts, parts / "run.pansrec"):
+        assert json_of(capsys, "verify", place)["ok"]
+        payload = json_of(capsys, "replay", place)
+        assert payload["identical"]
+        assert len(payload["parts"]) == len(parts_in(parts))
+    assert json_of(capsys, "export", place, "--format", "csv", "-o", tmp_path / "csv")["decisions"] > 1000
+    assert json_of(capsys, "info", place)["decisions"] == payload["decisions"]
+    assert main(["verify", str(tmp_path / "run.pansrec")]) == main(["verify", str(tmp_path / "csv")]) == 2
+    with pytest.raises(UsageError, match="0 recordings are here"):
+        open_recording(tmp_path)

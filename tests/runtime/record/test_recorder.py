@@ -10,12 +10,12 @@ import os
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from automata import automaton_bundle
 from bundles import made_bundle
+from small_runs import Disk, fails
 
 from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
@@ -287,14 +287,9 @@ def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
 def test_an_exception_leaves_an_incomplete_recording_with_all_that_was_added(tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
     recorder = Recorder(path, HEADER)
-
-    def broken_run() -> None:
-        with recorder:
-            recorder.add_decisions(decisions(1))
-            raise RuntimeError("the run broke")
-
-    with pytest.raises(RuntimeError, match="the run broke"):
-        broken_run()
+    with pytest.raises(RuntimeError, match="the run broke"), recorder:
+        recorder.add_decisions(decisions(1))
+        raise RuntimeError("the run broke")
     assert facts(read_recording(path)) == (1, False)
     with pytest.raises(UsageError, match="closed"):
         recorder.add_clock(np.zeros(1, CLOCK_DTYPE))
@@ -362,29 +357,18 @@ def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
             recorder.add_event({"text": "x" * 70_000})
 
 
-def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.pansrec"
+def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path) -> None:
+    path, room = tmp_path / "a.pansrec", [10]
     recorder = Recorder(path, HEADER)
     recorder.add_decisions(decisions(1))
     recorder.flush()
+    real = recorder.open_file._file
 
-    class FullDisk:
-        """Takes ten more bytes, then refuses."""
+    def write(data: memoryview) -> int:
+        """Take ten more bytes, then refuse."""
+        return int(real.write(data[: room.pop()] if room else fails(errno.ENOSPC)()))
 
-        def __init__(self, file: Any) -> None:
-            self.file, self.room = file, 10
-
-        def write(self, data: memoryview) -> int:
-            if not self.room:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            taken = self.file.write(data[: self.room])
-            self.room -= taken
-            return int(taken)
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(self.file, name)
-
-    monkeypatch.setattr(recorder.open_file, "_file", FullDisk(recorder.open_file._file))
+    recorder.open_file._file = Disk(real, write=write)
     recorder.add_decisions(decisions(1, 1))
     with pytest.raises(PansError, match="recording stops after"):
         recorder.flush()
@@ -393,19 +377,11 @@ def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeyp
     assert found.size == found.end_offset
 
 
-def test_short_writes_are_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_short_writes_are_continued(tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
     with Recorder(path, HEADER) as recorder:
         real = recorder.open_file._file
-
-        class Trickle:
-            def write(self, data: memoryview) -> int:
-                return int(real.write(data[:7]))
-
-            def __getattr__(self, name: str) -> Any:
-                return getattr(real, name)
-
-        monkeypatch.setattr(recorder.open_file, "_file", Trickle())
+        recorder.open_file._file = Disk(real, write=lambda data: real.write(data[:7]))
         recorder.add_message(1, b"hello" * 20)
         recorder.close({})
     assert list(read_recording(path).messages()) == [(1, b"hello" * 20)]
@@ -460,26 +436,18 @@ def test_a_recording_must_say_who_drove_its_automaton() -> None:
         automaton_of({"drive": "host", "confidence": 0.0}, fixed)
 
 
-class FailsAtClose:
-    """A file whose disk fails when it is closed, and only then."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-    def close(self) -> None:
-        if not self._file.closed:
-            self._file.close()
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-
 @pytest.mark.parametrize("leaves", [False, True], ids=["close", "exit"])
 def test_a_disk_that_fails_at_close_is_told_with_the_files_name(leaves: bool, tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
     recorder = Recorder(path, HEADER)
-    recorder.open_file._file = FailsAtClose(recorder.open_file._file)  # type: ignore[assignment]
+    real = recorder.open_file._file
+
+    def close() -> None:
+        if not real.closed:
+            real.close()
+            fails(errno.EIO)()
+
+    recorder.open_file._file = Disk(real, close=close)
     with pytest.raises(RecordingError, match=r"a\.pansrec: the disk failed when the recording was closed"):
         if leaves:
             with recorder:
