@@ -223,11 +223,11 @@ class Instrument:
             elif not self.session or frame.session != self.session:
                 self.counters.foreign_session += 1
             elif frame.type == MessageType.PING:
-                ping = wire.decode_ping(frame.payload)
+                ping = wire.Ping(*wire.fields("PING", frame.payload))
                 pong = wire.Pong(ping.probe_id, ping.host_ns, self._tick, self._tick)
                 self._out.append(wire.encode_pong(pong, self.session))
             elif frame.type == MessageType.GRANT:
-                self._grant(wire.decode_grant(frame.payload))
+                self._grant(wire.Grant(*wire.fields("GRANT", frame.payload)))
             elif frame.type == MessageType.COMMAND:
                 self._command(wire.decode_command(frame.payload))
             else:
@@ -236,7 +236,7 @@ class Instrument:
             self.counters.malformed += 1
 
     def _hello(self, frame: Frame) -> None:
-        hello = wire.decode_hello(frame.payload)
+        hello = wire.Hello(*wire.fields("HELLO", frame.payload, exact=False))
         if not frame.session:
             raise wire.MalformedMessage("HELLO without a nonce")
         if frame.session == self.session and hello == (wire.SCHEMA, wire.PROTOCOL_VERSION):

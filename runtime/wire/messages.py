@@ -186,11 +186,6 @@ def encode_hello(session: int) -> bytes:
     return encode_frame(MessageType.HELLO, STRUCTS["HELLO"].pack(SCHEMA, PROTOCOL_VERSION), session)
 
 
-def decode_hello(payload: bytes) -> Hello:
-    """Decode HELLO; a longer payload of a later version is accepted so that the mismatch can be named."""
-    return Hello(*fields("HELLO", payload, exact=False))
-
-
 def encode_welcome(facts: Mapping[str, Any], session: int) -> bytes:
     """Return the device's answer to HELLO; `facts` is a flat map, at most MAX_WELCOME_BYTES of msgpack."""
     body = msgpack.packb(dict(facts))
@@ -239,11 +234,6 @@ def encode_ping(probe_id: int, host_ns: int, session: int) -> bytes:
     return encode_frame(MessageType.PING, STRUCTS["PING"].pack(probe_id, host_ns), session)
 
 
-def decode_ping(payload: bytes) -> Ping:
-    """Decode PING."""
-    return Ping(*fields("PING", payload))
-
-
 def encode_pong(pong: Pong, session: int) -> bytes:
     """Return the device's answer to a probe."""
     return encode_frame(MessageType.PONG, STRUCTS["PONG"].pack(*pong), session)
@@ -289,11 +279,6 @@ def decode_ack(payload: bytes) -> Ack:
 def encode_grant(grant: Grant, session: int) -> bytes:
     """Return a receive-window and lease message; idempotent, never acknowledged."""
     return encode_frame(MessageType.GRANT, STRUCTS["GRANT"].pack(*grant), session)
-
-
-def decode_grant(payload: bytes) -> Grant:
-    """Decode GRANT."""
-    return Grant(*fields("GRANT", payload))
 
 
 def encode_status(status: Status, session: int) -> bytes:

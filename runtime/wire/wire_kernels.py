@@ -37,7 +37,6 @@ SKIPPING, CONSUMED, HELD, N_TALLIES = range(7, 11)
 SMALLEST_BODY = 12  # header and CRC
 _U = np.uint64
 _ONE, _EIGHT, _SIXTEEN, _BYTE = _U(1), _U(8), _U(16), _U(0xFF)
-_S16, _S24, _S32, _S40, _S48, _S56 = _U(16), _U(24), _U(32), _U(40), _U(48), _U(56)
 _ONES, _HIGHS = _U(0x0101010101010101), _U(0x8080808080808080)
 _LOW32 = _U(0xFFFFFFFF)
 _LONG_RUN = 12  # zeros in a row before it pays to look at eight at once: shorter runs are told apart by no branch
@@ -69,26 +68,9 @@ def crc32_span(data, start, stop, seed):  # type: ignore[no-untyped-def]
     crc = _U(seed) ^ _LOW32
     i, end = _U(start), _U(stop)
     while i + _SIXTEEN <= end:
-        x = load8(data, i) ^ crc
-        y = load8(data, i + _EIGHT)
-        crc = _U(
-            table[15, x & _BYTE]
-            ^ table[14, (x >> _EIGHT) & _BYTE]
-            ^ table[13, (x >> _S16) & _BYTE]
-            ^ table[12, (x >> _S24) & _BYTE]
-            ^ table[11, (x >> _S32) & _BYTE]
-            ^ table[10, (x >> _S40) & _BYTE]
-            ^ table[9, (x >> _S48) & _BYTE]
-            ^ table[8, x >> _S56]
-            ^ table[7, y & _BYTE]
-            ^ table[6, (y >> _EIGHT) & _BYTE]
-            ^ table[5, (y >> _S16) & _BYTE]
-            ^ table[4, (y >> _S24) & _BYTE]
-            ^ table[3, (y >> _S32) & _BYTE]
-            ^ table[2, (y >> _S40) & _BYTE]
-            ^ table[1, (y >> _S48) & _BYTE]
-            ^ table[0, y >> _S56]
-        )
+        x, y, crc = load8(data, i) ^ crc, load8(data, i + _EIGHT), _U(0)
+        for k in range(8):
+            crc ^= _U(table[15 - k, x >> _U(8 * k) & _BYTE] ^ table[7 - k, y >> _U(8 * k) & _BYTE])
         i += _SIXTEEN
     while i < end:
         crc = _U(table[0, (crc ^ _U(data[i])) & _BYTE]) ^ (crc >> _EIGHT)
