@@ -5,30 +5,40 @@ python docs/pictures/calibration.py       (extra `plot`)
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
 
-sys.path.append(str(Path(__file__).parents[2] / "tests" / "instruments"))
 matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
-from simulated_calibrations import simulate
 
 from pans.runtime.core.calibration import (
     LADDER,
     TELLING,
+    Design,
     calibration_exposure_us,
     count_model,
-    counts_of,
     design_run,
     profile_level,
 )
+from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.estimate import Counts, fit_light, log_likelihood
-from pans.runtime.instrument.profile import load_profile
+from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.intervals import CHI2_95, jeffreys_interval
+from pans.runtime.wire.messages import DARK_PATTERN
+
+
+def drawn(truth: Profile, design: Design, seed: int) -> Counts:
+    """Draw the clicks of every pattern, and of dark exposures, on `truth`: its exposures do not depend on each other."""
+    shown, exposure_us = design.plan.slot_pattern.astype(np.int64), design.plan.exposure_us
+    pattern = np.append(np.arange(len(design.drives)), -1)
+    slots = [int((shown == (DARK_PATTERN if one < 0 else one)).sum()) for one in pattern]
+    exposures, drive = design.n_cycles * np.array(slots), np.append(design.drives, 0.0)
+    chance = click_probability(click_law(truth, exposure_us), drive * profile_level(truth, exposure_us))
+    clicks = np.random.default_rng(seed).binomial(exposures, chance)
+    return Counts(drive, clicks, exposures, np.zeros(len(drive)), pattern)
 
 
 def main() -> None:
@@ -41,7 +51,7 @@ def main() -> None:
     guess = profile_level(profile, exposure)
     for targets, seconds in ((LADDER, 1.0), (TELLING, 9.0)):
         design = design_run(profile, targets, guess, seconds, 1)
-        counts: Counts = counts_of(simulate(truth, design, 3), design, profile)[0]
+        counts = drawn(truth, design, 3)
         fit = fit_light(counts, model)
         guess = fit.level.value
         stages.append((counts, fit))
