@@ -334,7 +334,7 @@ class _Run:
             def prepared(run: LiveRun) -> None:
                 self.dark.check_device(run)
                 if self.registration is not None:
-                    self.registration.check_device(self.dark.serial_of(run))
+                    self.registration.registered.check_made_for(self.profile, self.dark.serial_of(run))
                 welcome = run.connection.session.welcome
                 if welcome is not None and (words := scene_words(welcome.facts, options.device)):
                     say(f"pans: {words}")

@@ -1,18 +1,18 @@
 """The calibration file: what was measured on one instrument, when and how; beside the profile, never a rewrite of it.
 
-The file is strict JSON with a checksum over all of it, as registrations have it too. `load_calibration` returns a `Calibration` whose
-every figure is possible, or raises DamagedFileError; `find_objections` raises where a run must not use it.
+The file is strict JSON with a checksum over all of it; `MeasuredFile` and the functions on it serve registrations too. `load_calibration`
+returns a `Calibration` whose every figure is possible, or raises DamagedFileError; `check_made_for` raises where a run must not use it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,8 @@ from pans.runtime.ranges import Range, demand, number_text
 from .click_law import ClickLaw, log_no_click
 from .profile import Profile
 
-FORMAT = "pans-calibration"
-VERSION = 1
 MAX_BYTES = 4 << 20
-MAX_AGE_H = 24.0
+MAX_AGE_H, FUTURE_H = 24.0, 0.1  # how old a file may be, and by how much clocks may differ
 F64 = NDArray[np.float64]
 CHANNELS_MAX = 4096
 CHANCE = Range(0, 1)
@@ -47,10 +45,16 @@ _INTERVALS = {  # whose ends have the range of that number; the upper one may be
 }
 
 
+Check = Callable[[Mapping[str, Any]], None]
+M = TypeVar("M", bound="MeasuredFile")
+
+
 @dataclass(frozen=True, slots=True)
 class MeasuredFile:
     """A file of something measured; `sha256` is that of its bytes, `values` everything that stands in it."""
 
+    KIND: ClassVar[str] = ""  # its format is pans-KIND
+    COMMAND: ClassVar[str] = ""  # that measures it
     path: str
     sha256: str
     values: Mapping[str, Any]
@@ -64,11 +68,35 @@ class MeasuredFile:
         """Its age in hours at `now` (UTC)."""
         return (now - self.made).total_seconds() / 3600
 
+    def age_warnings(self, now: datetime, max_age_h: float = MAX_AGE_H) -> list[str]:
+        """Return a sentence about a file that is too old, or from the future."""
+        age = self.age_h(now)
+        if age > max_age_h:
+            return [f"the {self.KIND} is {age:.1f} h old, allowed are {max_age_h:g} h: measure again ({self.COMMAND})"]
+        if age < -FUTURE_H:
+            return [f"the {self.KIND} is from {-age:.1f} h in the future: check this machine's clock"]
+        return []
+
+    def check_made_for(self, profile: Profile, serial: str | None) -> None:
+        """Raise ConfigError if it is of another profile or, where the device has told its serial number, of another device."""
+        made_for, of_device = self.values["profile"], self.values["device"].get("serial")
+        if made_for["sha256"] != profile.sha256:
+            raise ConfigError(
+                f"{self.path}: made for the profile {made_for['name']} ({made_for['sha256'][:12]}…), this run uses {profile.name} "
+                f"({profile.sha256[:12]}…)",
+                remedy=f"measure with this profile: {self.COMMAND} --profile {profile.name}",
+            )
+        if None not in (serial, of_device) and of_device != serial:
+            raise ConfigError(
+                f"{self.path}: made on the device {of_device}, this is {serial}", remedy="measure this device"
+            )
+
 
 class Calibration(MeasuredFile):
     """The facts of one calibration."""
 
     __slots__ = ()
+    KIND, COMMAND = "calibration", "pans calibrate"
 
     def dark_probability(self, profile: Profile, exposure_us: float, channels: int) -> tuple[F64, F64, F64]:
         """Click probability of a dark exposure of `exposure_us`, with the ends of its 95 % interval, each float64 (channels,).
@@ -108,70 +136,57 @@ def save_calibration(path: str | Path, values: Mapping[str, Any], *, force: bool
 
     UsageError if `path` exists, unless `force`.
     """
-    data = sealed(values, FORMAT, VERSION)
-    parse_calibration(data, str(path))
-    write_file(path, data, force=force)
-    return hashlib.sha256(data).hexdigest()
+    return save_measured(path, values, Calibration, _check, force=force)
 
 
 def load_calibration(path: str | Path) -> Calibration:
     """Return what `path` holds; UsageError without a file, else DamagedFileError."""
-    return parse_calibration(read_file(path, MAX_BYTES), str(path))
+    return parse_measured(read_file(path, MAX_BYTES), str(path), Calibration, _check)
 
 
-def parse_calibration(data: bytes, where: str) -> Calibration:
-    """Check the bytes of a calibration file; DamagedFileError names the first thing that cannot be."""
-    values = unsealed(data, where, FORMAT, VERSION)
+def save_measured(
+    path: str | Path, values: Mapping[str, Any], kind: type[MeasuredFile], check: Check, *, force: bool
+) -> str:
+    """Write a file of that `kind` whole or not at all, if `check` finds nothing; return its SHA-256."""
+    data = sealed(values, kind.KIND)
+    parse_measured(data, str(path), kind, check)
+    write_file(path, data, force=force)
+    return hashlib.sha256(data).hexdigest()
+
+
+def parse_measured(data: bytes, where: str, kind: type[M], check: Check) -> M:
+    """Return the bytes of a file as `kind`; DamagedFileError names the first thing that cannot be, which `check` raises."""
+    values = _unsealed(data, where, kind.KIND)
     try:
-        _check(values)
+        _check_origin(values)
+        check(values)
     except KeyError as error:
-        raise DamagedFileError(f"{where}: {error.args[0]} is missing", remedy="calibrate again") from error
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DamagedFileError(f"{where}: {error}", remedy="calibrate again") from error
-    return Calibration(where, hashlib.sha256(data).hexdigest(), values)
+        raise DamagedFileError(f"{where}: {error.args[0]} is missing", remedy="measure again") from error
+    except (TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise DamagedFileError(f"{where}: {error}", remedy="measure again") from error
+    return kind(where, hashlib.sha256(data).hexdigest(), values)
 
 
-def sealed(values: Mapping[str, Any], format_name: str, version: int) -> bytes:
+def sealed(values: Mapping[str, Any], kind: str) -> bytes:
     """Return the file's bytes: `values` (JSON-able) with format, version and checksum."""
-    body = {"format": format_name, "version": version, **values}
+    body = {"format": f"pans-{kind}", "version": 1, **values}
     whole = {**body, "sha256": hashlib.sha256(canonical_json(body)).hexdigest()}
     return (json.dumps(whole, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
-def unsealed(data: bytes, where: str, format_name: str, version: int) -> dict[str, Any]:
+def _unsealed(data: bytes, where: str, kind: str) -> dict[str, Any]:
     """Return what the bytes of a file hold; DamagedFileError for another format, or where the checksum does not fit."""
-    what, taker = other_kind(data, format_name.removeprefix("pans-"))
+    what, taker = other_kind(data, kind)
     if what:
-        raise DamagedFileError(f"{where}: not a {format_name.removeprefix('pans-')}: it is {what}", remedy=taker)
+        raise DamagedFileError(f"{where}: not a {kind}: it is {what}", remedy=taker)
     values = parse_json_object(data, where)
-    if values.get("format") != format_name or values.get("version") != version:
+    if values.get("format") != f"pans-{kind}" or values.get("version") != 1:
         found = f"{ascii(values.get('format'))[:40]} {ascii(values.get('version'))[:20]}"
-        raise DamagedFileError(f"{where}: format {found}, allowed: {format_name} {version}")
+        raise DamagedFileError(f"{where}: format {found}, allowed: pans-{kind} 1")
     body = {key: value for key, value in values.items() if key != "sha256"}
     if values.get("sha256") != hashlib.sha256(canonical_json(body)).hexdigest():
-        raise DamagedFileError(f"{where}: altered: its checksum does not fit what it says", remedy="calibrate again")
+        raise DamagedFileError(f"{where}: altered: its checksum does not fit what it says", remedy="measure again")
     return values
-
-
-def check_made_for(where: str, values: Mapping[str, Any], profile: Profile, serial: str | None, command: str) -> None:
-    """Raise ConfigError if the file is of another profile or, where the device has told its serial number, of another device."""
-    made_for = values["profile"]
-    if made_for["sha256"] != profile.sha256:
-        raise ConfigError(
-            f"{where}: made for the profile {made_for['name']} ({made_for['sha256'][:12]}…), this run uses {profile.name} "
-            f"({profile.sha256[:12]}…)",
-            remedy=f"calibrate with this profile: {command} --profile {profile.name}",
-        )
-    of_device = values["device"].get("serial")
-    if serial is not None and of_device is not None and of_device != serial:
-        raise ConfigError(f"{where}: made on the device {of_device}, this is {serial}", remedy="calibrate this device")
-
-
-def find_objections(calibration: Calibration, profile: Profile, serial: str | None) -> None:
-    """Raise ConfigError if the calibration is of another profile or, where the device has told its serial number, another
-    device.
-    """
-    check_made_for(calibration.path, calibration.values, profile, serial, "pans calibrate")
 
 
 def find_warnings(calibration: Calibration | None, now: datetime, max_age_h: float = MAX_AGE_H) -> list[str]:
@@ -185,12 +200,7 @@ def find_warnings(calibration: Calibration | None, now: datetime, max_age_h: flo
     if silent := calibration.values.get("silent_channels"):
         names = ", ".join(map(str, silent[:8])) + (", ..." if len(silent) > 8 else "")
         return [f"the calibration saw no click of channel {names} in light: check these detectors, and calibrate again"]
-    age = calibration.age_h(now)
-    if age > max_age_h:
-        return [f"the calibration is {age:.1f} h old, allowed are {max_age_h:g} h: calibrate again"]
-    if age < -0.1:
-        return [f"the calibration is from {-age:.1f} h in the future: check this machine's clock"]
-    return []
+    return calibration.age_warnings(now, max_age_h)
 
 
 def now_utc() -> datetime:
@@ -198,14 +208,24 @@ def now_utc() -> datetime:
     return datetime.now(UTC)
 
 
+def _check_origin(values: Mapping[str, Any]) -> None:
+    """Check when a file was measured, and of which profile and device."""
+    made = values["made_utc"]
+    demand(isinstance(made, str), f"made_utc is {number_text(made)}, allowed: a date and time")
+    demand(datetime.fromisoformat(made).utcoffset() is not None, f"made_utc {made[:40]!a} has no time zone")
+    for part in ("profile", "device"):
+        demand(isinstance(values[part], dict), f"{part} holds no facts")
+    for key in ("name", "sha256"):
+        demand(isinstance(values["profile"][key], str), f"profile.{key} is no text")
+    serial = values["device"].get("serial")
+    demand(serial is None or isinstance(serial, str), f"device.serial is {number_text(serial)}, allowed: text")
+
+
 def _check(values: Mapping[str, Any]) -> None:
     for key, allowed in _NUMBERS.items():
         allowed.checked(values[key], key)
     for key, of in _INTERVALS.items():
         _check_interval(values[key], _NUMBERS[of], False, key)
-    made = values["made_utc"]
-    demand(isinstance(made, str), f"made_utc is {number_text(made)}, allowed: a date and time")
-    demand(datetime.fromisoformat(made).utcoffset() is not None, f"made_utc {made[:40]!a} has no time zone")
     rows = values["channels"]
     fits = isinstance(rows, list) and 0 < len(rows) <= CHANNELS_MAX
     demand(fits, f"channels is no list of 1 to {CHANNELS_MAX}, allowed: one row for each channel")
@@ -216,12 +236,6 @@ def _check(values: Mapping[str, Any]) -> None:
     demand(isinstance(silent, list), f"silent_channels is {number_text(silent)}, allowed: a list of channels")
     for channel in silent:
         Range(0, len(rows) - 1, whole=True).checked(channel, "silent_channels")
-    for part in ("profile", "device"):
-        demand(isinstance(values[part], dict), f"{part} holds no facts")
-    for key in ("name", "sha256"):
-        demand(isinstance(values["profile"][key], str), f"profile.{key} is no text")
-    serial = values["device"].get("serial")
-    demand(serial is None or isinstance(serial, str), f"device.serial is {number_text(serial)}, allowed: text")
 
 
 def _check_channel(row: Mapping[str, Any], what: str) -> None:

@@ -17,7 +17,6 @@ from pans.runtime.detector import afterpulses_of
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.calibration import (
     Calibration,
-    find_objections,
     find_warnings,
     load_calibration,
     now_utc,
@@ -66,7 +65,7 @@ class DarkRun:
         """Read what `options` ask for; ConfigError for a calibration of another profile."""
         calibration = None if options.calibration is None else load_calibration(options.calibration)
         if calibration is not None:
-            find_objections(calibration, profile, None)
+            calibration.check_made_for(profile, None)
         warnings = []
         if options.warns_uncalibrated:
             warnings = find_warnings(calibration, now_utc(), options.calibration_max_age_h)
@@ -119,7 +118,7 @@ class DarkRun:
     def check_device(self, run: LiveRun) -> None:
         """Before arming: is this the device that was calibrated? ConfigError if not."""
         if self.calibration is not None:
-            find_objections(self.calibration, self.profile, self.serial_of(run))
+            self.calibration.check_made_for(self.profile, self.serial_of(run))
         for warning in self.warnings:
             run.journal.note("calibration_warning", words=warning)
 

@@ -17,22 +17,19 @@ import numpy as np
 
 from pans.runtime.bundle.facts import Bundle
 from pans.runtime.container import read_file
-from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
+from pans.runtime.errors import ConfigError, UsageError
 from pans.runtime.imaging import IDENTITY, Imaging, tolerance_of
-from pans.runtime.instrument.calibration import MAX_AGE_H, MeasuredFile, check_made_for, sealed, unsealed
+from pans.runtime.instrument.calibration import MAX_AGE_H, MeasuredFile, parse_measured, save_measured
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.outputs import write_file
 from pans.runtime.ranges import Range, demand, number_text
 
 from .correct import Correction, corrected
 from .estimate import Estimate
 from .parameters import DARK, PARAMETERS, Shape, imaging_of
 
-FORMAT, VERSION = "pans-registration", 1
 MAX_BYTES = 1 << 20
 SIDE = Range(1, 4096, whole=True)
 CLICKS = Range(1, 1 << 53, whole=True)
-FUTURE_H = 0.1  # by which clocks may differ
 TOLERATES = "tolerates"  # where a bundle that was trained through optics says which
 
 
@@ -40,6 +37,7 @@ class Registered(MeasuredFile):
     """What one registration says."""
 
     __slots__ = ()
+    KIND, COMMAND = "registration", "pans calibrate --registration"
 
     @property
     def shape(self) -> Shape:
@@ -83,61 +81,32 @@ def registration_values(found: Estimate, shape: Shape) -> dict[str, Any]:
 
 def save_registration(path: str | Path, values: Mapping[str, Any], *, force: bool = False) -> str:
     """Write `values` whole or not at all; return the file's SHA-256. UsageError if `path` exists, unless `force`."""
-    data = sealed(values, FORMAT, VERSION)
-    parse_registration(data, str(path))
-    write_file(path, data, force=force)
-    return hashlib.sha256(data).hexdigest()
+    return save_measured(path, values, Registered, check_values, force=force)
 
 
 def load_registration(path: str | Path) -> Registered:
     """Return what `path` holds; UsageError without a file, else DamagedFileError."""
-    return parse_registration(read_file(path, MAX_BYTES), str(path))
+    return parse_measured(read_file(path, MAX_BYTES), str(path), Registered, check_values)
 
 
 def is_registration(path: str | Path) -> bool:
     """Return whether the file at `path` says of itself that it is one; UsageError without a file."""
-    return f'"{FORMAT}"'.encode() in read_file(path, 4 * MAX_BYTES)
-
-
-def parse_registration(data: bytes, where: str) -> Registered:
-    """Check the bytes of a file; DamagedFileError names the first thing that cannot be."""
-    values = unsealed(data, where, FORMAT, VERSION)
-    try:
-        _check(values)
-    except KeyError as error:
-        raise DamagedFileError(f"{where}: {error.args[0]} is missing", remedy="register again") from error
-    except (TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise DamagedFileError(f"{where}: {error}", remedy="register again") from error
-    return Registered(where, hashlib.sha256(data).hexdigest(), values)
+    return b'"pans-registration"' in read_file(path, 4 * MAX_BYTES)
 
 
 def check_usable(
     registered: Registered, profile: Profile, shape: Shape, now: datetime, max_age_h: float = MAX_AGE_H
 ) -> None:
     """Raise ConfigError if a run on `profile` with patterns of `shape` must not use it: another profile or grid, or too old."""
-    where = registered.path
-    check_made_for(where, registered.values, profile, None, "pans calibrate --registration")
+    registered.check_made_for(profile, None)
     if registered.shape != tuple(shape):
         rows, columns = registered.shape
         raise ConfigError(
-            f"{where}: of a grid of {rows} x {columns} pixels, the bundle's patterns have {shape[0]} x {shape[1]}",
-            remedy="register with a target of as many pixels: pans calibrate --registration --target FILE",
+            f"{registered.path}: of a grid of {rows} x {columns} pixels, the bundle's patterns have {shape[0]} x {shape[1]}",
+            remedy=f"register with a target of as many pixels: {registered.COMMAND} --target FILE",
         )
-    if stale := age_warnings(registered, now, max_age_h):
-        raise ConfigError(
-            f"{where}: {stale[0]}",
-            remedy="measure again: pans calibrate --registration, or allow more with --calibration-max-age-h",
-        )
-
-
-def age_warnings(registered: Registered, now: datetime, max_age_h: float = MAX_AGE_H) -> list[str]:
-    """Return a sentence about a file that is too old, or from the future."""
-    age = registered.age_h(now)
-    if age > max_age_h:
-        return [f"the registration is {age:.1f} h old, allowed are {max_age_h:g} h"]
-    if age < -FUTURE_H:
-        return [f"the registration is from {-age:.1f} h in the future: check this machine's clock"]
-    return []
+    for stale in registered.age_warnings(now, max_age_h):
+        raise ConfigError(f"{registered.path}: {stale}", remedy="or allow more with --calibration-max-age-h")
 
 
 def registration_words(path: str | Path, values: Mapping[str, Any]) -> str:
@@ -156,7 +125,8 @@ def registration_words(path: str | Path, values: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _check(values: Mapping[str, Any]) -> None:
+def check_values(values: Mapping[str, Any]) -> None:
+    """Raise ValueError, TypeError or KeyError where a figure of a file cannot be."""
     grid = values["grid"]
     demand(isinstance(grid, list) and len(grid) == 2, f"grid is {number_text(grid)}, allowed: rows and columns")
     for size in grid:
@@ -168,14 +138,6 @@ def _check(values: Mapping[str, Any]) -> None:
             Range(-1e6, 1e6).checked(row[key], f"{one.name}.{key}")
         fits = row["low"] <= row["value"] <= row["high"]
         demand(fits, f"{one.name} {row['value']} is not within {row['low']} to {row['high']}")
-    made = values["made_utc"]
-    demand(isinstance(made, str), f"made_utc is {number_text(made)}, allowed: a date and time")
-    demand(datetime.fromisoformat(made).utcoffset() is not None, f"made_utc {made[:40]!a} has no time zone")
-    for key in ("name", "sha256"):
-        demand(isinstance(values["profile"][key], str), f"profile.{key} is no text")
-    demand(isinstance(values["device"], dict), "device holds no facts")
-    serial = values["device"].get("serial")
-    demand(serial is None or isinstance(serial, str), f"device.serial is {number_text(serial)}, allowed: text")
     CLICKS.checked(values["clicks"], "clicks")
     Range(0, 1).checked(values["p_value"], "p_value")
     Registered("", "", dict(values)).imaging()  # refuses a flat field that is negative somewhere
@@ -216,11 +178,6 @@ class InUse:
             f"patterns corrected for the table of {self.registered.path} ({self.registered.imaging().words()}): "
             f"error of their light {found.error_before:.1%} before, {found.error_after:.1%} after, light kept {found.light_kept:.1%}"
         )
-
-    def check_device(self, serial: str | None) -> None:
-        """Raise ConfigError if the device is another than the one that was measured."""
-        one = self.registered
-        check_made_for(one.path, one.values, self.profile, serial, "pans calibrate --registration")
 
 
 def in_use(path: Path, bundle: Bundle, profile: Profile, now: datetime, max_age_h: float) -> InUse:

@@ -30,7 +30,7 @@ from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
 from pans.runtime.record.parts import chain_violations, first_decision, is_of_parts, missing_parts, parts_in, stem_of
 from pans.runtime.record.replaying import replay_faults
-from pans.runtime.registration.file import age_warnings, is_registration, load_registration
+from pans.runtime.registration.file import is_registration, load_registration
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 from pans.runtime.wire.session import ANSWER_TYPES
 
@@ -91,7 +91,7 @@ def verify_file(path: str | Path) -> FileVerdict:
         elif verdict.kind == "calibration":
             verdict.alerts += find_warnings(load_calibration(path), now_utc())
         elif verdict.kind == "registration":
-            verdict.alerts += age_warnings(load_registration(path), now_utc())
+            verdict.alerts += load_registration(path).age_warnings(now_utc())
         else:
             load_profile(str(path))
     except UsageError:

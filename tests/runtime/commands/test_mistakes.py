@@ -26,7 +26,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Recorder(folder / "run.pansrec", {"simulated": True}) as recorder:
         recorder.close({})
     (folder / "lab.toml").write_text(profile_text("oled-qcmos"))
-    (folder / "cal.json").write_bytes(sealed({"what": 1}, "pans-calibration", 1))
+    (folder / "cal.json").write_bytes(sealed({"what": 1}, "calibration"))
     (folder / "notes.txt").write_text("hello\n")
     (folder / "options.toml").write_text("decisions = 3\n")
     (folder / "folder").mkdir()

@@ -16,11 +16,9 @@ import pytest
 from pans.runtime.commands.calibrate import CALIBRATE
 from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
 from pans.runtime.instrument.calibration import (
-    find_objections,
     find_warnings,
     load_calibration,
     now_utc,
-    parse_calibration,
     save_calibration,
 )
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
@@ -152,15 +150,15 @@ def test_command_and_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert payload["photons_per_level"] == pytest.approx(0.08, rel=0.03)
     assert payload["dark_ci"][0] <= float(click_probability(click_law(profile, 40.0), 0.0)) <= payload["dark_ci"][1]
     calibration = load_calibration(path)
-    find_objections(calibration, profile, "SIM-00000007")
+    calibration.check_made_for(profile, "SIM-00000007")
     with pytest.raises(ConfigError, match="made on the device SIM-00000007"):
-        find_objections(calibration, profile, "OTHER")
+        calibration.check_made_for(profile, "OTHER")
     with pytest.raises(ConfigError, match="made for the profile dmd-spad"):
-        find_objections(calibration, load_profile("ideal"), None)
+        calibration.check_made_for(load_profile("ideal"), None)
     assert find_warnings(calibration, now_utc()) == []
     assert "25.0 h old" in find_warnings(calibration, calibration.made + timedelta(hours=25))[0]
     later = calibration.made + timedelta(milliseconds=1)  # within the second of its stamp
-    assert "calibrate again" in find_warnings(calibration, later, max_age_h=1e-9)[0]
+    assert "measure again" in find_warnings(calibration, later, max_age_h=1e-9)[0]
     assert "no calibration" in find_warnings(None, now_utc())[0]
     assert calibration.applied_to(profile) is profile  # within the interval
     brighter = replace(profile, projector=replace(profile.projector, peak_photoelectrons_hz=3000.0))
@@ -188,5 +186,6 @@ def test_impossible_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(DamagedFileError):
             save_calibration(tmp_path / "bad.json", {**values, key: bad})
     assert not (tmp_path / "bad.json").exists()
+    (tmp_path / "empty.json").write_text("{}")
     with pytest.raises(DamagedFileError, match="format"):
-        parse_calibration(b"{}", "here")
+        load_calibration(tmp_path / "empty.json")
