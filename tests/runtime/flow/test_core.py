@@ -6,16 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from flows import (
-    PERIOD_TICKS,
-    SESSION,
-    SETTINGS,
-    feed,
-    frame,
-    make,
-    plan_of,
-    scene,
-)
+from flows import PERIOD_TICKS, SESSION, SETTINGS, feed, frame, make, plan_of, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_flow import passages as naive_passages
@@ -33,7 +24,7 @@ F64 = NDArray[np.float64]
 # -- the kernels ---------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_scan_finds_what_plain_loops_find_however_the_frames_are_cut(data: st.DataObject) -> None:
     width, hold = data.draw(st.integers(1, 6)), data.draw(st.integers(0, 5))
@@ -113,27 +104,13 @@ def test_a_flickering_cell_is_one_cell() -> None:
     assert [d.label for d in feed(make(), words).decisions] == [1]
 
 
-@pytest.mark.parametrize("block", [1, 7, 20])
-def test_blocks_change_nothing(block: int) -> None:
-    words = scene((100, 60, 0), (300, 70, 1), (395, 60, 2))
-    whole = feed(make(20), words)
-    cut = feed(make(block), words, block)
-    assert (cut.decisions, cut.passages) == (whole.decisions, whole.passages)
-
-
-def test_a_gap_within_a_cell_abstains_and_the_next_cell_is_decided() -> None:
+@pytest.mark.parametrize("drop", [5, 6])
+def test_a_gap_within_a_cell_or_over_its_beginning_abstains_and_the_next_cell_is_decided(drop: int) -> None:
     core = make()
-    output = feed(core, scene((100, 60, 0), (300, 60, 1)), drop=(6,))
-    assert [(d.label, d.flags) for d in output.decisions] == [
-        (NO_LABEL, DecisionFlag.GAP | DecisionFlag.ABSTAINED),
-        (1, 0),
-    ]
+    output = feed(core, scene((100, 60, 0), (300, 60, 1)), drop=(drop,))
+    lost = (NO_LABEL, DecisionFlag.GAP | DecisionFlag.ABSTAINED)
+    assert [(d.label, d.flags) for d in output.decisions] == [lost, (1, 0)]
     assert core.tracker.counters.lost_exposures == 20
-
-
-def test_a_cell_whose_beginning_was_lost_is_not_decided() -> None:
-    output = feed(make(), scene((100, 60, 0)), drop=(5,))
-    assert [d.flags for d in output.decisions] == [DecisionFlag.GAP | DecisionFlag.ABSTAINED]
 
 
 def test_no_decided_window_ever_overlaps_a_gap() -> None:
@@ -159,14 +136,8 @@ def test_too_long_and_two_maxima_are_coincidences() -> None:
     dip[165:190] |= 0b1111000000
     dip[145:154] = 0b10000  # one click per frame keeps it open
     assert [d.flags for d in feed(make(), dip).decisions] == [flags]
-
-
-def test_light_that_stays_is_one_abort_and_then_nothing() -> None:
-    output = feed(make(), scene((100, 600, 0), (800, 60, 1)))
-    assert [(d.label, bool(d.flags & DecisionFlag.COINCIDENCE)) for d in output.decisions] == [
-        (NO_LABEL, True),
-        (1, False),
-    ]
+    stays = feed(make(), scene((100, 600, 0), (800, 60, 1)))  # light that stays is one abort and then nothing
+    assert [d.flags for d in stays.decisions] == [flags, 0]
 
 
 def test_ambiguous_cells_are_aborted_when_asked_for() -> None:
@@ -202,9 +173,8 @@ def test_frames_without_an_object_are_tallied_per_channel() -> None:
     core = make()
     feed(core, words)
     assert core.empty_channels.tolist() == [0] * 8 + [10, 0]
-    assert core.empty_frames == (445 - 56 + 1) + (
-        944 - 620 + 1
-    )  # the onset is at 501, the release at 565, 55 frames are kept off
+    # the onset is at 501, the release at 565, 55 frames are kept off
+    assert core.empty_frames == (445 - 56 + 1) + (944 - 620 + 1)
 
 
 def test_pulses_are_asked_for_at_a_tick_after_leaving() -> None:

@@ -64,7 +64,7 @@ def guarded(core: FlowCore, block: int, dark: bool) -> FlowCore:
     return core
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.data())
 def test_each_decision_is_the_core_s(data: st.DataObject) -> None:
     starts = np.cumsum(data.draw(st.lists(st.integers(45, 150), min_size=3, max_size=7))).tolist()
@@ -102,20 +102,6 @@ def test_the_guard_finds_the_same_at_the_same_exposures(dark: bool) -> None:
     found = by_turn(other, data, list(range(5000, len(data), 5000)))
     assert found.events == by_one(one, data).events
     assert len(found.events) > 1, "a rate of twenty times the expected one was not seen"
-    assert state_of(other) == state_of(one)
-
-
-@pytest.mark.parametrize("kind", ["lost", "twice", "another session", "short", "drops", "period"])
-@pytest.mark.parametrize("place", [3, 8])  # a mark, a block
-def test_each_oddity_changes_nothing_between_the_two(kind: str, place: int) -> None:
-    messages = stream(scene((100, 60, 0), (300, 60, 1)), 20)
-    assert (frame(messages[place]).type == MessageType.MARK) == (place == 3)
-    if (kind, place) == ("period", 3):  # a mark has none
-        return
-    messages[place : place + 1] = strange(kind, messages[place])
-    one, other = (make(decider=TABLES[1]) for _ in range(2))
-    wanted, found = by_one(one, b"".join(messages)), by_turn(other, b"".join(messages), [400])
-    assert found._replace(block_end_tick=None) == wanted._replace(block_end_tick=None)
     assert state_of(other) == state_of(one)
 
 

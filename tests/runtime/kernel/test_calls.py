@@ -24,13 +24,13 @@ import pytest
 from fault_grid import MODES, run_case
 from heads import head_bundle, random_layers
 from inner_kernels import called
+from links import served
 from plans import shot_major
 from streams import SESSION, click_frames
 from tree import ROOT
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
@@ -61,18 +61,19 @@ class Served:
 
     def __init__(self, mode: str, listen: str) -> None:
         self.profile, self.bundle, self.plan = small_setup(mode)
-        images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
-        scene = scene_from_arrays("turn", images, np.arange(6) % 3, ("a", "b", "c"))
         clock = DeviceClock(self.profile.clock.tick_hz)
-        device = Instrument(self.profile, scene, seed=3, power_on_tick=clock.tick_at(time.perf_counter_ns()))
-        port = open_port(listen)
-        self.url, self._stopped = port.url, threading.Event()
-        self._thread = threading.Thread(target=serve, args=(device, clock, port, self._stopped.is_set), daemon=True)
-        self._thread.start()
+        device = instrument(self.profile, clock.tick_at(time.perf_counter_ns()))
+        self._running = served(device, clock, listen)
+        self.url = self._running.__enter__().url
 
     def close(self) -> None:
-        self._stopped.set()
-        self._thread.join(10)
+        self._running.__exit__(None, None, None)
+
+
+def instrument(profile: Any, tick: int) -> Instrument:
+    images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
+    scene = scene_from_arrays("turn", images, np.arange(6) % 3, ("a", "b", "c"))
+    return Instrument(profile, scene, seed=3, power_on_tick=tick)
 
 
 def recorded(setup: Any, link: Any, path: Path, observers: Any = NO_OBSERVERS) -> tuple[RunResult, Any]:
@@ -147,10 +148,8 @@ def test_a_core_alone_leaves_the_same(mode: str, acts: bool, tmp_path: Path, mon
             monkeypatch.setattr(Core, "takes", False)
         else:
             monkeypatch.undo()
-        images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
-        scene = scene_from_arrays("turn", images, np.arange(6) % 3, ("a", "b", "c"))
         clock = DeviceClock(profile.clock.tick_hz)
-        device = Instrument(profile, scene, seed=3, power_on_tick=clock.tick_at(START_NS))
+        device = instrument(profile, clock.tick_at(START_NS))
         setup = SimpleNamespace(profile=profile, bundle=bundle, plan=plan)
         observers = Observers(lambda run, output: None, acts=acts)
         link = VirtualLink(device, clock, "sim:turn")

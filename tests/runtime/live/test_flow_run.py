@@ -13,9 +13,8 @@ from commands import json_of
 
 from pans.firmware_sim.ports.serve import open_sim
 from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
-from pans.runtime.cli import main
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import ConfigError, PlanError, UsageError
+from pans.runtime.errors import ConfigError, PlanError
 from pans.runtime.flow.make import build_flow_plan, plan_flow
 from pans.runtime.flow.settings import FlowSettings, flow_of_header, read_flow
 from pans.runtime.instrument.profile import load_profile
@@ -33,17 +32,8 @@ def run_command(
     folder: Path, capsys: pytest.CaptureFixture[str], *more: str | Path, faults: str = "", code: int = 0
 ) -> dict[str, Any]:
     device = f"sim:flow-snspd?scene={folder / 'cells.toml'}&seed=4&pace=fast&faults={faults}"
-    words = (
-        folder / "thirds.pans",
-        "--device",
-        device,
-        "--flow",
-        folder / "flow.toml",
-        "--out",
-        folder / "out",
-        "--force",
-    )
-    return json_of(capsys, "run --seconds 0.1", *words, *more, code=code)
+    words = (folder / "thirds.pans", "--device", device, "--flow", folder / "flow.toml", "--out", folder / "out")
+    return json_of(capsys, "run --force --seconds 0.1", *words, *more, code=code)
 
 
 def test_cells_are_decided_once_gated_on_time_and_replayed(
@@ -173,17 +163,19 @@ def test_a_flow_plan_has_dark_frames_where_asked_for(flow_folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"block_us": 1.0}, {"block_us": 2000.0}, {"block_us": 250.0, "dark_every": 1000}],
+    ("profile", "changes", "words"),
+    [
+        ("flow-snspd", {"block_us": 1.0}, "allowed"),
+        ("flow-snspd", {"block_us": 2000.0}, "allowed"),
+        ("flow-snspd", {"block_us": 250.0, "dark_every": 1000}, "allowed"),
+        ("oled-qcmos", {"block_us": 250.0}, "all patterns at once"),
+    ],
 )
-def test_a_flow_plan_that_cannot_be_is_refused(flow_folder: Path, changes: dict[str, Any]) -> None:
-    with pytest.raises(PlanError, match="allowed"):
-        build_flow_plan(PROFILE, thirds(flow_folder), **changes)
-
-
-def test_a_sequential_instrument_has_no_flow(flow_folder: Path) -> None:
-    with pytest.raises(PlanError, match="all patterns at once"):
-        build_flow_plan(load_profile("oled-qcmos"), thirds(flow_folder), block_us=250.0)
+def test_a_flow_plan_that_cannot_be_is_refused(
+    flow_folder: Path, profile: str, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(PlanError, match=words):
+        build_flow_plan(load_profile(profile), thirds(flow_folder), **changes)
 
 
 @pytest.mark.parametrize(
@@ -211,15 +203,5 @@ def test_shipped_settings_load_and_survive_a_header(name: str) -> None:
 
 
 def test_decisions_cannot_be_counted_beforehand(flow_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&pace=fast"
-    assert (
-        main(["run", str(flow_folder / "thirds.pans"), "--device", device, "--flow", "cells", "--decisions", "5"]) == 2
-    )
-    assert "as many decisions as objects pass" in capsys.readouterr().err
-
-
-def test_an_unknown_gate_class_is_a_usage_error(flow_folder: Path) -> None:
-    bundle = thirds(flow_folder)
-    settings = FlowSettings("cells", gate_classes=("x",))
-    with pytest.raises(UsageError, match="gate class x"):
-        plan_flow(PROFILE, bundle, make_decider(bundle), settings, 1, 0.1)
+    found = run_command(flow_folder, capsys, "--decisions", "5", code=2)
+    assert "as many decisions as objects pass" in found["error"]["message"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,13 +10,11 @@ from typing import Any
 import fault_grid
 import pytest
 from commands import json_of, page_of, words_of
-from links import served
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime import SHIPPED
-from pans.runtime.link.base import open_link
 from pans.runtime.live import RunOptions, RunResult, run_live
 from pans.runtime.record import Recorder, Recording, read_recording
 from pans.runtime.record.replaying import replay
@@ -179,20 +176,3 @@ def test_the_exit_code_and_each_file_tell(
     found = again["parts"] if parts else [again]
     assert sum(part["contradictions"].get("repeat", 0) for part in found) == n
     assert len(found) > 3 or not parts
-
-
-@pytest.mark.parametrize("how", [EQUAL, CHANGED_FIRST, CHANGED_LATER])
-def test_repeats_are_compared_at_real_pace(how: int, tmp_path: Path) -> None:
-    one, repeats = fault_grid.Case.of("device-driven", 2000), Repeats(how, 1, 0.05)
-    clock = DeviceClock(one.profile.clock.tick_hz)
-    device = Repeating(one.profile, one.scene, seed=1, power_on_tick=clock.tick_at(time.perf_counter_ns()))
-    device.repeats = repeats
-    config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False)
-    with served(device, clock) as port, Recorder(tmp_path / "run.pansrec", {"config": one.recorded()}) as recorder:
-        result = run_live(open_link(port.url), one.profile, one.bundle, one.plan, one.core, config, recorder)
-        recorder.close({})
-    again = replay(read_recording(tmp_path / "run.pansrec"), one.bundle)
-    assert (result.ended, again.as_recorded) == ("completed", True)
-    assert (repeats.changed > 10, repeats.equal > 10) == (how != EQUAL, how == EQUAL)
-    assert bool(contradictions_of(result)) == (how != EQUAL)
-    assert again.contradictions.get("repeat", 0) == result.stream["repeats_differing"]
