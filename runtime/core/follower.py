@@ -167,9 +167,7 @@ class Follower:
     moving = False  # whether objects flow past
 
     def __init__(self, plan: Plan, n_cycles: int, n_classes: int = ANY_CLASS) -> None:
-        self.contradictions: Counter[str] = (
-            Counter()
-        )  # messages that the plan or others exclude, by what is wrong in them
+        self.contradictions: Counter[str] = Counter()  # messages that the plan or others exclude, by what is wrong
         self.n_classes = n_classes
         self.start_tick = 0
         self.completed = False

@@ -255,9 +255,7 @@ class DecisionWindows:
         if self.visit_exposures > MAX_VISIT_EXPOSURES:
             raise PlanError(f"an object takes {self.visit_exposures} exposures, allowed {MAX_VISIT_EXPOSURES}")
         self.tallies: I64 = np.zeros(N_TALLIES, np.int64)
-        self._channels = (
-            plan.channels_at_once
-        )  # of several the clicks of a slot are one number until its window is settled
+        self._channels = plan.channels_at_once  # of several, a slot's clicks are one number until its window is settled
         n_features //= self._channels
         self._counts: I64 = np.zeros((self.n_windows, n_features), np.int64)
         self._out: I64 = np.zeros((self.n_windows, n_features * self._channels), np.int64)
@@ -303,13 +301,11 @@ class DecisionWindows:
         return settled
 
     def _add_clicks(self, relative: int, patterns: npt.NDArray[np.uint16], bits: npt.NDArray[np.uint8]) -> None:
+        maps = (self._feature_at, self._window_at)
         if self._adaptive:
-            maps = (self._feature_at, self._window_at)
             add_walks(relative, patterns, bits, maps, self.walks, self._counts, self._seen, self.tallies)
         else:
-            add_exposures(
-                relative, patterns, bits, self._feature_at, self._window_at, self._counts, self._seen, self.tallies
-            )
+            add_exposures(relative, patterns, bits, *maps, self._counts, self._seen, self.tallies)
 
     def skip_to(self, exposure_index: int) -> list[Window]:
         """Report every window before `exposure_index` that will never be complete (a gap, or the end of the stream)."""
@@ -324,9 +320,8 @@ class DecisionWindows:
     @position.setter
     def position(self, value: tuple[int, int, int]) -> None:
         self.advance(value)
-        self.walks.nodes[: self._next_window] = len(
-            self.walks.successors
-        )  # at a leaf: what is left of the cycle is dark
+        # at a leaf: what is left of the cycle is dark
+        self.walks.nodes[: self._next_window] = len(self.walks.successors)
 
     def advance(self, position: tuple[int, int, int]) -> None:
         """Take over a `position` to which a kernel has brought the same arrays."""
@@ -409,17 +404,8 @@ class DecisionWindows:
             self._out[index] = self._clicks(index)
             last = self._visit * self.visit_exposures + int(self._last[index])
             exposures = right if self._adaptive else 0
-            settled.append(
-                Window(
-                    self._object,
-                    index * self.shots,
-                    last,
-                    self._out[index],
-                    need - right - wrong,
-                    wrong,
-                    exposures,
-                )
-            )
+            missing, shot = need - right - wrong, index * self.shots
+            settled.append(Window(self._object, shot, last, self._out[index], missing, wrong, exposures))
             self._next_window += 1
         return settled
 

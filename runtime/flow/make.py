@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -33,9 +33,6 @@ from pans.runtime.instrument.profile import Profile
 from .core import FlowCore
 from .matching import PassageFigures
 from .settings import FlowSettings, flow_limits, flow_of_header
-
-if TYPE_CHECKING:
-    from pans.runtime.bundle.model import Bundle
 
 
 def build_flow_plan(profile: Profile, bundle: Bundle, *, block_us: float, dark_every: int = 0) -> Plan:

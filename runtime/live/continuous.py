@@ -12,10 +12,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:  # the options must not load what a run needs
-    pass
 
 INTERRUPTED = "interrupted"
 ASKED_TO_STOP = "stopped by SIGTERM"

@@ -15,12 +15,7 @@ from pans.runtime.core.decision import DECISION_DTYPE, Decision, DecisionFlag, O
 from pans.runtime.core.plan import Plan
 from pans.runtime.detector import afterpulses_of
 from pans.runtime.errors import UsageError
-from pans.runtime.instrument.calibration import (
-    Calibration,
-    find_warnings,
-    load_calibration,
-    now_utc,
-)
+from pans.runtime.instrument.calibration import Calibration, find_warnings, load_calibration, now_utc
 from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.light_level import LightWatch
@@ -32,9 +27,8 @@ from .run_options import RunOptions
 if TYPE_CHECKING:
     from .run import LiveRun
 
-FALSE_ALARM_H = (
-    240.0  # hours between false alarms about the dark counts, in the mean; as many about dead channels in the light
-)
+# hours between false alarms about the dark counts, in the mean; as many about dead channels in the light
+FALSE_ALARM_H = 240.0
 LEAST_ARL = 1e4  # dark exposures
 FEW_CLICKS = 10
 CONTRADICTION_CHANCE = 1e-9  # of dark counts as far off the end of the calibration's 95 % interval, in one run
@@ -82,17 +76,13 @@ class DarkRun:
             raise UsageError(
                 f"--on-dark {self.policy}: the plan has no dark slots", remedy="use --dark-slots 1 or more"
             )
-        channels = plan.n_channels
+        channels, said = plan.n_channels, float(click_probability(click_law(self.profile, plan.exposure_us), 0.0))
         if self.calibration is None:
-            rate = float(click_probability(click_law(self.profile, plan.exposure_us), 0.0))
-            expected = low = high = np.full(channels, rate)
+            expected = low = high = np.full(channels, said)
         else:
             expected, low, high = self.calibration.dark_probability(self.profile, plan.exposure_us, channels)
-            said = float(click_probability(click_law(self.profile, plan.exposure_us), 0.0))
-            few = self.calibration.dark_clicks(channels) < FEW_CLICKS
-            expected = np.where(
-                few, np.clip(said, low, high), expected
-            )  # hardly measured: the profile's, as far as possible
+            hardly = self.calibration.dark_clicks(channels) < FEW_CLICKS  # measured: the profile's, as far as possible
+            expected = np.where(hardly, np.clip(said, low, high), expected)
         per_hour = (plan.dark_slots_per_cycle or plan.slots_per_cycle) * 3.6e9 / plan.cycle_us
         self._header = {
             "policy": self.policy,
@@ -110,9 +100,8 @@ class DarkRun:
 
     def header(self) -> dict[str, Any]:
         """What the recording says, and a replay needs."""
-        calibration = None
-        if self.calibration is not None:
-            calibration = {"sha256": self.calibration.sha256, "values": dict(self.calibration.values)}
+        one = self.calibration
+        calibration = None if one is None else {"sha256": one.sha256, "values": dict(one.values)}
         return {"guard": self._header, "calibration": calibration, "warnings": self.warnings}
 
     def check_device(self, run: LiveRun) -> None:

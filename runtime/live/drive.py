@@ -110,9 +110,7 @@ class HostDriver:
         following = self._place.following(core.windows, core.tracker.next_exposure)
         if following == self._sent or following[0] >= core.end_exposure:
             return False
-        if (
-            connection.session.in_flight >= COMMAND_WINDOW
-        ):  # what waits for acknowledgements comes late: the next walk is named in time
+        if connection.session.in_flight >= COMMAND_WINDOW:  # what waits comes late: the next walk is named in time
             return False
         exposure, state = self._sent = following
         connection.session.submit(Opcode.SHOW, self.body(exposure, state), may_be_refused=True)

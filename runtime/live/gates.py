@@ -14,12 +14,12 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from importlib.metadata import entry_points
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from pans.runtime.core.decision import Action
-from pans.runtime.core.plan import NO_SHOT, Plan, ticks_of
+from pans.runtime.core.plan import Cycle, Plan, lay_out, ticks_of
 from pans.runtime.core.plan_codec import plan_chunks
 from pans.runtime.errors import DeviceError, LinkError, UsageError
 from pans.runtime.instrument.profile import Profile
@@ -39,14 +39,6 @@ PROBE_EVERY_NS = 89_000_000  # odd on purpose, and not that of the instrument th
 LOOK_EVERY_NS = 20_000_000
 LOOK_SOON_NS = 1_000_000  # while a pulse has no answer
 SETTLE_NS = NS_PER_S  # longest wait at the end for a pulse that is still to come
-
-
-class Sent(NamedTuple):
-    """A pulse on its way: the command's id, the tick of the second instrument's clock, and how far off the conversion may be in ns."""
-
-    command_id: int
-    tick: int
-    uncertainty_ns: int
 
 
 class SecondInstrument:
@@ -123,8 +115,8 @@ class SecondInstrument:
             session.submit(Opcode.RESET)
             self._arm()
 
-    def submit(self, at_ns: int, duration_us: float, channel: int) -> Sent:
-        """Send a pulse for `at_ns` of the host's clock, at once."""
+    def submit(self, at_ns: int, duration_us: float, channel: int) -> tuple[int, int, int]:
+        """Send a pulse for `at_ns` of the host's clock, at once; return the command's id, the tick, and how far off that may be in ns."""
         clock = self.connection.known_clock()
         tick = clock.to_tick(at_ns)
         uncertainty_ns = clock.to_host_ns(tick)[1]
@@ -134,7 +126,7 @@ class SecondInstrument:
         self.connection.flush()
         self._last_pulse_ns = max(self._last_pulse_ns, at_ns + round(duration_us * 1000))
         self._look_due_ns = 0
-        return Sent(command_id, tick, uncertainty_ns)
+        return command_id, tick, uncertainty_ns
 
     def finish(self) -> None:
         """Let the pulses that are still to come happen and be answered, within a second, then stop the instrument."""
@@ -180,20 +172,8 @@ class SecondInstrument:
 def idle_plan(profile: Profile) -> Plan:
     """Return a plan of one dark exposure per second, the shortest that `profile` carries."""
     ticks = ticks_of(profile, max(profile.exposure.min_us, 1e6 / profile.clock.tick_hz))
-    return Plan(
-        mode=profile.mode,
-        n_patterns=1,
-        slot_offset_ticks=np.zeros(1, np.int64),
-        slot_pattern=np.full(1, DARK_PATTERN, np.uint16),
-        slot_shot=np.full(1, NO_SHOT, np.uint16),
-        exposure_ticks=ticks.exposure,
-        slot_period_ticks=ticks.spacing,
-        cycle_ticks=max(profile.clock.tick_hz, ticks.spacing),
-        shots_per_cycle=1,
-        cycles_per_object=1,
-        block_exposures=1,
-        exposure_us=ticks.exposure * 1e6 / profile.clock.tick_hz,
-    )
+    cycle_ticks, zero = max(profile.clock.tick_hz, ticks.spacing), np.zeros(1, np.int64)
+    return lay_out(profile, 1, Cycle(zero + DARK_PATTERN, zero, zero, cycle_ticks, ticks.spacing, 1, 1, 1), ticks)
 
 
 GROUP = "pans.actuators"
@@ -312,16 +292,16 @@ class GateQueue:
             self._refuse(action, self._lost)
             return
         try:
-            sent = second.submit(at_ns, duration_us, action.channel)
+            command_id, tick, own_ns = second.submit(at_ns, duration_us, action.channel)
         except (LinkError, DeviceError) as error:
             self._lose_second(error)
             self._refuse(action, self._lost)
             return
         self._session = second.connection.session
-        self._sent.append((sent.command_id, action))
-        off_ns = uncertainty_ns + sent.uncertainty_ns
+        self._sent.append((command_id, action))
+        off_ns = uncertainty_ns + own_ns
         second.worst_uncertainty_ns = max(second.worst_uncertainty_ns, off_ns)
-        facts = {"host_ns": at_ns, "second_tick": sent.tick, "uncertainty_us": off_ns / 1000}
+        facts = {"host_ns": at_ns, "second_tick": tick, "uncertainty_us": off_ns / 1000}
         self._journal.note("gate_sent", decision=action.number, tick=action.tick, **facts)
 
     def _turn_second(self, second: SecondInstrument, now_ns: int) -> None:

@@ -10,6 +10,8 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain, repeat
+from typing import Any
 
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.link.base import Link, open_link
@@ -18,17 +20,12 @@ from pans.runtime.link.connection import Connection
 from .run import LiveRun
 
 NS_PER_MS = 1_000_000
-FIRST_PAUSE_S = 0.1
-LONGEST_PAUSE_S = 2.0
 MOST_FRUITLESS = 8  # reconnections in a row without one decision in between
 
 
-def pauses_s(first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> Iterator[float]:
+def pauses_s() -> Iterator[float]:
     """Yield the pauses before each attempt: doubling, then constant."""
-    pause_s = first_s
-    while True:
-        yield pause_s
-        pause_s = min(2 * pause_s, longest_s)
+    return chain((0.1, 0.2, 0.4, 0.8, 1.6), repeat(2.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +44,8 @@ class Recovery:
             lost.close()
             return open_link(url)
 
-        own = getattr(link, "reopen", None)
-        return cls(
-            (lambda lost: lost.reopen()) if own is not None else by_url,  # type: ignore[attr-defined]
-            give_up_s,
-            getattr(link, "pause", time.sleep),
-        )
+        reopen: Any = (lambda lost: lost.reopen()) if hasattr(link, "reopen") else by_url
+        return cls(reopen, give_up_s, getattr(link, "pause", time.sleep))
 
 
 def reconnect(

@@ -411,9 +411,8 @@ class LiveRun:
         ends_ns and unsure_ns (n,): when the last exposure ended, and how uncertain that is; stamps_ns (n, 4): arrival, decoded, decided,
         recorded.
         """
-        ends_ns = np.where(
-            ends_ns - unsure_ns > stamps_ns[:, 0], stamps_ns[:, 0], ends_ns
-        )  # what has arrived has happened
+        # what has arrived has happened
+        ends_ns = np.where(ends_ns - unsure_ns > stamps_ns[:, 0], stamps_ns[:, 0], ends_ns)
         marks_ns = np.column_stack((ends_ns, stamps_ns))
         late, numbers = self.timing.judge(marks_ns, unsure_ns, counts), first + np.cumsum(counts) - counts
         if self.recorder is not None:
