@@ -92,11 +92,7 @@ class RunOptions:
         (), "class to pulse for (repeatable, or a,b)", action="append", metavar="NAME", group=FLOW
     )
     gate_delay_us: float | None = option(
-        None,
-        "from leaving to the pulse (default: the settings', 900)",
-        range=Range(0, 1e6),
-        metavar="US",
-        group=FLOW,
+        None, "from leaving to the pulse (default: the settings', 900)", range=Range(0, 1e6), metavar="US", group=FLOW
     )
     act: str = option(
         DEVICE,
@@ -105,10 +101,7 @@ class RunOptions:
         group=FLOW,
     )
     act_profile: str | None = option(
-        None,
-        "hardware profile of the second instrument (default: that of the first)",
-        metavar="PROFILE",
-        group=FLOW,
+        None, "hardware profile of the second instrument (default: that of the first)", metavar="PROFILE", group=FLOW
     )
     pool: int | None = option(
         None,
@@ -146,11 +139,7 @@ class RunOptions:
         None, "record in parts of about N MiB (default: one file)", range=Range(1e-6, 1e6), metavar="N", group=DAYS
     )
     keep_mb: float | None = option(
-        None,
-        "delete the oldest parts above N MiB (default: keep all)",
-        range=Range(1e-6, 1e9),
-        metavar="N",
-        group=DAYS,
+        None, "delete the oldest parts above N MiB (default: keep all)", range=Range(1e-6, 1e9), metavar="N", group=DAYS
     )
     disk_reserve_mb: float = option(
         DISK_RESERVE_MB,
