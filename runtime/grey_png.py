@@ -1,6 +1,6 @@
 """Plain grey pictures of 8 and 16 bits as PNG (W3C PNG specification), written and read without an imaging library.
 
-All other kinds are refused. Sizes are checked before anything is unpacked.
+All other kinds are refused; what is written may have colours. Sizes are checked before anything is unpacked.
 """
 
 from __future__ import annotations
@@ -25,13 +25,17 @@ def levels_png(levels: NDArray[np.unsignedinteger[Any]], count: int) -> bytes:
     return png_bytes(np.rint(levels * (top / max(count - 1, 1))).astype(kind))
 
 
-def png_bytes(grey: NDArray[np.unsignedinteger[Any]]) -> bytes:
-    """Return a grey picture, uint8 or uint16 (height, width), as PNG."""
-    depth = 8 * grey.itemsize
+def png_bytes(grey: NDArray[np.unsignedinteger[Any]], colours: NDArray[np.uint8] | None = None) -> bytes:
+    """Return a grey picture, uint8 or uint16 (height, width), as PNG.
+
+    With `colours`, RGB (256, 3), the bytes are numbers of these; number 0 is transparent.
+    """
+    depth, kind = 8 * grey.itemsize, 0 if colours is None else 3
     rows = grey.astype(grey.dtype.newbyteorder(">")).view(np.uint8).reshape(len(grey), -1)
     raw = np.hstack([np.zeros((len(rows), 1), np.uint8), rows])  # filter 0 before each row
-    head = struct.pack(">IIBBBBB", grey.shape[1], grey.shape[0], depth, 0, 0, 0, 0)
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(raw.tobytes(), 9)), (b"IEND", b""))
+    head = struct.pack(">IIBBBBB", grey.shape[1], grey.shape[0], depth, kind, 0, 0, 0)
+    palette = [] if colours is None else [(b"PLTE", colours.tobytes()), (b"tRNS", b"\0")]
+    chunks = [(b"IHDR", head), *palette, (b"IDAT", zlib.compress(raw.tobytes(), 9)), (b"IEND", b"")]
     return PNG_MARK + b"".join(_chunk(kind, data) for kind, data in chunks)
 
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
+from pans.runtime.grey_png import png_bytes
 from pans.runtime.intervals import wilson_interval
 
 from .page import Page, Picture
-from .pixels import png
 from .rates import Rates
 
 PATTERNS_MAX = 48
@@ -26,7 +26,7 @@ def grey_png(values: F64, low: float, high: float) -> bytes:
     """Return a pattern (height, width) as a picture, `low` black and `high` white; large ones are thinned."""
     step = -(-max(values.shape) // SIDE_MAX)
     share = (values[::step, ::step] - low) / ((high - low) or 1.0)
-    return png(np.round(255 * np.clip(share, 0.0, 1.0)))
+    return png_bytes(np.round(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8))
 
 
 def shown_values(bundle: Bundle) -> tuple[F64, str]:

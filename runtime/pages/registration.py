@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pans.runtime.grey_png import png_bytes
 from pans.runtime.outputs import write_file
 from pans.runtime.registration.estimate import Estimate, pattern_residuals
 from pans.runtime.registration.measure import Registration
@@ -13,7 +14,7 @@ from pans.runtime.registration.parameters import DARK, N_GEOMETRY, PARAMETERS, f
 
 from .charts import Axis, Chart, Curve, Mark, number
 from .page import Page, Picture
-from .pixels import heat_png, png
+from .pixels import heat_png
 
 FAR = 5.0  # standard errors at the ends of the residuals' axis
 
@@ -54,8 +55,12 @@ def _target(page: Page, measurement: Registration, found: Estimate) -> None:
     page.heading("The target")
     page.pictures(
         [
-            Picture(png(np.rint(255 * stated)), "as stated", ["on the pattern grid"]),
-            Picture(png(np.rint(255 * np.clip(seen, 0, 1).reshape(shape))), "as seen", ["moved, turned, blurred"]),
+            Picture(png_bytes(np.rint(255 * stated).astype(np.uint8)), "as stated", ["on the pattern grid"]),
+            Picture(
+                png_bytes(np.rint(255 * np.clip(seen, 0, 1).reshape(shape)).astype(np.uint8)),
+                "as seen",
+                ["moved, turned, blurred"],
+            ),
             Picture(heat_png(seen.reshape(shape) - stated, -1.0, 1.0), "seen - stated", ["light to dark: -1 to 1"]),
             Picture(
                 heat_png(field, float(field.min()), float(field.max())),

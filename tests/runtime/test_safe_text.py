@@ -18,10 +18,10 @@ from nasty import NASTY
 from pans.firmware_sim.testing import small_setup
 from pans.runtime import cli, safe_text
 from pans.runtime.errors import UsageError
+from pans.runtime.grey_png import png_bytes
 from pans.runtime.html_card import html_card
 from pans.runtime.pages.charts import Axis, Chart, Curve, Mark
 from pans.runtime.pages.page import Page, Picture
-from pans.runtime.pages.pixels import png
 
 nasty = pytest.mark.parametrize("text", NASTY, ids=lambda text: ascii(text)[1:30])
 
@@ -91,7 +91,7 @@ def tags_of(text: str) -> Tags:
     page.facts({text: {"inner": [text]}})
     page.verdict(text, "fail", [(text, "advice")])
     page.tiles([(text, text, text)])
-    page.pictures([Picture(png([[0, 255]]), text, [text])], text)
+    page.pictures([Picture(png_bytes(np.zeros((1, 2), np.uint8)), text, [text])], text)
     page.confusion(np.eye(2, dtype=np.int64), (text, text), text)
     page.sentences([text])
     axis = Axis(text, 0.0, 1.0, text=lambda value: text)
