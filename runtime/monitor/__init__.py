@@ -6,6 +6,5 @@ summary at the end is the package report's. Start with monitor.py, then snapshot
 
 from .history import History
 from .monitor import Monitor
-from .snapshot import Snapshots
 
-__all__ = ["History", "Monitor", "Snapshots"]
+__all__ = ["History", "Monitor"]

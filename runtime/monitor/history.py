@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pans.runtime.intervals import wilson_interval
-from pans.runtime.timing.ledger import upper_edge
 
 MAX_BINS = 240
 FIRST_BIN_S = 1.0
@@ -59,7 +58,7 @@ class History:
         self.number += 1
 
     def _take_picture(self, picture: dict[str, Any]) -> None:
-        grown = {int(bucket): int(count) for bucket, count in picture.pop("latency", ())}
+        grown = {int(duration_ns): int(count) for duration_ns, count in picture.pop("latency", ())}
         self.pixels.update(picture.pop("pixels", {}))
         if "word" not in picture and "word" in self.picture:
             picture["word"] = self.picture["word"]
@@ -110,13 +109,13 @@ class History:
 
 
 def quantile_us(counts: Counter[int], q: float) -> float | None:
-    """Return quantile `q` of durations counted in the buckets of LatencyHistogram, microseconds; None without any."""
+    """Return quantile `q` of durations, ns with their counts, in microseconds; None without any."""
     total = sum(counts.values())
     if not total:
         return None
     wanted, seen = max(1, -int(-q * total // 1)), 0
-    for bucket in sorted(counts):
-        seen += counts[bucket]
+    for duration_ns in sorted(counts):
+        seen += counts[duration_ns]
         if seen >= wanted:
-            return upper_edge(bucket) / 1000
+            return duration_ns / 1000
     return None

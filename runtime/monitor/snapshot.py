@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.instrument.channel_health import LEVELS
+from pans.runtime.timing.ledger import upper_edge
 from pans.runtime.watch.state_file import state_of
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class Snapshots:
     def __init__(self, run: LiveRun, bundle: Bundle, recorder: Recorder | None, latest: deque[Decision]) -> None:
         self._run, self._bundle, self._recorder, self._latest = run, bundle, recorder, latest
         self._began_s = time.monotonic()
-        self._counts = np.zeros(0, np.int64)
+        self._counts = np.zeros_like(run.timing.total.counts)
         self._told: set[int] = set()
         automaton = run.plan.automaton
         self._light = None if automaton is None else bundle.light_of(automaton)  # of each state
@@ -96,13 +97,12 @@ class Snapshots:
         }
 
     def _latency(self) -> dict[str, Any]:
-        """The histogram of latencies as it has grown since the last picture: [bucket, how many more]."""
+        """The histogram of latencies as it has grown since the last picture: [duration in ns, how many more]."""
         total = self._run.timing.total
-        counts = np.array(total.counts, np.int64)
-        grown = counts if not len(self._counts) else counts - self._counts
-        self._counts = counts
-        some = np.flatnonzero(grown)
-        return {"latency": np.stack([some, grown[some]], axis=1).tolist(), "latency_max_us": total.max_ns / 1000}
+        before, self._counts = self._counts, total.counts.copy()
+        grown = self._counts - before
+        some = [[upper_edge(bucket), int(grown[bucket])] for bucket in np.flatnonzero(grown).tolist()]
+        return {"latency": some, "latency_max_us": total.max_ns / 1000}
 
     def _classes(self) -> dict[str, Any]:
         table = self._run.tally.confusion

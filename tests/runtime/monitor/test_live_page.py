@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,7 +39,11 @@ def a_history(pictures: int = 30) -> History:
                 "photons": 160.0 * k,
             },
             **{"walk_light": 7e3 * k, "exposures": 600 * k, "late": k // 10, "trouble": NASTY},
-            **{"latency": [[520 + k % 5, 18], [560, 2]], "latency_max_us": 1500.0, "recording": "run.pansrec"},
+            **{
+                "latency": [[300_000 + 10_000 * (k % 5), 18], [900_000, 2]],
+                "latency_max_us": 1500.0,
+                "recording": "run.pansrec",
+            },
             **{"dark_exposures": 50 * k, "dark_clicks": k, "dark_expected": 0.015, "dark_high": 0.02, "dark_words": ""},
             **{"clock_drift_ppm": -20 + k % 3, "clock_uncertainty_us": 70.0, "disk_free_bytes": 1 << 36},
             **{"recording_bytes": 1 << 22, "class_decided": list(range(10)), "class_truth": [10] * 10},
@@ -67,6 +73,11 @@ def until(client: socket.socket, mark: bytes) -> bytes:
     while mark not in data and (piece := client.recv(1 << 16)):
         data += piece
     return data
+
+
+def test_the_process_that_draws_loads_little() -> None:
+    loads = "import sys, pans.runtime.monitor.child, pans.runtime.monitor.server as s; print('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", loads], capture_output=True, text=True).stdout == "False\n"
 
 
 def test_the_page_is_one_small_file_that_loads_nothing() -> None:

@@ -27,11 +27,11 @@ from pans.runtime.cli import main
 from pans.runtime.commands import one_run
 from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.intervals import wilson_interval
-from pans.runtime.monitor import History, Monitor, Snapshots
+from pans.runtime.monitor import History, Monitor
 from pans.runtime.monitor.figures import class_rows, headline, latest_rows, rows_of, series
 from pans.runtime.monitor.history import MAX_BINS, quantile_us
-from pans.runtime.monitor.snapshot import begin_facts
-from pans.runtime.timing.ledger import LatencyHistogram
+from pans.runtime.monitor.snapshot import Snapshots, begin_facts
+from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 
 NUMBERS = (
     *("decisions", "abstained", "known", "right", "objects", "clicks", "photons", "photons_known", "exposures", "lost"),
@@ -62,7 +62,7 @@ def test_a_month_takes_the_memory_of_an_hour_and_loses_no_decision() -> None:
 def test_quantiles_are_those_of_the_loop_s_histogram() -> None:
     total, rng = LatencyHistogram(), np.random.default_rng(4)
     total.add_many(rng.lognormal(12, 1, 3000).astype(np.int64))
-    counts = Counter({bucket: count for bucket, count in enumerate(total.counts) if count})
+    counts = Counter({upper_edge(bucket): int(count) for bucket, count in enumerate(total.counts) if count})
     for q in (0.001, 0.5, 0.99, 0.999):
         assert quantile_us(counts, q) * 1000 == pytest.approx(total.quantile_ns(q))  # type: ignore[operator]
     assert quantile_us(Counter(), 0.5) is None
@@ -81,7 +81,7 @@ def test_what_is_wrong_is_marked_and_in_words() -> None:
     history = History()
     history.take({"kind": "begin", "deadline_us": 1000.0, "classes": ["a\x1b[2J", "b"], "expected": 100})
     late = picture(10.0, decisions=50, known=50, right=25, objects=50, clicks=100, late=3, lost=7, gaps=2)
-    late |= {"class_decided": [30, 20], "class_truth": [25, 25], "class_right": [20, 10], "latency": [[600, 50]]}
+    late |= {"class_decided": [30, 20], "class_truth": [25, 25], "class_right": [20, 10], "latency": [[1_700_000, 50]]}
     late |= {"disk_free_bytes": 1 << 20, "recording_bytes": 1 << 20, "recording": "run.pansrec"}
     late |= {"latest": [[49, 3, 0, 0.5, 2, 1, 0]]}
     history.take(late | {"trouble": "lost\n\x1b[31m", "dark_words": "", "dark_exposures": 100, "dark_clicks": 3})
