@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from bundles import made_bundle
 from models import model
 
 from pans.runtime.bundle.automaton import reachable_automaton
-from pans.runtime.bundle.model import Bundle
+from pans.runtime.bundle.model import BackEnd, Bundle, make_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.container import FILE_MAX_BYTES, JSON_VALUES_MAX, MIB
 from pans.runtime.core.decision import DECISION_DTYPE
@@ -67,8 +66,9 @@ def large_matrix() -> Bundle:
     d_f, pixels = 64, ROOM // 8 // 64
     rng = np.random.default_rng(4)
     matrix = (rng.normal(size=(d_f, pixels)) + 1j * rng.normal(size=(d_f, pixels))).astype(np.complex64) / 1000
-    optics = Analyser("coherent", matrix, "field", "none", 10.0, 100.0)
-    return passive_bundle(optics, pixels)
+    optics, head = Analyser("coherent", matrix, "field", "none", 10.0, 100.0), chain_head([d_f, 8, 2])
+    facts: dict[str, Any] = {"name": "passive", "task": "test", "classes": ("a", "b"), "provenance": {}}
+    return make_bundle(image_shape=(1, pixels), optics=optics, back_end=BackEnd(head_onnx=head), **facts)
 
 
 def large_automaton() -> Bundle:
@@ -95,12 +95,6 @@ def _layered(slots: int, width: int, shape: tuple[int, int], levels: int) -> Bun
     return made_bundle(n_classes=10, automaton=automaton, image_shape=shape, pattern_levels=patterns, **light)
 
 
-AUTOMATA: dict[str, Callable[[], Bundle]] = {one.__name__: one for one in (large_automaton, many_states)}
-BUNDLES: dict[str, Callable[[], Bundle]] = {
-    one.__name__: one for one in (many_patterns, large_patterns, large_table, large_head, wide_results, large_matrix)
-}
-
-
 def chain_head(sizes: list[int], last: float = 1.0) -> bytes:
     """A chain of dense layers with random weights, those of the last one times `last`."""
     from onnx import helper
@@ -117,34 +111,25 @@ def chain_head(sizes: list[int], last: float = 1.0) -> bytes:
     return bytes(model(nodes, weights, d_f=sizes[0], n_out=sizes[-1]).SerializeToString())
 
 
-def passive_bundle(optics: Analyser, pixels: int) -> Bundle:
-    """A bundle with these optics and a small head."""
-    from pans.runtime.bundle.model import BackEnd, make_bundle
-
-    head = BackEnd(head_onnx=chain_head([len(optics.matrix), 8, 2]))
-    return make_bundle(
-        name="passive",
-        task="test",
-        classes=("a", "b"),
-        image_shape=(1, pixels),
-        optics=optics,
-        back_end=head,
-        provenance={},
-    )
+def large_pictures() -> Bundle:
+    """Patterns for the largest pictures that a scene may have, in s.npz."""
+    return _scene_bundle((16, 2048, 2040))
 
 
-def large_scene(path: Path, shape: tuple[int, int, int]) -> Path:
-    """Pictures, which a few bytes may stand for."""
-    np.savez_compressed(path, images=np.full(shape, 200, np.uint8), labels=(np.arange(shape[0]) % 2).astype(np.int16))
-    return path
+def many_pictures() -> Bundle:
+    """Patterns for as many pictures as a scene may have, in s.npz."""
+    return _scene_bundle((85_000, 28, 28))
 
 
-def scene_bundle(shape: tuple[int, int]) -> Bundle:
-    """Patterns of as many pixels as the pictures of a scene, as many as the simulator's table and the file have room for."""
-    d_f = min(48, ROOM // 2 // (shape[0] * shape[1]))
-    levels = np.random.default_rng(6).integers(0, 65536, (d_f, shape[0] * shape[1])).astype(np.uint16)
+def _scene_bundle(shape: tuple[int, int, int]) -> Bundle:
+    """Write a scene of pictures, which a few bytes stand for, and return patterns of as many pixels, as many as there is room for."""
+    labels = (np.arange(shape[0]) % 2).astype(np.int16)
+    np.savez_compressed("s.npz", images=np.full(shape, 200, np.uint8), labels=labels)
+    pixels = shape[1] * shape[2]
+    d_f = min(48, ROOM // 2 // pixels)
+    levels = np.random.default_rng(6).integers(0, 65536, (d_f, pixels)).astype(np.uint16)
     head = chain_head([d_f, 8, 2])
-    return made_bundle(d_f, **LIGHT, pattern_levels=levels, image_shape=shape, head_onnx=head)
+    return made_bundle(d_f, **LIGHT, pattern_levels=levels, image_shape=shape[1:], head_onnx=head)
 
 
 def long_recording(path: Path, decisions: int) -> Path:

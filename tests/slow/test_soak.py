@@ -53,14 +53,6 @@ def sample(pid: int, port: int, elapsed_s: float) -> dict[str, Any]:
     }
 
 
-def slope_of(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return the least-squares slope of y over x and its standard error."""
-    around = x - x.mean()
-    slope = float(around @ y / (around @ around))
-    residual = y - y.mean() - slope * around
-    return slope, float(np.sqrt(residual @ residual / (len(x) - 2) / (around @ around)))
-
-
 def wait_until_running(process: subprocess.Popen[str], state: Path) -> None:
     """Wait until the state file says that the run is under way."""
     until = time.monotonic() + 120
@@ -99,8 +91,8 @@ def test_a_long_run_with_faults_stays_flat_and_ends_well(tmp_path: Path) -> None
     later = [one for one in samples if one["s"] >= WARM_UP_SHARE * samples[-1]["s"]]
     seconds, rss = np.array([one["s"] for one in later]), np.array([one["rss"] for one in later], float)
     print("MiB", (rss[::6] / 2**20).round(1).tolist())
-    slope, error = slope_of(seconds, rss)
-    assert (slope + 1.96 * error) * float(np.ptp(seconds)) <= FLAT_RSS_BYTES
+    (slope, _), covariance = np.polyfit(seconds, rss, 1, cov=True)
+    assert (slope + 1.96 * covariance[0, 0] ** 0.5) * float(np.ptp(seconds)) <= FLAT_RSS_BYTES
     assert later[-1]["handles"] - later[0]["handles"] <= FLAT_HANDLES
     assert later[-1]["threads"] - later[0]["threads"] <= FLAT_THREADS
     paths = parts_in(out)

@@ -96,16 +96,10 @@ class Bench:
         shutil.copytree(self.inputs, self.folder)
         return contents(self.folder)
 
-    def cut(self, case: Case) -> tuple[Ended, list[tuple[str, Files]]]:
-        """Run a command and return how it ended, and what a power cut leaves at any moment."""
-        disk, journal = disk_of(self.folder), self.trace.with_name("journal")
+    def run(self, case: Case, at: int = 0, fault: Fault = Fault.NONE, error: int = 0, journal: str = "") -> Ended:
+        """Run a command."""
         words = case.words.replace("TRACE", str(self.trace)).split()
-        ended = self.storage.noted(words, self.folder, journal)
-        return ended, states(disk, journal)
-
-    def run(self, case: Case, at: int = 0, fault: Fault = Fault.NONE, error: int = 0) -> Ended:
-        words = case.words.replace("TRACE", str(self.trace)).split()
-        return self.storage.run(words, self.folder, at, fault, error)
+        return self.storage.run(words, self.folder, at, fault, error, journal)
 
 
 @pytest.fixture(scope="module")
@@ -254,10 +248,11 @@ def judge_cut(bench: Bench, case: Case, before: Files, left: Files) -> None:
 @pytest.mark.parametrize("name", CUT)
 def test_a_power_cut_at_every_call_of_every_command(name: str, bench: Bench) -> None:
     case = CASES[name]
-    before = bench.fresh()
-    ended, cuts = bench.cut(case)
+    before, journal = bench.fresh(), bench.trace.with_name("journal")
+    disk = disk_of(bench.folder)
+    ended = bench.run(case, journal=str(journal))
     assert ended.code in (0, 1), ended
-    after = contents(bench.folder)
+    after, cuts = contents(bench.folder), states(disk, journal)
     for words, left in cuts:
         try:
             judge_cut(bench, case, before, left)

@@ -1,14 +1,12 @@
 """Storage that fails: runs commands in processes of their own, in which the n-th call on files below a folder fails, is cut or is the last.
 
 The faults are made between the process and the kernel (storage_faults.c, by LD_PRELOAD): nothing of the project is replaced. A process with
-everything imported is forked for each command, so that hundreds of them take a minute. As a program it is that process. A forked process
-differs from a fresh one in what it need not do: import, compile or load kernels, fill caches. `fresh` runs a command in a fresh one.
+everything imported is forked for each command, so that hundreds of them take a minute. As a program it is that process.
 """
 
 from __future__ import annotations
 
 import ctypes
-import errno
 import gc
 import json
 import os
@@ -16,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -54,12 +53,8 @@ class FaultyStorage:
         shim = folder / "storage_faults.so"
         source = str(HERE / "storage_faults.c")
         subprocess.run([compiler(), "-shared", "-fPIC", "-O1", "-o", str(shim), source, "-ldl"], check=True)
-        self._environment = environment = {
-            **os.environ,
-            "LD_PRELOAD": str(shim),
-            "PYTHONPATH": os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
-        }
-        self._program = words = [sys.executable, str(HERE / "storage.py"), str(shim), str(folder)]
+        environment = os.environ | {"LD_PRELOAD": str(shim)}
+        words = [sys.executable, __file__, str(shim), str(folder)]
         self._errors = folder / "server.txt"
         with self._errors.open("wb") as errors:
             self._process = subprocess.Popen(
@@ -67,15 +62,18 @@ class FaultyStorage:
             )
         self._ask({"warm": [list(one) for one in warm]})
 
-    def run(self, words: Sequence[str], folder: Path, at: int = 0, fault: Fault = Fault.NONE, error: int = 0) -> Ended:
-        """Run a command in `folder`, on whose files call number `at` meets `fault`."""
-        asked = {"words": list(words), "folder": str(folder), "at": at, "fault": int(fault), "error": error}
-        return Ended(**self._ask(asked))
-
-    def noted(self, words: Sequence[str], folder: Path, journal: Path) -> Ended:
-        """Run a command in `folder`; what it does to the files there is written to `journal` (power_cut.py reads it)."""
-        asked = {"words": list(words), "folder": str(folder), "at": 0, "fault": 0, "error": 0, "journal": str(journal)}
-        return Ended(**self._ask(asked))
+    def run(
+        self,
+        words: Sequence[str],
+        folder: Path,
+        at: int = 0,
+        fault: Fault = Fault.NONE,
+        error: int = 0,
+        journal: str = "",
+    ) -> Ended:
+        """Run a command in `folder`, on whose files call number `at` meets `fault`; power_cut.py reads the `journal` of all calls."""
+        where = {"words": list(words), "folder": str(folder), "journal": journal}
+        return Ended(**self._ask(where | {"at": at, "fault": int(fault), "error": error}))
 
     def close(self) -> None:
         self._process.communicate()
@@ -114,18 +112,6 @@ def _serve(shim: str, folder: str) -> None:
         print(json.dumps(found), file=answers, flush=True)
 
 
-def _once(shim: str, asked: dict[str, Any], told: int) -> None:
-    """Carry out one question in this process."""
-    from pans.runtime.cli import main
-
-    faults = ctypes.CDLL(shim)
-    os.chdir(asked["folder"])
-    faults.storage_arm(asked["folder"].encode(), asked["at"], asked["fault"], asked["error"])
-    code = main(asked["words"])
-    os.write(told, str(faults.storage_calls()).encode())
-    os._exit(code)
-
-
 def _forked(main: Any, faults: Any, asked: dict[str, Any]) -> dict[str, Any]:
     said, told = os.memfd_create("stderr"), os.memfd_create("calls")
     child = os.fork()
@@ -135,14 +121,12 @@ def _forked(main: Any, faults: Any, asked: dict[str, Any]) -> dict[str, Any]:
             os.chdir(asked["folder"])
             os.dup2(said, 2)
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-            faults.storage_journal(asked.get("journal", "").encode())
+            faults.storage_journal(asked["journal"].encode())
             faults.storage_arm(asked["folder"].encode(), asked["at"], asked["fault"], asked["error"])
             code = main(asked["words"])
         except SystemExit as error:
             code = int(error.code or 0)
         except BaseException:
-            import traceback
-
             traceback.print_exc()
         finally:
             os.write(told, str(faults.storage_calls()).encode())
@@ -160,9 +144,5 @@ def _forked(main: Any, faults: Any, asked: dict[str, Any]) -> dict[str, Any]:
     return {"code": os.waitstatus_to_exitcode(ended[1]), "calls": int(words[1] or 0), "said": words[0]}
 
 
-ERRORS = (errno.EIO, errno.ENOSPC)
-
 if __name__ == "__main__":
-    if len(sys.argv) > 3:
-        _once(sys.argv[1], json.loads(sys.argv[3]), int(sys.argv[4]))
     _serve(*sys.argv[1:])
