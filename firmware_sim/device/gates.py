@@ -23,33 +23,21 @@ class GatePulse(NamedTuple):
     channel: int
 
 
-class GateRefusal(NamedTuple):
-    """One pulse that was asked for at tick `asked_at` and not accepted, and why."""
-
-    tick: int
-    channel: int
-    asked_at: int
-    status: AckStatus
-
-
 class Gates:
-    """All outputs; `pulses` and `refusals` in the order of their commands, the oldest forgotten; `accepted` and `refused` count all."""
+    """All outputs; `pulses` in the order of their commands, the oldest forgotten; `refused` counts those that were not accepted."""
 
     def __init__(self) -> None:
         self.pulses: deque[GatePulse] = deque(maxlen=MAX_KEPT_PULSES)
-        self.refusals: deque[GateRefusal] = deque(maxlen=MAX_KEPT_PULSES)
-        self.accepted = self.refused = 0
+        self.refused = 0
         self._pending: list[int] = []  # ticks, some of them passed
 
     def add(self, gate: Gate, now: int) -> None:
         """Accept a pulse, or raise `Refused`: a pulse that comes too late is never executed."""
         try:
             self._check(gate, now)
-        except Refused as refusal:
+        except Refused:
             self.refused += 1
-            self.refusals.append(GateRefusal(gate.tick, gate.channel, now, refusal.status))
             raise
-        self.accepted += 1
         self._pending.append(gate.tick)
         self.pulses.append(GatePulse(gate.tick, gate.tick + gate.duration_ticks, gate.channel))
 

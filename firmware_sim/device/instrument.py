@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pans.firmware_sim.program import Program
@@ -48,20 +47,6 @@ if TYPE_CHECKING:
 NEVER = 1 << 64
 
 
-@dataclass(slots=True)
-class InstrumentCounters:
-    """What the instrument has seen since power-on; nothing is dropped without one of these moving."""
-
-    sessions: int = 0
-    foreign_session: int = 0
-    unknown_type: int = 0
-    malformed: int = 0
-    refused: int = 0
-    repeated_commands: int = 0
-    commands_out_of_order: int = 0
-    lease_expiries: int = 0
-
-
 class Instrument:
     """A simulated instrument from power-on; `step` and `next_event_tick` are all that a shell needs."""
 
@@ -80,7 +65,6 @@ class Instrument:
         scene = SceneFile(scene.name, scene) if isinstance(scene, Scene) else scene
         self.view = View(profile, scene, optics, seed)
         self.view.check_and_warm_up()
-        self.counters = InstrumentCounters()
         self.decoder = wire.FrameDecoder()
         self.state, self.reason = DeviceState.IDLE, StateReason.POWER_ON
         self.session = 0  # the host's nonce; 0 before the first HELLO
@@ -178,7 +162,6 @@ class Instrument:
         elif what == "end":
             self._end_run(DeviceState.IDLE, StateReason.COMPLETED)
         elif what == "lease":
-            self.counters.lease_expiries += 1
             self._end_run(DeviceState.SAFE, StateReason.LEASE_EXPIRED)
 
     def _enter(self, state: DeviceState, reason: StateReason) -> None:
@@ -221,7 +204,7 @@ class Instrument:
             if frame.type == MessageType.HELLO:
                 self._hello(frame)
             elif not self.session or frame.session != self.session:
-                self.counters.foreign_session += 1
+                return
             elif frame.type == MessageType.PING:
                 ping = wire.Ping(*wire.fields("PING", frame.payload))
                 pong = wire.Pong(ping.probe_id, ping.host_ns, self._tick, self._tick)
@@ -230,10 +213,8 @@ class Instrument:
                 self._grant(wire.Grant(*wire.fields("GRANT", frame.payload)))
             elif frame.type == MessageType.COMMAND:
                 self._command(wire.decode_command(frame.payload))
-            else:
-                self.counters.unknown_type += 1
         except wire.MalformedMessage:
-            self.counters.malformed += 1
+            return  # nothing says what it was: the host asks again
 
     def _hello(self, frame: Frame) -> None:
         hello = wire.Hello(*wire.fields("HELLO", frame.payload, exact=False))
@@ -244,7 +225,6 @@ class Instrument:
             self._out.append(wire.encode_welcome(self._facts(), self.session))
             self._send_status()
             return
-        self.counters.sessions += 1
         self._end_run(DeviceState.IDLE, StateReason.STOPPED)
         self._forget_session()
         self._out.append(wire.encode_welcome(self._facts(), frame.session))
@@ -273,15 +253,9 @@ class Instrument:
             try:
                 self._execute(command)
             except Refused as refusal:
-                self.counters.refused += 1
                 self._ack = wire.Ack(expected, expected, refusal.status, refusal.text, mask | 1)
             except wire.MalformedMessage as error:
-                self.counters.refused += 1
                 self._ack = wire.Ack(expected, expected, AckStatus.MALFORMED, str(error), mask | 1)
-        elif command.command_id < expected:
-            self.counters.repeated_commands += 1
-        else:
-            self.counters.commands_out_of_order += 1
         self._send_ack()
 
     # -- commands ------------------------------------------------------------------------------------------------------

@@ -120,11 +120,6 @@ class FrameRun(Timetable):
             ahead.popleft()
         return ahead[0] if ahead or self._draw() else None
 
-    @property
-    def made_until(self) -> int:
-        """The tick at which the last message that is made is due; the start tick when none is."""
-        return self._ahead[-1].due[-1] if self._ahead else self._start_tick
-
     def draw_ahead(self) -> bool:
         """Make a stretch of what is to come, if there is room; whether it did."""
         self._at_once = self._ahead_blocks
