@@ -312,9 +312,7 @@ class Evidence:
         """Return what is known about the time from `begin_ns` to `end_ns`, both host times."""
         if not self.heard_since(end_ns):
             self._counters.read()
-        first, last = self._counters.around(begin_ns, end_ns)
-        cpu_ns = last.cpu_ns - first.cpu_ns
-        own, *readers = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)] or [0]
+        steal_ns, cpu_ns, own, *readers = self._counters.grown(begin_ns, end_ns)
         spans, arrivals_ns = list(self._spans), list(self._arrivals)  # both in the order of their ends
         first_span = bisect_right(spans, begin_ns, key=attrgetter("end_ns"))
         return Facts(
@@ -326,7 +324,7 @@ class Evidence:
             self._pause_ns,
             cpu_ns,
             max([own, *(delay - cpu_ns for delay in readers)]),  # a reader waits for the loop while that computes
-            last.steal_ns - first.steal_ns,
+            steal_ns,
             tuple(
                 one
                 for one in self._stamped
@@ -342,34 +340,24 @@ class Evidence:
             self._collecting_ns = 0
 
 
-class Sample(NamedTuple):
-    """Counters of the system, read between `began_ns` and `ended_ns`; they only ever grow."""
-
-    began_ns: int
-    ended_ns: int
-    cpu_ns: int  # that the loop's thread has computed
-    run_delays_ns: tuple[int, ...]  # how long each thread, the loop's first, waited to run
-    steal_ns: int  # of the whole machine: time in which the hypervisor ran somebody else
-
-
 class Counters:
     """Samples of the counters of some threads, the loop's first; made by a thread of their own, or by `read` in the caller's.
 
     The thread runs one step below the loop's priority, where that is a real-time one: it never takes the processor from the loop. Not
     further down: whoever holds the interpreter must not wait for the rest of the machine, since the loop may be waiting for it.
-    Where the system does not tell, there is no thread, and a sample holds the caller's own time and zeros.
+    Where the system does not tell, there is no thread, and a sample holds the caller's own computing time and zeros.
     """
 
     def __init__(self, now_ns: Callable[[], int], threads: Sequence[int]) -> None:
         self.heard_ns = 0  # when the latest reading began
         self._now = now_ns
-        self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
+        # when a reading began and ended; steal of the whole machine, computing time of the loop, how long each thread waited to run, ns
+        self._samples: deque[tuple[int, int, list[int]]] = deque(maxlen=MAX_SAMPLES)
         self._lock, self._stop = threading.Lock(), threading.Event()
         self._files: list[int] = []
-        with suppress(OSError):  # in the order of `_sample`
-            for path in (
-                ("/proc/stat", *(f"/proc/self/task/{thread}/schedstat" for thread in threads)) if threads else ()
-            ):
+        tasks = [f"/proc/self/task/{thread}/schedstat" for thread in threads]
+        with suppress(OSError):
+            for path in ["/proc/stat", *tasks] if tasks else []:
                 self._files.append(os.open(path, os.O_RDONLY))
         self.read()
         self._thread = threading.Thread(target=self._watch, name="pans-counters", daemon=True)
@@ -382,24 +370,25 @@ class Counters:
             return
         try:
             began_ns = self._now()
-            numbers = [_numbers(file) for file in self._files]
-            if len(numbers) > 1:
-                (*_, steal), *tasks = [numbers[0][:8], *(one[:2] for one in numbers[1:])]
-                cpu_ns, delays_ns = tasks[0][0], tuple(task[1] for task in tasks)
-                steal_ns = steal * (NS_PER_S // os.sysconf("SC_CLK_TCK"))
-                sample = Sample(began_ns, self._now(), cpu_ns, delays_ns, steal_ns)
-            else:
-                sample = Sample(began_ns, self._now(), time.thread_time_ns(), (), 0)
-            self._samples.append(sample)
+            stat, *tasks = [_numbers(file) for file in self._files] or [[]]
+            found = [0, time.thread_time_ns(), 0]
+            if tasks:
+                steal_ns = stat[7] * (NS_PER_S // os.sysconf("SC_CLK_TCK"))
+                found = [steal_ns, tasks[0][0], *(task[1] for task in tasks)]
+            self._samples.append((began_ns, self._now(), found))
             self.heard_ns = began_ns
         finally:
             self._lock.release()
 
-    def around(self, begin_ns: int, end_ns: int) -> tuple[Sample, Sample]:
-        """Return the latest sample that was whole at `begin_ns` and the first one begun at `end_ns`; as near as there are."""
+    def grown(self, begin_ns: int, end_ns: int) -> list[int]:
+        """Return by how much the counters grew from the latest reading whole at `begin_ns` to the first begun at `end_ns`.
+
+        [steal, computing time, waiting time of each thread], ns; of the nearest readings where there are none such.
+        """
         samples = list(self._samples)
-        before = next((one for one in reversed(samples) if one.ended_ns <= begin_ns), samples[0])
-        return before, next((one for one in samples if one.began_ns >= end_ns), samples[-1])
+        first = next((one for one in reversed(samples) if one[1] <= begin_ns), samples[0])
+        last = next((one for one in samples if one[0] >= end_ns), samples[-1])
+        return [after - before for before, after in zip(first[2], last[2])]
 
     def close(self) -> None:
         """End the thread and close the files; idempotent."""
