@@ -33,10 +33,9 @@ def test_the_same_objects_are_paired_and_counted(runs: Path, capsys: pytest.Capt
     better = sum(right[0][one] and not right[1][one] for one in right[0])
     worse = sum(right[1][one] and not right[0][one] for one in right[0])
     rows = {row["name"]: row for row in found["findings"]}
-    assert found["paired"]
+    assert (found["paired"], rows["clicks_mean"]["significant"]) == (True, True)
     assert rows["accuracy"]["p"] == mcnemar_exact(better, worse)
     assert rows["accuracy"]["difference"] == pytest.approx((better - worse) / 80)
-    assert rows["clicks_mean"]["significant"]
     assert rows["clicks_mean"]["first"] == pytest.approx(first["clicks"].mean())
     least = min((row for row in found["findings"] if row["p"] is not None), key=lambda row: row["p"])
     tested = sum(row["p"] is not None for row in found["findings"])
@@ -109,19 +108,32 @@ def test_a_cut_recording_is_compared_as_far_as_it_goes(runs: Path, tmp_path: Pat
     assert "Side A was cut" in words_of((tmp_path / "page.html").read_text())
 
 
-@pytest.mark.parametrize("what", ["missing", "empty folder", "bundle", "other json", "broken json", "two recordings"])
-def test_what_is_no_run_is_refused(what: str, runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    place = tmp_path / {"other json": "a.json", "broken json": "b.json"}.get(what, "x")
-    if what in ("empty folder", "two recordings"):
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("missing", None),
+        ("bundle", "PANSxyz"),
+        ("other.json", '{"a": 1}'),
+        ("broken.json", "{"),
+        ("empty folder", None),
+    ],
+)
+def test_what_is_no_run_is_refused(
+    name: str, text: str | None, runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / name
+    if text is not None:
+        place.write_text(text)
+    if name == "empty folder":
         place.mkdir()
-    if what == "two recordings":
-        for name in ("p", "q"):
-            (place / f"{name}.pansrec").write_bytes(b"")
-    texts = {"bundle": "PANSxyz", "other json": '{"a": 1}', "broken json": "{"}
-    if what in texts:
-        place.write_text(texts[what])
     assert main(["compare", str(place), str(runs / "a")]) == 2
     assert str(place) in capsys.readouterr().err
+
+
+def test_a_folder_of_two_recordings_is_no_run(runs: Path, tmp_path: Path) -> None:
+    for name in ("p", "q"):
+        (tmp_path / f"{name}.pansrec").write_bytes(b"")
+    assert main(["compare", str(tmp_path), str(runs / "a")]) == 2
 
 
 def test_the_page_in_a_browser(runs: Path, tmp_path: Path) -> None:

@@ -65,14 +65,11 @@ def test_parquet_holds_every_decision(recording: Path, tmp_path: Path, capsys: p
     assert columns["decision"] == rows["index"].tolist()
     for name, field in (("tick", "tick"), ("clicks", "clicks"), ("object", "object"), ("flags", "flags")):
         assert columns[name] == rows[field].tolist()
-    known = rows["label"] != NO_LABEL
-    assert columns["class"] == [
-        classes[label] if one else None for label, one in zip(rows["label"], known, strict=True)
-    ]
-    assert columns["truth"] == [None if truth < 0 else truth for truth in rows["truth"].tolist()]
-    assert columns["probability"] == [
-        p if one else None for p, one in zip(rows["probability"].tolist(), known, strict=True)
-    ]
+    known = (rows["label"] != NO_LABEL).tolist()
+    labels, probabilities, truths = (rows[name].tolist() for name in ("label", "probability", "truth"))
+    assert columns["class"] == [classes[label] if one else None for label, one in zip(labels, known)]
+    assert columns["truth"] == [None if truth < 0 else truth for truth in truths]
+    assert columns["probability"] == [p if one else None for p, one in zip(probabilities, known)]
     facts = json.loads(table.schema.metadata[b"pans"])
     assert (facts["simulated"], facts["decisions_sha256"]) == (True, source.decisions_sha256)
 
@@ -89,20 +86,10 @@ def test_a_bundle_comes_back_from_its_exports(way: str, tmp_path: Path, capsys: 
     out, head = tmp_path / "parts", tmp_path / "head.onnx"
     facts = json_of(capsys, "export", FASHION, "--format", way, "-o", out)
     json_of(capsys, "export", FASHION, "--format", "onnx", "-o", head)
-    words = [
-        "--head",
-        head,
-        "--classes",
-        ",".join(facts["classes"]),
-        "--levels",
-        facts["levels"],
-        "-o",
-        tmp_path / "b.pans",
-    ]
-    if way == "npy":
-        words += ["--patterns", out / "patterns.npy"]
-    else:
-        words += ["--patterns", out, "--photons-at-white", facts["photons_at_white"]]
+    classes = ",".join(facts["classes"])
+    words = ["--head", head, "--classes", classes, "--levels", facts["levels"], "-o", tmp_path / "b.pans"]
+    white = [] if way == "npy" else ["--photons-at-white", facts["photons_at_white"]]
+    words += ["--patterns", out / "patterns.npy" if way == "npy" else out, *white]
     json_of(capsys, "bundle", *words)
     (before, _), (after, _) = load_bundle(FASHION), load_bundle(tmp_path / "b.pans")
     assert (after.pattern_levels == before.pattern_levels).all()

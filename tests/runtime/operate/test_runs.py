@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from argparse import ArgumentTypeError
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -41,19 +42,13 @@ def test_the_list_says_what_the_summary_says(root: Path, capsys: pytest.CaptureF
     found = {Path(run["folder"]).name: run for run in listed(capsys, root)["runs"]}
     assert found.keys() == {"whole", "parts"}
     for name, decisions in (("whole", 20), ("parts", 60)):
-        run = found[name]
-        summary = (root / name / "summary.md").read_text()
-        assert (run["decisions"], run["bundle"], run["simulated"], run["locked"]) == (
-            decisions,
-            "fashion10",
-            True,
-            False,
-        )
+        run, summary = found[name], (root / name / "summary.md").read_text()
+        told = tuple(run[key] for key in ("decisions", "bundle", "simulated", "locked"))
+        assert told == (decisions, "fashion10", True, False)
         assert run["verdict"] in ("PASS", "FAIL")
         assert run["verdict"] in summary
         assert run["bytes"] == sum(path.stat().st_size for path in (root / name).iterdir())
-        started = datetime.fromisoformat(run["started"])
-        assert abs((datetime.now(UTC) - started).total_seconds()) < 3600
+        assert datetime.now(UTC) - datetime.fromisoformat(run["started"]) < timedelta(hours=1)
     assert main(["runs", str(root)]) == 0
     assert "2 runs" in capsys.readouterr().out
 
@@ -110,3 +105,11 @@ def test_links_are_not_followed(root: Path, tmp_path: Path) -> None:
 def test_times_and_sizes() -> None:
     assert (duration_s("30d"), duration_s("1.5 h"), duration_s("2w")) == (2_592_000, 5400, 1_209_600)
     assert (size_bytes("5GB"), size_bytes("200 MiB")) == (5 * 10**9, 200 << 20)
+    for text in ("30", "d", "5 parsecs", "-1d"):
+        with pytest.raises(ArgumentTypeError):
+            duration_s(text)
+
+
+@pytest.mark.parametrize("words", ["prune", "--keep 3", "--yes", "a b"])
+def test_words_without_effect_are_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    listed(capsys, *words.split(), code=2)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from commands import page_of, words_of
+from commands import json_of, page_of, words_of
 
 from pans.runtime.cli import main
 from pans.runtime.pages import flow
@@ -28,16 +27,10 @@ def run(flow_folder: Path) -> Path:
 def test_the_page_says_what_the_run_said(run: Path, tmp_path: Path) -> None:
     page = page_of(run, tmp_path)
     words, summary = words_of(page), read_recording(run).summary
-    for text in (
-        "Objects that passed by",
-        f"{summary['accuracy']:.3%}",
-        f"{summary['missed']:.3%}",
-        f"{summary['yield']:.3%}",
-        f"{summary['purity']:.3%}",
-        ", ".join(str(n) for n in summary["gates"].values()),
-        "Decisions by what became of them",
-        "true class in rows",
-    ):
+    shares = [f"{summary[name]:.3%}" for name in ("accuracy", "missed", "yield", "purity")]
+    gates = ", ".join(str(n) for n in summary["gates"].values())
+    sections = ("Objects that passed by", "Decisions by what became of them", "true class in rows")
+    for text in (*sections, *shares, gates):
         assert text in words
     assert "spread over trials" not in words
     assert "Late and missing work" not in words
@@ -67,12 +60,10 @@ def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> Non
     assert pulses["asked"].tolist() == asked.tolist()
     assert (pulses["refused"].tolist(), pulses["expired"].tolist()) == ([asked[0]], [asked[2]])
     assert len(pulses["done"]) == len(asked) - 2
-    span, rows = _span_of(told), recording.decisions()
-    bins = _bins_of(rows["tick"])
-    found = _late_rows(told, span)
-    wanted = {"link": (3, 4), "host": (9, 20)}
-    assert {cause: counts.tolist() for cause, counts in found.items()} == {
-        cause: np.bincount(bins[list(numbers)], minlength=BINS).tolist() for cause, numbers in wanted.items()
+    bins = _bins_of(recording.decisions()["tick"])
+    assert {cause: counts.tolist() for cause, counts in _late_rows(told, _span_of(told)).items()} == {
+        cause: np.bincount(bins[list(numbers)], minlength=BINS).tolist()
+        for cause, numbers in (("link", (3, 4)), ("host", (9, 20)))
     }
 
 
@@ -101,13 +92,11 @@ def test_late_decisions_are_counted_once_however_many_events_are_held(
         events.insert(4 * first // 3 + 3, blame | {"cause": "link" if first % 2 else "host"})
     told: Any = SimpleNamespace(iter_decisions=recording.iter_decisions, events=lambda: iter(events))
     span = _span_of(told)
-    whole = _late_rows(told, span)
-    assert sum(int(counts.sum()) for counts in whole.values()) == 200
+    whole = {cause: counts.tolist() for cause, counts in _late_rows(told, span).items()}
+    assert sum(map(sum, whole.values())) == 200
     for held in (8, 20, 64):
         monkeypatch.setattr(flow, "EVENTS_AT_ONCE", held)
-        assert {cause: counts.tolist() for cause, counts in _late_rows(told, span).items()} == {
-            cause: counts.tolist() for cause, counts in whole.items()
-        }
+        assert {cause: counts.tolist() for cause, counts in _late_rows(told, span).items()} == whole
 
 
 def test_parts_of_a_flow_tell_of_their_passages(
@@ -115,13 +104,10 @@ def test_parts_of_a_flow_tell_of_their_passages(
 ) -> None:
     device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast"
     words = ["run", str(flow_folder / "thirds.pans"), "--device", device, "--flow", str(flow_folder / "flow.toml")]
-    words += ["--seconds", "1.5", "--rotate-mb", "1", "--out", str(tmp_path), "--json"]
-    assert main(words) == 0
-    summary = json.loads(capsys.readouterr().out)
+    summary = json_of(capsys, "", *words, "--seconds", "1.5", "--rotate-mb", "1", "--out", tmp_path)
     parts = sorted(tmp_path.glob("run-*.pansrec"))
     assert len(parts) >= 2
-    assert main(["replay", str(tmp_path), "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["parts"]
+    rows = json_of(capsys, "replay", tmp_path)["parts"]
     marks = sum(row["passages"]["marks"] for row in rows)
     assert 0.98 * summary["passages"]["marks"] <= marks <= summary["passages"]["marks"]
     for row in rows:
@@ -131,7 +117,5 @@ def test_parts_of_a_flow_tell_of_their_passages(
         assert row["missed"] < 0.02
     assert main(["replay", str(parts[1])]) == 0
     text = capsys.readouterr().out
-    assert "passages" in text
-    assert "accuracy" in text
-    words_on_page = words_of(page_of(parts[1], tmp_path))
-    assert "This is one part of a run" in words_on_page
+    assert ("passages" in text, "accuracy" in text) == (True, True)
+    assert "This is one part of a run" in words_of(page_of(parts[1], tmp_path))

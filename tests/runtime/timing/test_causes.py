@@ -180,11 +180,10 @@ def test_an_incident_is_judged_once_from_its_worst_decision() -> None:
 
 def test_late_work_that_does_not_overlap_is_judged_apart() -> None:
     evidence = Evidence(lambda: 0, 10 * MS, virtual=True)
-    evidence.worked(DISK, 100 * MS, 120 * MS)
-    evidence.worked(INFERENCE, 121 * MS, 161 * MS)
     incidents = Incidents(evidence)
-    incidents.late(LateWork(0, 101 * MS, 101 * MS, 120 * MS))
-    incidents.late(LateWork(1, 121 * MS, 121 * MS, 161 * MS))
+    for number, (kind, begin, end) in enumerate(((DISK, 100, 120), (INFERENCE, 121, 161))):
+        evidence.worked(kind, begin * MS, end * MS)
+        incidents.late(LateWork(number, (begin + 1) * MS, (begin + 1) * MS, end * MS))
     assert [verdict_of(incidents, 10**12)["cause"] for _ in range(2)] == ["disk", "inference"]  # type: ignore[index]
 
 
@@ -203,12 +202,10 @@ def test_a_real_collection_is_seen_with_its_length() -> None:
     evidence = Evidence(time.perf_counter_ns, MS)
     heap = [[[]] for _ in range(400_000)]
     evidence.watch()
-    try:
-        begin = time.perf_counter_ns()
-        gc.collect()
-        end = time.perf_counter_ns()
-    finally:
-        evidence.close()
+    begin = time.perf_counter_ns()
+    gc.collect()
+    end = time.perf_counter_ns()
+    evidence.close()
     assert evidence._on_gc not in gc.callbacks
     assert len(heap) == 400_000
     known = evidence.facts(begin, begin, end)

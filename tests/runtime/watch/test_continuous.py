@@ -126,13 +126,12 @@ def test_sigterm_ends_a_continuous_run_well(bundle_file: Path, tmp_path: Path, l
 
 
 @contextmanager
-def _running(bundle_file: Path, folder: Path, *more: str, device: str = DEVICE) -> Iterator[subprocess.Popen[str]]:
+def _running(bundle_file: Path, folder: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
     """A run in a process of its own, with its files in `folder`."""
-    words = ["run", "--device", device, "--no-realtime", "--json", str(bundle_file), *more]
+    words = ["run", "--device", DEVICE, "--no-realtime", "--json", str(bundle_file), *more]
     words += ["--out", str(folder / "out"), "--state", str(folder / "state.json")]
-    command = "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))"
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = subprocess.Popen([sys.executable, "-c", command, *words], text=True, **pipes)
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-m", "pans", *words], **pipes)
     try:
         yield process
     finally:
