@@ -144,7 +144,7 @@ def coarse(bench: Bench, observed: Observed, library: Library, count: int = STAR
     xy, xx = (weight * y) @ x, weight @ (x * x)
     slope = np.maximum(xy, 0.0) / xx
     rest = (weight * y) @ y - slope * xy
-    dark = _dark_start(observed)
+    dark = -math.log1p(-observed.clicks[~lit].sum() / (observed.exposures[~lit].sum() + 1))
     result = []
     for place in np.argsort(rest)[:count]:
         gain = max(float(slope[place]), 0.02)
@@ -161,12 +161,6 @@ def _told_means(bench: Bench, observed: Observed) -> F64:
     log_miss = bench.model.log_miss(grid)
     share = (observed.clicks + 0.25) / (observed.exposures + 0.5)
     return np.interp(-(np.log1p(-share) - observed.log_other), -log_miss, grid)
-
-
-def _dark_start(observed: Observed) -> float:
-    dark = ~observed.lit
-    clicks, exposures = int(observed.clicks[dark].sum()), int(observed.exposures[dark].sum())
-    return -math.log1p(-clicks / (exposures + 1)) if clicks else 0.0
 
 
 class _Fit:

@@ -27,7 +27,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.intervals import CHI2_95
 
 from .estimate import Estimate, Library, Observed, estimate
-from .parameters import DARK, PARAMETERS, Bench, Shape, at_edge, information_per_exposure, worths
+from .parameters import DARK, PARAMETERS, WORTHS, Bench, Shape, information_per_exposure
 
 F64 = NDArray[np.float64]
 U16 = NDArray[np.uint16]
@@ -39,6 +39,7 @@ PRECISION_PX, PRECISION_DEG = 0.05, 0.1  # half of the 95 % interval
 LENGTHS, ANGLES = ("right_px", "down_px"), ("rotation_deg",)
 SCATTERED, TELLING = 96, 128  # patterns of the two stages
 # photoelectrons per exposure of scattered patterns, if the profile is right; the clicks tell most from 0.5 to 2
+DRIVES = (0.4, 1.0, 2.5)
 DRIVE = 1.0  # of telling ones: of a click's worth 0.92 of the most is left, and of an exposure's time 0.9
 SIZES = (2, 4, 8, 16, 24, 32, 48)  # lit pixels of candidates
 DIRECTIONS = 300
@@ -63,11 +64,9 @@ def bench_of(profile: Profile, target: NDArray[np.uint8]) -> Bench:
 class Registration:
     """One measurement: `first` and `second` lay out what is shown, `take` is given what was counted of it."""
 
-    def __init__(
-        self, profile: Profile, target: NDArray[np.uint8], seconds: float, seed: int, bench: Bench | None = None
-    ):
+    def __init__(self, profile: Profile, target: NDArray[np.uint8], seconds: float, seed: int) -> None:
         self.profile, self.seconds, self.seed = profile, seconds, seed
-        self.bench = bench_of(profile, target) if bench is None else bench
+        self.bench = bench_of(profile, target)
         self.observed: Observed | None = None
 
     def words(self) -> str:
@@ -79,9 +78,9 @@ class Registration:
             f"±{turn.high:g} degrees, {self.seconds:g} s of instrument time"
         )
 
-    def prepare(self, library: Library | None = None) -> None:
+    def prepare(self) -> None:
         """Compute the target's appearance at every place of the search."""
-        self.library = Library(self.bench) if library is None else library
+        self.library = Library(self.bench)
 
     def first(self) -> Design:
         """Return the first stage: scattered pixels."""
@@ -108,11 +107,8 @@ class Registration:
 
     def _at_most(self, count: int) -> int:
         """As many patterns as the instrument can show: in parallel mode each channel has one."""
-        return (
-            self.profile.detector.channels
-            if self.profile.mode == "parallel"
-            else min(count, self.profile.projector.pattern_memory)
-        )
+        profile = self.profile
+        return profile.detector.channels if profile.mode == "parallel" else min(count, profile.projector.pattern_memory)
 
 
 def check_saturation(observed: Observed) -> None:
@@ -138,7 +134,12 @@ def check_estimate(
 
     `precision` is what half of the 95 % interval may be, in px of shift and degrees of rotation.
     """
-    if edges := at_edge(found.values[:DARK]):
+    edges = [
+        f"{one.name} {value:.4g}, looked for from {one.low:g} to {one.high:g}"
+        for one, value in zip(PARAMETERS, found.values.tolist())
+        if not (one.low < value < one.high or (one.name == "psf_px" and value <= one.low))
+    ]
+    if edges:
         raise UsageError(
             f"the estimate lies at the edge of the search: {'; '.join(edges)}",
             remedy="align the target by hand first, or check that it is the one that was named",
@@ -158,9 +159,6 @@ def check_estimate(
             f"too few photons: {worst} is known to ±{half[worst]:.3g} from {found.clicks} clicks, wanted ±{wanted[worst]:g}",
             remedy=f"--seconds {seconds * factor * 1.1:.3g}: {seconds * (factor * 1.1 - 1):.3g} s more",
         )
-
-
-# ---- the patterns of the two stages ----
 
 
 def scattered(bench: Bench, library: Library, seed: int, count: int = SCATTERED) -> U16:
@@ -185,7 +183,7 @@ def telling(bench: Bench, known: Estimate, seed: int, exposures: float, count: i
     From candidates that each serve one direction among the parameters, the one that lowers the sum of the variances, in units of what
     each parameter is worth, most is taken in turn; `exposures` is how many each will have.
     """
-    worth = np.append(worths(), 1.0)
+    worth = np.append(WORTHS, 1.0)
     candidates = _candidates(bench, known, np.random.default_rng(seed), worth)
     _, telling_of = information_per_exposure(bench, known.values, candidates.astype(np.float64))
     scaled = telling_of * worth * np.sqrt(exposures)
@@ -221,6 +219,3 @@ def _candidates(bench: Bench, known: Estimate, rng: np.random.Generator, worth: 
         np.put_along_axis(levels, lit.T, level[:, None].astype(np.uint16), axis=1)
         found.append(levels)
     return np.unique(np.vstack(found), axis=0)
-
-
-DRIVES = (0.4, 1.0, 2.5)

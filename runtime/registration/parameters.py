@@ -5,7 +5,6 @@ All pure functions of arrays. The optics are imaging's, the law of clicks instru
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -41,6 +40,7 @@ GEOMETRY = (
 FLAT = tuple(Parameter(f"flat_{term}", "", -0.5, 0.5, 0.1) for term in ("x", "y", "xx", "xy", "yy"))
 LIGHT = (Parameter("gain", "", 0.02, 50.0, 0.05), Parameter("black", "", -0.002, 0.1, 0.001))
 PARAMETERS = (*GEOMETRY, *LIGHT, *FLAT)
+WORTHS: F64 = np.array([one.worth for one in PARAMETERS])
 DARK = len(PARAMETERS)  # place in the vector of the dark photoelectrons of an exposure, a nuisance
 N_GEOMETRY = len(GEOMETRY)
 PSF_SEEN_FROM = 0.15  # px: the light changes with the square of less, and an interval in px begins at 0
@@ -75,22 +75,6 @@ def vector_of(imaging: Imaging, flat: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0), dar
     return np.array([*geometry, facts["gain"], facts["black"], *np.asarray(flat, np.float64), dark])
 
 
-def worths() -> F64:
-    """Return what each of `PARAMETERS` is worth knowing to, float64 (12,)."""
-    return np.array([one.worth for one in PARAMETERS])
-
-
-def at_edge(values: F64) -> list[str]:
-    """Return what of the values lies at an end of its range, in words."""
-    return [
-        f"{one.name} {value:.4g}, looked for from {one.low:g} to {one.high:g}"
-        for one, value in zip(PARAMETERS, values.tolist())
-        if not (one.low < value < one.high or (one.name == "psf_px" and value <= one.low)) or not math.isfinite(value)
-    ]
-
-
-# ---- expected light ----
-
 STEPS = np.array([1e-4, 1e-4, 1e-3, 1e-5, 1e-4])  # of the differences, in px, degrees, 1 and px
 LEAST_MEAN = 1e-9  # photoelectrons per exposure: less cannot be told from none
 
@@ -122,15 +106,12 @@ class Bench:
             rows.append((self.appearance(ahead) - self.appearance(behind)) / (2 * step))
         return np.array(rows)
 
-    def means(self, vector: F64, patterns: F64, met: F64 | None = None) -> F64:
-        """Return photoelectrons per exposure, dark counts included, float64 (patterns,); `met` is the target's appearance if known."""
-        met = self.appearance(vector[:N_GEOMETRY]) if met is None else met
-        light = self._light(vector, patterns, (1.0 + vector[7:DARK] @ flat_basis(self.shape)) * met)
-        return np.maximum(light + vector[DARK], LEAST_MEAN)
-
-    def _light(self, vector: F64, patterns: F64, met: F64) -> F64:
+    def means(self, vector: F64, patterns: F64) -> F64:
+        """Return photoelectrons per exposure, dark counts included, float64 (patterns,)."""
+        met = (1.0 + vector[7:DARK] @ flat_basis(self.shape)) * self.appearance(vector[:N_GEOMETRY])
         gain, black = vector[5] * self.photons_per_level, vector[6]
-        return np.asarray(gain * (black * (self.levels - 1) * met.sum() + (1 - black) * (patterns @ met)))
+        light = gain * (black * (self.levels - 1) * met.sum() + (1 - black) * (patterns @ met))
+        return np.maximum(light + vector[DARK], LEAST_MEAN)
 
     def slopes(self, vector: F64, patterns: F64) -> tuple[F64, F64]:
         """Return the means (patterns,) and their derivatives (patterns, 13) by the vector's numbers."""

@@ -17,11 +17,11 @@ from pans.runtime.registration.measure import bench_of, check_estimate, check_sa
 from pans.runtime.registration.parameters import (
     DARK,
     PARAMETERS,
+    WORTHS,
     Bench,
     flat_basis,
     information_per_exposure,
     vector_of,
-    worths,
 )
 from pans.runtime.registration.target import built_in_target, target_sha256
 
@@ -104,7 +104,7 @@ def test_slopes_are_those_of_the_means(bench: Bench, library: Library) -> None:
     )
     patterns = scattered(bench, library, 5, 24).astype(np.float64)
     _, slopes = bench.slopes(vector, patterns)
-    steps = np.append(1e-3 * worths(), 1e-5)
+    steps = np.append(1e-3 * WORTHS, 1e-5)
     for index, step in enumerate(steps):
         ahead, behind = vector.copy(), vector.copy()
         ahead[index] += step
@@ -149,7 +149,7 @@ def errors_of_a_click(bench: Bench, vector: F64, patterns: F64) -> F64:
 def test_telling_patterns_need_far_fewer_clicks_than_others(bench: Bench, library: Library) -> None:
     vector = vector_of(Imaging(right_px=0.7, down_px=-0.6, rotation_deg=1.5, psf_px=0.7, black=0.005), dark=DARK_MEAN)
     errors = {}
-    rough = Estimate(vector, np.diag(np.append(worths() * 2, 1e-3) ** 2), 0.0, 0.0, 1, 1, 1)
+    rough = Estimate(vector, np.diag(np.append(WORTHS * 2, 1e-3) ** 2), 0.0, 0.0, 1, 1, 1)
     half = np.random.default_rng(0).integers(0, 2, (300, 784)).astype(np.float64)
     for name, patterns in {
         "telling": telling(bench, rough, 1, 1000).astype(np.float64),
