@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,29 +24,46 @@ def mark(seq: int) -> Frame:
     return FrameDecoder().feed(wire.encode_mark(Mark(seq, 3, 1, 0, 0, 0.0), 1))[0]
 
 
-def test_a_lost_message_is_a_gap_with_its_exposures() -> None:
+def frames(first: int, n: int) -> Frame:
+    block = wire.FrameBlock(1, 0, 0, first, 1, 0, np.ones((n, 1), np.uint8))
+    return FrameDecoder().feed(wire.encode_frames(block, 1))[0]
+
+
+@pytest.mark.parametrize(
+    ("then", "gaps", "counts"),
+    [
+        (
+            [clicks(2, 8, 4)],
+            [Gap(first_exposure=4, exposures=4, messages=1, dropped_by_device=0)],
+            {"lost_messages": 1},
+        ),
+        ([clicks(1, 10, 4, drops=6)], [Gap(4, 6, 0, 6)], {"device_drops": 6}),
+        # the counter of drops goes on
+        (
+            [clicks(1, 6, 4, drops=2), clicks(2, 13, 4, drops=5)],
+            [Gap(4, 2, 0, 2), Gap(10, 3, 0, 3)],
+            {"device_drops": 5},
+        ),
+        ([frames(6, 6)], [Gap(4, 2, 0, 0)], {"exposures": 10, "unexplained_drops": 1}),
+        # a mark was lost, or came
+        ([clicks(2, 4, 4), mark(3), clicks(4, 8, 4)], [None, None, None], {"lost_messages": 1, "exposures": 12}),
+        # overtaken, or repeated: a late photon is useless
+        (
+            [clicks(2, 8, 4), clicks(1, 4, 4), clicks(2, 8, 4), clicks(3, 12, 4)],
+            [Gap(4, 4, 1, 0), None, None, None],
+            {"repeated": 2},
+        ),
+        ([clicks(1, 2, 8)], [None], {"malformed": 1, "exposures": 4}),  # a device that counts backwards
+    ],
+)
+def test_what_is_missing_before_a_message(then: list[Frame], gaps: list[Gap | None], counts: dict[str, int]) -> None:
     tracker = StreamTracker()
     tracker.accept(clicks(0, 0, 4))
-    _, gap = tracker.accept(clicks(2, 8, 4))
-    assert gap == Gap(first_exposure=4, exposures=4, messages=1, dropped_by_device=0)
-
-
-def test_what_the_device_dropped_is_told_apart() -> None:
-    tracker = StreamTracker()
-    tracker.accept(clicks(0, 0, 4))
-    _, gap = tracker.accept(clicks(1, 10, 4, drops=6))
-    assert gap == Gap(4, 6, 0, 6)
-    assert (tracker.counters.lost_exposures, tracker.counters.device_drops, tracker.counters.lost_messages) == (6, 6, 0)
-
-
-def test_a_lost_mark_is_a_lost_message_but_no_gap() -> None:
-    tracker = StreamTracker()
-    tracker.accept(clicks(0, 0, 4))
-    block, gap = tracker.accept(clicks(2, 4, 4))
-    assert block is not None
-    assert gap is None
-    assert tracker.counters.lost_messages == 1
-    assert tracker.accept(mark(3))[0] == Mark(3, 3, 1, 0, 0, 0.0)
+    assert [tracker.accept(frame)[1] for frame in then] == gaps
+    lost = sum(gap.exposures for gap in gaps if gap is not None)
+    wanted = {"gaps": len(list(filter(None, gaps))), "lost_exposures": lost, "malformed": 0, "unexplained_drops": 0}
+    found = asdict(tracker.counters)
+    assert {name: found[name] for name in wanted | counts} == wanted | counts
 
 
 def test_marks_taken_elsewhere_do_not_hide_a_loss() -> None:
@@ -60,33 +79,24 @@ def test_marks_taken_elsewhere_do_not_hide_a_loss() -> None:
 
 
 @pytest.mark.parametrize(
-    ("end", "drops", "gap", "unexplained"),
-    [(4, 0, None, 0), (10, 3, Gap(4, 6, 0, 3), 0), (10, 6, Gap(4, 6, 0, 6), 0), (6, 5, Gap(4, 2, 0, 2), 1)],
+    ("end", "drops", "gap", "position", "unexplained"),
+    [
+        (4, 0, None, 4, 0),
+        (10, 3, Gap(4, 6, 0, 3), 10, 0),
+        (10, 6, Gap(4, 6, 0, 6), 10, 0),
+        (6, 5, Gap(4, 2, 0, 2), 6, 1),
+        (3, 0, None, 4, 1),  # before what came
+    ],
 )
-def test_what_is_missing_at_the_end_is_dropped_or_lost(end: int, drops: int, gap: Gap | None, unexplained: int) -> None:
+def test_what_is_missing_at_the_end_is_dropped_or_lost(
+    end: int, drops: int, gap: Gap | None, position: int, unexplained: int
+) -> None:
     tracker = StreamTracker()
     tracker.accept(clicks(0, 0, 4))
     assert tracker.finish(end, drops) == gap
     dropped = 0 if gap is None else gap.dropped_by_device
     assert (tracker.counters.device_drops, tracker.counters.unexplained_drops) == (dropped, unexplained)
-    assert not tracker.open
-
-
-def test_an_end_that_cannot_be_is_no_gap() -> None:
-    tracker = StreamTracker()
-    tracker.accept(clicks(0, 0, 4))
-    assert tracker.finish(3, 0) is None
-    assert (tracker.counters.unexplained_drops, tracker.next_exposure) == (1, 4)
-
-
-def test_drops_of_the_device_count_up_and_an_end_moves_the_stream_on() -> None:
-    tracker = StreamTracker()
-    tracker.accept(clicks(0, 0, 4, drops=0))
-    assert tracker.accept(clicks(1, 6, 4, drops=2))[1] == Gap(4, 2, 0, 2)
-    assert tracker.accept(clicks(2, 13, 4, drops=5))[1] == Gap(10, 3, 0, 3)
-    assert tracker.finish(20, drops=8) == Gap(17, 3, 0, 3)
-    assert (tracker.counters.device_drops, tracker.counters.unexplained_drops) == (8, 0)
-    assert tracker.position == (3, 20, 8)
+    assert (tracker.next_exposure, tracker.open) == (position, False)
 
 
 @pytest.mark.parametrize(("ahead", "malformed"), [(RECEIVE_WINDOW - 1, 0), (RECEIVE_WINDOW, 1)])
@@ -94,16 +104,6 @@ def test_a_message_beyond_the_receive_window_is_malformed(ahead: int, malformed:
     tracker = StreamTracker()
     assert (tracker.accept(clicks(ahead, 0, 1))[0] is None) == bool(malformed)
     assert tracker.counters.malformed == malformed
-
-
-def test_repeated_and_overtaken_messages_are_dropped() -> None:
-    tracker = StreamTracker()
-    for frame in (clicks(0, 0, 4), clicks(2, 8, 4)):
-        tracker.accept(frame)
-    assert tracker.accept(clicks(1, 4, 4)) == (None, None)
-    assert tracker.accept(clicks(2, 8, 4)) == (None, None)
-    assert tracker.counters.repeated == 2
-    assert tracker.accept(clicks(3, 12, 4))[1] is None
 
 
 def changed(frame: Frame) -> Frame:
@@ -166,28 +166,19 @@ def test_the_memory_goes_on_in_another_tracker(first: int) -> None:
     assert other.counters.repeats_unchecked == 1
 
 
-def test_sequence_and_drop_counters_wrap() -> None:
+@pytest.mark.parametrize(
+    ("position", "frame", "gap"),
+    [
+        ((2**32 - 1, 4, 2**32 - 2), clicks(2**32 - 1, 9, 1, drops=3), Gap(4, 5, 0, 5)),
+        ((0, 2**40, 0), clicks(0, 2**40 + 3, 2), Gap(2**40, 3, 0, 0)),
+    ],
+)
+def test_counters_wrap_and_exposures_pass_32_bits(position: tuple[int, int, int], frame: Frame, gap: Gap) -> None:
     tracker = StreamTracker()
-    tracker.next_seq = 2**32 - 1
-    tracker._drops = 2**32 - 2
-    assert tracker.accept(clicks(2**32 - 1, 0, 4, drops=2**32 - 2))[1] is None
-    _, gap = tracker.accept(clicks(2**32, 9, 1, drops=3))
-    assert gap == Gap(4, 5, 0, 5)
-    assert tracker.next_seq == 1
-
-
-def test_exposures_beyond_32_bits() -> None:
-    tracker = StreamTracker()
-    tracker.next_exposure = 2**40
-    _, gap = tracker.accept(clicks(0, 2**40 + 3, 2))
-    assert gap == Gap(2**40, 3, 0, 0)
-
-
-def test_a_device_that_counts_backwards_cannot_rewrite_the_past() -> None:
-    tracker = StreamTracker()
-    tracker.accept(clicks(0, 0, 8))
-    assert tracker.accept(clicks(1, 4, 8)) == (None, None)
-    assert tracker.counters.malformed == 1
+    tracker.resume(position)
+    block, found = tracker.accept(frame)
+    assert isinstance(block, ClickBlock)
+    assert (found, tracker.next_seq) == (gap, (position[0] + 1) % 2**32)
 
 
 def test_damage_is_counted() -> None:
@@ -233,11 +224,3 @@ def test_every_exposure_arrives_once_or_is_lost_once(fates: list[str], size: int
     assert sorted(arrived + lost) == list(range(len(fates) * size))
     assert tracker.counters.lost_exposures == len(lost)
     assert tracker.counters.exposures == len(arrived)
-
-
-def test_frame_blocks_count_as_exposures() -> None:
-    tracker = StreamTracker()
-    words = np.ones((6, 1), np.uint8)
-    frame = FrameDecoder().feed(wire.encode_frames(wire.FrameBlock(0, 0, 0, 2, 1, 0, words), 1))[0]
-    assert tracker.accept(frame)[1] == Gap(0, 2, 0, 0)
-    assert tracker.next_exposure == 8
