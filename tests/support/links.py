@@ -21,6 +21,7 @@ def served(device: Any, clock: Any, listen: str = "tcp:127.0.0.1:0") -> Iterator
     finally:
         stopped.set()
         thread.join(10)
+        port.close()
 
 
 class Wrapped:

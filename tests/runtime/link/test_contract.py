@@ -11,20 +11,23 @@ import threading
 import time
 import types
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from links import served
 from tree import ROOT
 
 import pans
 from pans.firmware_sim.ports import usb_backend
 from pans.firmware_sim.ports.protocol_panssim import register
 from pans.firmware_sim.ports.serve import SimOptions, ThreadedInstrument, build_instrument
-from pans.firmware_sim.ports.shell import open_port, serve
+from pans.firmware_sim.ports.shell import serve
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
@@ -47,52 +50,32 @@ OPTIONS = SimOptions("ideal", "uniform")
 class Rig:
     """An open link, and how to take the instrument away from it."""
 
-    link: Link
+    link: Any
     vanish: Callable[[], None]
     url: str
-    comes_back: Callable[[], None] | None = None
-
-
-def served(listen: str) -> tuple[str, Callable[[], None]]:
-    device, clock = build_instrument(OPTIONS, time.perf_counter_ns())
-    port = open_port(listen)
-    stopped = threading.Event()
-    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
-    thread.start()
-
-    def vanish() -> None:
-        if not stopped.is_set():
-            stopped.set()
-            thread.join(PATIENCE_S)
-            port.close()
-
-    return port.url, vanish
 
 
 def rig(kind: str) -> Rig:
-    if kind in ("pty", "tcp"):
-        url, vanish = served("pty" if kind == "pty" else "tcp:127.0.0.1:0")
-        return Rig(open_link(url), vanish, url)
-    if kind == "usb elsewhere":
-        url, vanish = served("tcp:127.0.0.1:0")
-        url = url.replace("serial:", "simusb:")
-        return Rig(open_link(url), vanish, url)
-    url = {
-        "handler": "simserial:ideal?scene=uniform",
-        "usb": "simusb:ideal?scene=uniform",
-        "child": "sim:ideal?scene=uniform",
-        "virtual": "sim:ideal?scene=uniform&pace=fast",
+    if kind in ("pty", "tcp", "usb elsewhere"):
+        running = ExitStack()
+        device, clock = build_instrument(OPTIONS, time.perf_counter_ns())
+        url = running.enter_context(served(device, clock, "pty" if kind == "pty" else "tcp:127.0.0.1:0")).url
+        url = url.replace("serial:", "simusb:") if kind == "usb elsewhere" else url
+        return Rig(open_link(url), running.close, url)
+    scheme, more = {
+        "handler": ("simserial", ""),
+        "usb": ("simusb", ""),
+        "child": ("sim", ""),
+        "virtual": ("sim", "&pace=fast"),
     }[kind]
-    link: Any = open_link(url)
-    if kind == "usb":
-        return Rig(
-            link, lambda: setattr(link.backend, "plugged", False), url, lambda: setattr(link.backend, "plugged", True)
-        )
-    if kind == "handler":
-        return Rig(link, link._port._instrument.close, url)
-    if kind == "child":
-        return Rig(link, link._end_child, url)
-    return Rig(link, lambda: setattr(link, "_broken", True), url, lambda: None)
+    link: Any = open_link(url := f"{scheme}:ideal?scene=uniform{more}")
+    vanish: Callable[[], None] = {
+        "usb": lambda: partial(setattr, link.backend, "plugged", False),
+        "handler": lambda: link._port._instrument.close,
+        "child": lambda: link._end_child,
+        "virtual": lambda: partial(setattr, link, "_broken", True),
+    }[kind]()
+    return Rig(link, vanish, url)
 
 
 KINDS = ["tcp", "handler", "usb", "usb elsewhere", "child", "virtual", *(["pty"] if hasattr(os, "openpty") else [])]
@@ -181,40 +164,13 @@ def test_a_whole_run_decides(rigged: Rig) -> None:
     assert result.device["simulated"] is True
 
 
-def test_a_device_that_comes_back_is_found_again() -> None:
-    """Over pyusb: the cable is pulled after some blocks and plugged in again; the run goes on and completes."""
-    made = rig("usb")
-    seen = [0]
-
-    def pull(run: Any, output: Any) -> None:
-        seen[0] += 1
-        if seen[0] == 50:
-            made.vanish()
-
-    def plug(seconds: float) -> None:
-        assert made.comes_back is not None
-        made.comes_back()
-
-    recovery = Recovery.of(made.link, made.url, 10.0)
-    recovery = Recovery(recovery.reopen, 10.0, plug)
-    try:
-        result = run_on(made.link, 400, recovery, pull)
-    finally:
-        made.link.close()
-    assert (result.ended, result.reconnects, result.link_lost) == ("completed", 1, False)
-    assert result.tally.decisions == 400
-    assert result.tally.abstained <= 8
-    kinds = [event["kind"] for event in result.events]
-    assert kinds.index("link_lost") < kinds.index("reconnected") < len(kinds)
-
-
 def test_a_device_that_stays_away_ends_the_run_loudly() -> None:
     made = rig("virtual")
 
     def absent(lost: Link) -> Link:
         raise LinkError("it is not there")
 
-    recovery = Recovery(absent, 5.0, made.link.pause)  # type: ignore[attr-defined]
+    recovery = Recovery(absent, 5.0, made.link.pause)
     result = run_on(made.link, 400, recovery, lambda run, output: made.vanish())
     assert result.link_lost
     assert result.ended == "the link was lost: it is not there (5 attempts in 5 s)"

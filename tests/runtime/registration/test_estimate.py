@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from naive_imaging import rendered
 from numpy.typing import NDArray
 
 from pans.runtime.errors import UsageError
-from pans.runtime.imaging import Imaging, seen
+from pans.runtime.imaging import Imaging
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.registration.estimate import Estimate, Library, Observed, estimate
 from pans.runtime.registration.measure import bench_of, check_estimate, check_saturation, scattered, telling
@@ -28,25 +28,6 @@ from pans.runtime.registration.target import built_in_target, target_sha256
 PROFILE = load_profile("dmd-spad")
 DARK_MEAN = 0.004
 F64 = NDArray[np.float64]
-
-
-def rendered(image: np.ndarray, truth: Imaging, finer: int = 16) -> np.ndarray:
-    """Return the image (rows, columns) as every pixel of a grid of its size meets it, from points `finer` times closer than pixels."""
-    (rows, columns), margin = image.shape, 8  # pixels around the grid, into which nothing blurs
-    y = (np.arange((rows + 2 * margin) * finer) + 0.5) / finer - 0.5 - margin
-    x = (np.arange((columns + 2 * margin) * finer) + 0.5) / finer - 0.5 - margin
-    down, right = np.meshgrid(y - (rows - 1) / 2 - truth.down_px, x - (columns - 1) / 2 - truth.right_px, indexing="ij")
-    position = (
-        (right - 1j * down) * np.exp(-1j * math.radians(truth.rotation_deg)) / truth.scale
-    )  # upwards is positive here
-    column = np.floor(position.real + (columns - 1) / 2 + 0.5).astype(int)
-    row = np.floor(-position.imag + (rows - 1) / 2 + 0.5).astype(int)
-    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    fine = np.where(inside, image[row.clip(0, rows - 1), column.clip(0, columns - 1)], 0.0)
-    waves = np.add.outer(np.fft.fftfreq(len(y), 1 / finer) ** 2, np.fft.rfftfreq(len(x), 1 / finer) ** 2)
-    fine = np.fft.irfft2(np.fft.rfft2(fine) * np.exp(-2 * math.pi**2 * truth.psf_px**2 * waves), fine.shape)
-    fine = fine.reshape(rows + 2 * margin, finer, columns + 2 * margin, finer).mean(axis=(1, 3))
-    return np.asarray(fine[margin:-margin, margin:-margin])
 
 
 def field(coefficients: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -72,7 +53,7 @@ def counted(
     bench: Bench, truth: Imaging, patterns: F64, exposures: int, seed: int, coefficients: F64 | None = None
 ) -> Observed:
     """Draw clicks of `exposures` of each pattern, and of a tenth as many dark ones, from a rendering of the target."""
-    met = rendered(bench.target.reshape(bench.shape), truth)
+    met = rendered(truth, bench.target.reshape(bench.shape))
     met = met if coefficients is None else met * field(coefficients, bench.shape)
     scale = truth.gain * bench.photons_per_level
     lit = scale * (truth.black * (bench.levels - 1) * met.sum() + (1 - truth.black) * (patterns @ met.reshape(-1)))
@@ -80,20 +61,6 @@ def counted(
     n = np.append(np.full(len(patterns), exposures), max(1, exposures * len(patterns) // 10))
     clicks = np.random.default_rng(seed).binomial(n, 1 - np.exp(-means))
     return Observed(patterns, np.append(np.arange(len(patterns)), -1), clicks, n, np.zeros(len(n)))
-
-
-@pytest.mark.parametrize(
-    "truth",
-    [
-        Imaging(right_px=0.7, down_px=-1.3, rotation_deg=2.5, scale=1.02, psf_px=0.5),
-        Imaging(right_px=-1.9, rotation_deg=-3.0, scale=0.97, psf_px=1.2),
-    ],
-)
-def test_the_model_agrees_with_a_rendering_that_shares_nothing_with_it(bench: Bench, truth: Imaging) -> None:
-    image = bench.target.reshape(bench.shape)
-    difference = seen(truth, bench.target[None, :], bench.shape)[0].reshape(bench.shape) - rendered(image, truth)
-    assert np.sqrt(np.mean(difference**2)) < 0.002
-    assert np.abs(difference).max() < 0.02
 
 
 def test_slopes_are_those_of_the_means(bench: Bench, library: Library) -> None:
