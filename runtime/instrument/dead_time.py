@@ -36,7 +36,8 @@ INTERVALS = 2048  # of the table, equal in log(1 + mean): interpolation errs by 
 STEP = math.log1p(LARGEST_MEAN) / INTERVALS
 STEADY_BELOW = 0.3  # dead time of an exposure; until there w is m / (1 + a) as without a pause, P0 within 3e-5
 SOLVED_TO = 30.0  # mean; beyond, P0 falls as it does without a pause
-CANCELS_FROM = 18.0  # m exp(-a), above which the alternating series loses its digits and P0 is below 1e-7
+CANCELS_FROM = 18.0  # m exp(-a), above which the alternating series errs by more than LEAST_SILENT / 10
+LEAST_SILENT = 1e-7  # P0, below which it falls at its rate of decay
 _CELLS, _NODES = 96, 64  # of w, and of the integral over u
 
 
@@ -172,13 +173,9 @@ def _paralysable(dead_time: DeadTime, mean: F64) -> F64:
     flux = mean * np.exp(-mean * dead)
     counted = _decay(mean * dead) / dead
     sums = flux <= CANCELS_FROM
-    if (
-        reach > 1
-    ):  # it stays on through a pause: a detection needs a photon in this exposure and none in `dead` before it
-        silent = 1 - flux[sums]
-    else:
-        silent = _silent(mean[sums], dead, reach)
-    counted[sums] = -np.log(np.maximum(silent, 1e-9))
+    # where it stays on through a pause, a detection needs a photon in this exposure and none in `dead` before it
+    silent = 1 - flux[sums] if reach > 1 else _silent(mean[sums], dead, reach)
+    counted[sums] = np.where(silent > LEAST_SILENT, -np.log(np.maximum(silent, LEAST_SILENT)), counted[sums])
     return np.asarray(counted)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 
+import mpmath
 import numpy as np
 import pytest
 from naive_dead_time import share_of_clicks
@@ -102,6 +103,40 @@ def test_the_slope_is_the_derivative(dead_time: DeadTime) -> None:
     mean = np.exp(np.random.default_rng(2).uniform(-4, 3, 50))
     difference = (counted_mean(dead_time, mean * (1 + 1e-6)) - counted_mean(dead_time, mean)) / (mean * 1e-6)
     np.testing.assert_allclose(counted_slope(dead_time, mean), difference, atol=2e-3)
+
+
+def exact_silence(mean: float, dead: float, reach: float) -> mpmath.mpf:
+    """P0 of a paralysable detector: the module's integral over u, of the alternating series with 60 digits."""
+    with mpmath.workdps(60):
+        m, f, r = mpmath.mpf(mean), mpmath.mpf(dead), mpmath.mpf(reach)
+
+        def undetected(until: mpmath.mpf) -> mpmath.mpf:
+            rests = itertools.takewhile(lambda rest: rest > 0, (until - k * f for k in itertools.count()))
+            return mpmath.fsum(
+                (-m * mpmath.exp(-m * f) * rest) ** k / mpmath.factorial(k) for k, rest in enumerate(rests)
+            )
+
+        integral = mpmath.quad(lambda u: m * (mpmath.exp(-m * u) - mpmath.exp(-m * r)) * undetected(1 - u), [0, r])
+        return mpmath.exp(-m) + integral
+
+
+@pytest.mark.parametrize(
+    ("flux", "dead", "within"),
+    [
+        (1.0, 0.02, 1e-9),
+        (8.0, 0.02, 1e-9),
+        (11.5, 0.02, 1e-5),
+        (17.9, 0.02, 0.03),
+        (18.1, 0.02, 0.03),
+        (34.0, 0.01, 0.03),
+    ],
+)
+def test_a_paralysed_silence_at_both_sides_of_where_its_series_cancels(flux: float, dead: float, within: float) -> None:
+    with mpmath.workdps(30):
+        mean = float(mpmath.findroot(lambda m: m * mpmath.exp(-m * dead) - flux, flux * 1.3))
+        wanted = float(-mpmath.log(exact_silence(mean, dead, dead / 2)))
+    (found,) = law_module._paralysable(DeadTime(dead, dead / 2, False, True), np.array([mean])).tolist()
+    assert found == pytest.approx(wanted, rel=within)
 
 
 def test_more_light_clicks_more_unless_it_paralyses() -> None:
