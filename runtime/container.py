@@ -210,7 +210,6 @@ def other_kind(data: bytes, *allowed: str) -> tuple[str, str]:
 FILE_PROLOGUE = struct.Struct("<8sII")  # magic, version, CRC-32 of both
 _BLOCK_HEADER = struct.Struct("<IIB3xI")  # payload length, block index, kind, CRC-32 of these 12 bytes
 _CRC = struct.Struct("<I")
-BLOCK_OVERHEAD = _BLOCK_HEADER.size + _CRC.size
 
 
 @dataclass(frozen=True, slots=True)

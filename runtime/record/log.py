@@ -138,13 +138,6 @@ class LogReader:
         return self._hash.hexdigest()
 
 
-def decision_log_sha256(records: NDArray[np.void]) -> str:
-    """Return the SHA-256 (hex) of decisions, DECISION_DTYPE (n,), in their order: what replay compares."""
-    log = LogEncoder()
-    log.update(records)
-    return log.hexdigest()
-
-
 class _LogHash:
     """SHA-256 over the hashes of verdicts, codes and whole runs, and of exposures where there are any.
 

@@ -1,7 +1,6 @@
 """The pictures of a recorded run, recomputed from its clicks, and how they compare with the true ones.
 
-Owns the file of pictures (.npz, never pickled); the log of clicks and the reading of a recording are replaying.py's. A decision that
-abstained has no picture.
+A decision that abstained has no picture.
 """
 
 from __future__ import annotations

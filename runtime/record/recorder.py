@@ -78,8 +78,7 @@ def repeated_setup(plan: Plan, arm: Arm, nonce: int) -> list[bytes]:
 class _Buffer:
     """Preallocated bytes that are emptied into a block."""
 
-    def __init__(self, kind: Kind, size: int) -> None:
-        self.kind = kind
+    def __init__(self, size: int) -> None:
         self.data = np.full(size, 0, np.uint8)  # touched, which np.zeros leaves to the first use
         self.used = 0
 
@@ -120,21 +119,21 @@ class Recorder:
         `bundle_sha256` are added where they are missing.
         """
         self.path, self.limits = Path(path), limits
-        self.watch_write: Callable[[int, int], None] | None = (
-            None  # called with when a write began and ended, perf_counter_ns
-        )
+        # called with when a write began and ended, perf_counter_ns
+        self.watch_write: Callable[[int, int], None] | None = None
         self.parts = 0  # 0: one file
         self._header = {"created_utc": datetime.now(UTC).isoformat(timespec="seconds"), **header}
-        self._messages = _Buffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
-        self._commands = _Buffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
-        self._answers = _Buffer(Kind.ANSWERS, _EVENT_BUFFER_BYTES)
-        self._events = _Buffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
-        self._decisions = _Buffer(Kind.DECISIONS, BUFFER_ROWS * DECISION_DTYPE.itemsize)
-        self._timings = _Buffer(Kind.TIMINGS, BUFFER_ROWS * TIMING_RUN_DTYPE.itemsize)
-        self._timed = 0  # decisions in these
-        # A decision is written behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
-        self._first = (self._commands, self._answers, self._messages, self._decisions)
-        self._in_order = (*self._first, self._timings)
+        # In this order: a decision is written behind all that it is made of, so that a file that is cut off holds nothing that cannot be
+        # decided again.
+        self._buffers = {
+            Kind.COMMANDS: _Buffer(_MESSAGE_BUFFER_BYTES),
+            Kind.ANSWERS: _Buffer(_EVENT_BUFFER_BYTES),
+            Kind.MESSAGES: _Buffer(_MESSAGE_BUFFER_BYTES),
+            Kind.DECISIONS: _Buffer(BUFFER_ROWS * DECISION_DTYPE.itemsize),
+            Kind.TIMINGS: _Buffer(BUFFER_ROWS * TIMING_RUN_DTYPE.itemsize),
+            Kind.EVENTS: _Buffer(_EVENT_BUFFER_BYTES),
+        }
+        self._timed = 0  # decisions in the buffer of times
         self._pack = _packing()
         self._replaced = self._files_in_the_way(overwrite)
         self._closed: deque[dict[str, Any]] = deque()  # what the next part says of each
@@ -191,33 +190,33 @@ class Recorder:
 
     def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
-        self._add_bytes(self._messages, host_ns, data)
+        self._add_bytes(Kind.MESSAGES, host_ns, data)
 
     def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep the bytes of one command to the device and the host time at which it was sent, in ns."""
-        self._add_bytes(self._commands, host_ns, data)
+        self._add_bytes(Kind.COMMANDS, host_ns, data)
 
     def add_answer(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep one decoded WELCOME, ACK or PONG of at most 1 MiB and the host time at which it arrived, in ns."""
-        self._add_bytes(self._answers, host_ns, data)
+        self._add_bytes(Kind.ANSWERS, host_ns, data)
 
     def add_stamped(self, kind: Kind, data: NDArray[np.uint8], spans: NDArray[np.int64]) -> None:
         """Keep many MESSAGES, COMMANDS or ANSWERS: `spans` int64 (n, 4) are where each begins and ends in `data`, and its time in ns."""
-        buffer = next(one for one in self._first if one.kind == kind)
-        first = 0
+        buffer, first = self._buffers[kind], 0
         while first < len(spans):
             first, buffer.used = self._pack(data, spans, first, buffer.data, buffer.used)
             if first < len(spans):
                 begin, end, host_ns, _ = spans[first].tolist()
-                self._add_bytes(buffer, host_ns, data[begin:end].tobytes())  # makes room
+                self._add_bytes(kind, host_ns, data[begin:end].tobytes())  # makes room
                 first += 1
 
     def add_decisions(self, many: NDArray[np.void]) -> None:
         """Keep decisions, rows DECISION_DTYPE (n,); more than a buffer holds are written at once."""
-        if many.nbytes < self._decisions.room:
-            self._decisions.add(many.tobytes())
+        buffer = self._buffers[Kind.DECISIONS]
+        if many.nbytes < buffer.room:
+            buffer.add(many.tobytes())
             return
-        n, blocks = self._decisions.used // DECISION_DTYPE.itemsize + len(many), self._blocks_of(*self._first)
+        n, blocks = buffer.used // DECISION_DTYPE.itemsize + len(many), self._blocks_of(Kind.DECISIONS)
         for payload in self.open_file.log.blocks(many):
             blocks += self._framed(Kind.DECISIONS, payload)
         self._write(b"".join(blocks))  # a few long writes take half the time of many short ones
@@ -227,21 +226,21 @@ class Recorder:
         """Keep the host times of decisions, TIMING_RUN_DTYPE (n,), at most 2^16 of each run; not part of the log's hash."""
         for start in range(0, len(runs), BUFFER_ROWS):
             some = runs[start : start + BUFFER_ROWS]
-            if some.nbytes > self._timings.room:
-                self._write_up_to(self._timings)
-            self._timings.add(some.tobytes())
+            if some.nbytes > self._buffers[Kind.TIMINGS].room:
+                self._flush(Kind.TIMINGS)
+            self._buffers[Kind.TIMINGS].add(some.tobytes())
             self._timed += int(some["count"].sum())
         if self._timed > TIMING_ROWS_MAX // 2:
-            self._write_up_to(self._timings)
+            self._flush(Kind.TIMINGS)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
         """Keep one JSON-able event: a gap, an alarm, a late decision, a link that went away."""
-        line = canonical_json(event) + b"\n"
-        if len(line) > len(self._events.data):
-            raise UsageError(f"an event of {len(line)} bytes, allowed at most {len(self._events.data)}")
-        if len(line) > self._events.room:
-            self._write_up_to(self._events)
-        self._events.add(line)
+        line, buffer = canonical_json(event) + b"\n", self._buffers[Kind.EVENTS]
+        if len(line) > len(buffer.data):
+            raise UsageError(f"an event of {len(line)} bytes, allowed at most {len(buffer.data)}")
+        if len(line) > buffer.room:
+            self._write(*self._framed(Kind.EVENTS, buffer.empty()))
+        buffer.add(line)
 
     def add_clock(self, samples: NDArray[np.void]) -> None:
         """Write clock samples, CLOCK_DTYPE (n,) of clock.py; rare, hence not buffered."""
@@ -251,11 +250,11 @@ class Recorder:
 
     def flush(self) -> None:
         """Write everything that is buffered to the file, in one call; it then survives the death of this process."""
-        self._flush(*self._in_order, self._events)
+        self._flush(Kind.EVENTS)
 
     def flush_decisions(self) -> None:
         """Write what the decisions so far are made of, and these: as much as an action upon them needs on record before it."""
-        self._write_up_to(self._decisions)
+        self._flush(Kind.DECISIONS)
 
     def sync(self) -> None:
         """Flush, and wait until it survives a power cut: milliseconds, never on the hot path."""
@@ -388,7 +387,8 @@ class Recorder:
         )
         for data in commands:
             self.add_command(host_ns, data)
-        self._flush(self._events, *self._in_order)
+        self._write(*self._framed(Kind.EVENTS, self._buffers[Kind.EVENTS].empty()))  # a part begins with it
+        self.flush()
         if before is None:
             self._make_next()
 
@@ -444,41 +444,37 @@ class Recorder:
 
     # -- blocks --------------------------------------------------------------------------------------------------------
 
-    def _add_bytes(self, buffer: _Buffer, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+    def _add_bytes(self, kind: Kind, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         if len(data) > MESSAGE_MAX_BYTES:
             raise UsageError(f"a message of {len(data)} bytes, allowed at most {MESSAGE_MAX_BYTES}")
-        head = MESSAGE.pack(host_ns, len(data))
+        head, buffer = MESSAGE.pack(host_ns, len(data)), self._buffers[kind]
         if (needed := len(head) + len(data)) > buffer.room:
-            self._write_up_to(buffer)
+            self._flush(kind)
         if needed > buffer.room:
-            self._write(*self._framed(buffer.kind, head + bytes(data)))
+            self._write(*self._framed(kind, head + bytes(data)))
         else:
             buffer.add(head, data)
 
-    def _write_up_to(self, buffer: _Buffer) -> None:
-        """Write a buffer to the file, and before it what must stand before it."""
-        if buffer in self._in_order:
-            self._flush(*self._in_order[: self._in_order.index(buffer) + 1])
-        else:
-            self._flush(buffer)
-
-    def _flush(self, *buffers: _Buffer) -> None:
-        n_decisions = self._decisions.used // DECISION_DTYPE.itemsize if self._decisions in buffers else 0
-        if blocks := self._blocks_of(*buffers):
+    def _flush(self, last: Kind) -> None:
+        """Write the buffers up to `last` to the file."""
+        before = self._buffers[Kind.DECISIONS].used
+        if blocks := self._blocks_of(last):
             self._write(b"".join(blocks))
-            self.open_file.n_decisions += n_decisions
+            self.open_file.n_decisions += (before - self._buffers[Kind.DECISIONS].used) // DECISION_DTYPE.itemsize
 
-    def _blocks_of(self, *buffers: _Buffer) -> list[bytes | memoryview]:
-        """Empty buffers into the pieces of blocks, which must be written next."""
+    def _blocks_of(self, last: Kind) -> list[bytes | memoryview]:
+        """Empty the buffers up to `last` into the pieces of blocks, which must be written next."""
         pieces: list[bytes | memoryview] = []
-        for buffer in buffers:
+        for kind, buffer in self._buffers.items():
             if buffer.used:
                 data = buffer.empty()
-                if buffer is self._decisions:
+                if kind == Kind.DECISIONS:
                     data = self.open_file.log.block(np.frombuffer(data, DECISION_DTYPE))
-                elif buffer is self._timings:
+                elif kind == Kind.TIMINGS:
                     self._timed = 0
-                pieces += self._framed(buffer.kind, data)
+                pieces += self._framed(kind, data)
+            if kind == last:
+                break
         return pieces
 
     def _framed(self, kind: Kind, payload: bytes | memoryview) -> tuple[bytes, bytes | memoryview, bytes]:

@@ -1,13 +1,13 @@
 """Reading recordings: every block checked, a cut file read up to its last whole block, memory for one block at a time.
 
-Owns the way back from the file; never writes one and never judges a run. `read_recording` returns a `Recording` or raises
-DamagedFileError; a cut is no damage, it is what a power cut leaves.
+`read_recording` returns a `Recording` or raises DamagedFileError; a cut is no damage, it is what a power cut leaves.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,9 +63,7 @@ class Recording:
     end_offset: int  # bytes up to the last whole block
     summary: Mapping[str, Any]  # of END; empty if incomplete
     damage: str  # "" or what is wrong behind end_offset (salvage only)
-    bundle_place: (
-        tuple[int, int] | None
-    )  # where in the file the bundle begins, and how many bytes it has; None without one
+    bundle_place: tuple[int, int] | None  # begin and bytes of the bundle in the file
 
     @property
     def simulated(self) -> bool:
@@ -74,7 +72,7 @@ class Recording:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: what was run, and how it ended."""
-        summary = self.summary
+        names = ("verdict", "accuracy", "clicks_mean", "photons_mean", "late", "lost")
         rows = {
             "clicks are": "SIMULATED" if self.simulated else "",
             "recorded": str(self.header.get("created_utc", ""))[:19],
@@ -82,10 +80,7 @@ class Recording:
             "device": self.header.get("device_url"),
             "decisions": self.n_decisions,
             "complete": "yes" if self.complete else "no: cut off",
-            **{
-                name: summary.get(name)
-                for name in ("verdict", "accuracy", "clicks_mean", "photons_mean", "late", "lost")
-            },
+            **{name: self.summary.get(name) for name in names},
             "bytes": self.size,
             "damage": self.damage,
         }
@@ -114,8 +109,7 @@ class Recording:
 
     def decisions(self) -> NDArray[np.void]:
         """Return all decisions, DECISION_DTYPE (n,)."""
-        parts = list(self.iter_decisions())
-        return np.concatenate(parts) if parts else np.zeros(0, dtype=DECISION_DTYPE)
+        return np.concatenate([np.zeros(0, DECISION_DTYPE), *self.iter_decisions()])
 
     def iter_decisions(self) -> Iterator[NDArray[np.void]]:
         """Yield the decisions block by block, DECISION_DTYPE (n,); memory holds one block."""
@@ -125,31 +119,24 @@ class Recording:
 
     def timings(self) -> NDArray[np.void]:
         """Return the host times of all decisions, TIMING_DTYPE (n,)."""
-        parts = list(self.iter_timings())
-        return np.concatenate(parts) if parts else np.zeros(0, TIMING_DTYPE)
+        return np.concatenate([np.zeros(0, TIMING_DTYPE), *self.iter_timings()])
 
     def iter_timings(self) -> Iterator[NDArray[np.void]]:
         """Yield the host times block by block, TIMING_DTYPE (n,); memory holds one block."""
         for block in self.iter_blocks(Kind.TIMINGS):
             yield expand_timings(_checked_runs(block, self.path))
 
-    def clock_samples(self) -> NDArray[np.void]:
-        """Return all clock samples, CLOCK_DTYPE (n,)."""
-        parts = list(self.iter_clock_samples())
-        return np.concatenate(parts) if parts else np.zeros(0, CLOCK_DTYPE)
-
     def iter_clock_samples(self) -> Iterator[NDArray[np.void]]:
         """Yield the clock samples block by block, CLOCK_DTYPE (n,)."""
         for block in self.iter_blocks(Kind.CLOCK):
-            yield np.frombuffer(_whole_rows(block, CLOCK_DTYPE, self.path), CLOCK_DTYPE)
+            yield _rows(block, CLOCK_DTYPE, self.path)
 
     def events(self) -> Iterator[dict[str, Any]]:
         """Yield the events, in order."""
         for block in self.iter_blocks(Kind.EVENTS):
             for line in block.payload.splitlines():
-                yield _checked_event(
-                    parse_json_object(line, where := f"{self.path}: an event in block {block.index}"), where
-                )
+                where = f"{self.path}: an event in block {block.index}"
+                yield _checked_event(parse_json_object(line, where), where)
 
     def bundle_data(self) -> bytes:
         """Return the bytes of the bundle that the run used, b"" if it was not recorded."""
@@ -207,16 +194,16 @@ def _past_block(path: Path, block: Block) -> DamagedFileError:
     return DamagedFileError(f"{path}: block {block.index}: a message reaches past its block")
 
 
-def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:
-    if len(block.payload) % dtype.itemsize:
-        size = len(block.payload)
+def _rows(block: Block, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
+    size = len(block.payload)
+    if size % dtype.itemsize:
         raise DamagedFileError(f"{path}: block {block.index} has {size} bytes, allowed: a multiple of {dtype.itemsize}")
-    return block.payload
+    return np.frombuffer(block.payload, dtype)
 
 
 def _checked_runs(block: Block, path: Path) -> NDArray[np.void]:
     """Return the runs of a block that do not ask for more memory than such a block may."""
-    runs = np.frombuffer(_whole_rows(block, TIMING_RUN_DTYPE, path), TIMING_RUN_DTYPE)
+    runs = _rows(block, TIMING_RUN_DTYPE, path)
     rows = int(runs["count"].sum(dtype=np.uint64))
     if rows > TIMING_ROWS_MAX or not runs["count"].all():
         raise DamagedFileError(
@@ -260,15 +247,15 @@ class _Scan:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.kinds = {kind: 0 for kind in Kind}
+        self.kinds: Counter[Kind] = Counter()
         self.header: dict[str, Any] = {}
-        self.end: dict[str, Any] | None = None
-        self.end_offset = 0
-        self.n_decisions = 0
+        self.summary: dict[str, Any] | None = None
+        self.end_offset = self.n_decisions = 0
         self.bundle_place: tuple[int, int] | None = None
         self.log = LogReader()
 
     def take(self, block: Block) -> None:
+        """Account for the next block; DamagedFileError where it does not fit those before."""
         where = f"{self.path}: block {block.index}"
         kind = Kind(block.kind)
         if (kind == Kind.HEADER) != (block.index == 0) or (kind == Kind.BUNDLE and self.kinds[kind]):
@@ -276,27 +263,24 @@ class _Scan:
         if kind == Kind.HEADER:
             self.header = parse_json_object(block.payload, where)
         elif kind == Kind.BUNDLE:
-            found = hashlib.sha256(block.payload).hexdigest()
-            if self.header.get("bundle_sha256") != found:
-                wanted = ascii(self.header.get("bundle_sha256"))[:80]
-                raise DamagedFileError(f"{where}: the bundle has the SHA-256 {found}, the header says {wanted}")
+            found, wanted = hashlib.sha256(block.payload).hexdigest(), self.header.get("bundle_sha256")
+            if wanted != found:
+                said = ascii(wanted)[:80]
+                raise DamagedFileError(f"{where}: the bundle has the SHA-256 {found}, the header says {said}")
             self.bundle_place = block.begin, len(block.payload)
         elif kind == Kind.END:
-            self.end = self._check_end(block, where)
+            end = parse_json_object(block.payload, where)
+            facts = {"blocks": block.index, "decisions": self.n_decisions, "decisions_sha256": self.log.hexdigest()}
+            for key, value in facts.items():
+                if end.get(key) != value:
+                    raise DamagedFileError(f"{where}: END says {key} = {ascii(end.get(key))[:80]}, found {value}")
+            if not isinstance(end.get("summary"), dict):
+                raise DamagedFileError(f"{where}: END holds no summary")
+            self.summary = end["summary"]
         elif kind == Kind.DECISIONS:
             self.n_decisions += len(self.log.rows(block.payload, where))
         self.kinds[kind] += 1
         self.end_offset = block.end
-
-    def _check_end(self, block: Block, where: str) -> dict[str, Any]:
-        end = parse_json_object(block.payload, where)
-        facts = {"blocks": block.index, "decisions": self.n_decisions, "decisions_sha256": self.log.hexdigest()}
-        for key, found in facts.items():
-            if end.get(key) != found:
-                raise DamagedFileError(f"{where}: END says {key} = {ascii(end.get(key))[:80]}, found {found}")
-        if not isinstance(end.get("summary"), dict):
-            raise DamagedFileError(f"{where}: END holds no summary")
-        return end
 
 
 def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
@@ -313,25 +297,24 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
                 for block in _blocks(file, _start(file, str(path)), str(path)):
                     scan.take(block)
             except DamagedFileError as error:
-                if not salvage or not scan.kinds[Kind.HEADER]:
-                    whole = f"{sum(scan.kinds.values())} whole blocks before it"
+                if not salvage or not scan.kinds:
+                    whole = f"{scan.kinds.total()} whole blocks before it"
                     raise DamagedFileError(f"{error.message}; {whole}", remedy=error.remedy) from error
                 damage = error.message
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if not scan.kinds[Kind.HEADER]:
+    if not scan.kinds:
         raise DamagedFileError(f"{path}: cut after {size} bytes, within its header: nothing of it can be read")
-    complete = scan.end is not None and not damage
     return Recording(
         path=Path(path),
         size=size,
         header=scan.header,
-        kinds={kind: count for kind, count in scan.kinds.items() if count},
+        kinds=scan.kinds,
         n_decisions=scan.n_decisions,
         decisions_sha256=scan.log.hexdigest(),
-        complete=complete,
+        complete=scan.summary is not None and not damage,
         end_offset=scan.end_offset,
-        summary=scan.end["summary"] if scan.end is not None else {},
+        summary=scan.summary or {},
         damage=damage,
         bundle_place=scan.bundle_place,
     )

@@ -1,11 +1,8 @@
-"""The plan and the ARM commands of a recording, as they were sent to the device.
-
-Owns the way back from recorded commands; a plan's own form is core/plan_codec.py's.
-"""
+"""Recorded commands in; the plan and the ARM commands that the device was sent out (a plan's own form: core/plan_codec.py)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,7 +23,6 @@ from pans.runtime.wire.commands import (
 )
 from pans.runtime.wire.messages import (
     CommandMessage,
-    Frame,
     FrameDecoder,
     MalformedMessage,
     MessageType,
@@ -41,17 +37,19 @@ TICK_HZ = Range(1000, 10_000_000_000, whole=True)
 PHOTON_NUMBER = Range(1, MAX_PHOTON_NUMBER, whole=True)
 
 
+def _sent_commands(recording: Recording) -> Iterator[tuple[int, CommandMessage]]:
+    """Yield the commands, each with the session that it was sent in; MalformedMessage for what is none."""
+    decoder = FrameDecoder()
+    for _, data in recording.commands():
+        for frame in decoder.feed(data):
+            if frame.type == MessageType.COMMAND:
+                yield frame.session, decode_command(frame.payload)
+
+
 def never_armed(recording: Recording) -> bool:
     """Whether the run ended before it armed the device, so that there was nothing to decide; DamagedFileError for what is no command."""
-    if recording.n_decisions:
-        return False
-    decoder = FrameDecoder()
     try:
-        return not any(
-            frame.type == MessageType.COMMAND and decode_command(frame.payload).opcode == Opcode.ARM
-            for _, data in recording.commands()
-            for frame in decoder.feed(data)
-        )
+        return not recording.n_decisions and all(one.opcode != Opcode.ARM for _, one in _sent_commands(recording))
     except MalformedMessage as error:
         raise DamagedFileError(f"{recording.path}: a command cannot be read: {error}") from error
 
@@ -84,7 +82,7 @@ class Sent:
                 raise MalformedMessage(f"state {state} was shown as {shown} (pattern, dwell, steps), it is {known}")
         return plan
 
-    def take(self, frame: Frame, command: CommandMessage) -> None:
+    def take(self, session: int, command: CommandMessage) -> None:
         """Take one command; MalformedMessage when it cannot be read, or a state was shown in two ways."""
         if command.opcode == Opcode.LOAD_PLAN:
             chunk = unpack_command(PlanChunk, command.body)
@@ -100,16 +98,14 @@ class Sent:
             if self.shown.setdefault(show.state, seen) != seen:
                 raise MalformedMessage(f"state {show.state} was shown in two ways")
         elif command.opcode == Opcode.ARM:
-            self.arms[frame.session] = unpack_command(Arm, command.body)
+            self.arms[session] = unpack_command(Arm, command.body)
 
 
 def sent_to_device(recording: Recording) -> Sent:
     """Return what was sent to the device (repetitions left out); MalformedMessage if it was never armed."""
-    decoder, sent = FrameDecoder(), Sent()
-    for _, data in recording.commands():
-        for frame in decoder.feed(data):
-            if frame.type == MessageType.COMMAND:
-                sent.take(frame, decode_command(frame.payload))
+    sent = Sent()
+    for session, command in _sent_commands(recording):
+        sent.take(session, command)
     if not sent.arms:
         raise MalformedMessage("the device was never armed")
     return sent
@@ -131,8 +127,8 @@ def automaton_of(config: Mapping[str, Any], bundle: Bundle | None) -> Automaton 
 
 def walk_dose(config: Mapping[str, Any]) -> DoseCap | None:
     """Return the cap that a run with this `config` kept on each walk, None of others; KeyError or ValueError if it does not tell."""
-    told = config.get("walk_dose")
-    return None if told is None else DoseCap(float(told["most"]), int(told["states"]))
+    cap = config.get("walk_dose")
+    return None if cap is None else DoseCap(float(cap["most"]), int(cap["states"]))
 
 
 def recorded_plan(recording: Recording) -> Plan:

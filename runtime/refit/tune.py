@@ -143,9 +143,6 @@ class Cost(NamedTuple):
         return self.photons <= budget.photons and self.seconds <= budget.seconds
 
 
-UNLIMITED = Cost(math.inf, math.inf)
-
-
 class Step(NamedTuple):
     """One trial of the journal: the move, what it cost, and each object's loss (None: unknown; of all where the device cannot show it)."""
 

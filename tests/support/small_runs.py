@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pans.firmware_sim.ports.serve import open_sim
@@ -15,6 +16,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.record import PartLimits, Recorder
+from pans.runtime.record.log import LogEncoder
 
 
 class Disk:
@@ -35,6 +37,13 @@ def fails(number: int) -> Any:
         raise OSError(number, os.strerror(number))
 
     return method
+
+
+def log_sha256(rows: np.ndarray) -> str:
+    """The SHA-256 (hex) of decisions, DECISION_DTYPE (n,), in their order: what replay compares."""
+    log = LogEncoder()
+    log.update(rows)
+    return log.hexdigest()
 
 
 def record_small(

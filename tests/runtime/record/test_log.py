@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_runs import log_sha256
 
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record import log as record_log
 from pans.runtime.record.format import LONG_VERDICT
-from pans.runtime.record.log import RUN_DTYPE, VERDICT_DTYPE, LogEncoder, LogReader, decision_log_sha256
+from pans.runtime.record.log import RUN_DTYPE, VERDICT_DTYPE, LogEncoder, LogReader
 
 
 def naive_sha256(rows: np.ndarray) -> str:
@@ -101,9 +102,9 @@ def test_rows_come_back_and_the_hash_is_theirs_alone(rows: np.ndarray, cuts: lis
     pieces = np.split(rows, sorted(cuts))
     found = [reader.rows(encoder.block(piece), "a log") for piece in pieces]
     assert np.concatenate(found).tobytes() == rows.tobytes()
-    assert encoder.hexdigest() == reader.hexdigest() == decision_log_sha256(rows) == naive_sha256(rows)
+    assert encoder.hexdigest() == reader.hexdigest() == log_sha256(rows) == naive_sha256(rows)
     if len(rows) > 1:
-        assert decision_log_sha256(rows[:-1]) != encoder.hexdigest()
+        assert log_sha256(rows[:-1]) != encoder.hexdigest()
 
 
 def regular(n: int, verdicts: int, seed: int = 0) -> np.ndarray:
@@ -124,7 +125,7 @@ def test_a_fast_stream_takes_two_bytes_a_decision(tmp_path: Path) -> None:
     found = read_recording(tmp_path / "a.pansrec")
     assert found.size < 2.3 * len(rows)
     assert found.decisions().tobytes() == rows.tobytes()
-    assert digest == found.decisions_sha256 == decision_log_sha256(rows)
+    assert digest == found.decisions_sha256 == log_sha256(rows)
 
 
 def test_more_verdicts_than_have_numbers() -> None:
@@ -134,7 +135,7 @@ def test_more_verdicts_than_have_numbers() -> None:
     blocks = [encoder.block(rows[start : start + step]) for start in range(0, len(rows), step)]
     assert max(map(len, blocks)) < 2 << 20
     assert b"".join(reader.rows(block, "a log").tobytes() for block in blocks) == rows.tobytes()
-    assert encoder.hexdigest() == reader.hexdigest() == decision_log_sha256(rows)
+    assert encoder.hexdigest() == reader.hexdigest() == log_sha256(rows)
     assert len({row.tobytes() for row in rows["counts_crc"]}) > LONG_VERDICT
 
 
@@ -168,7 +169,7 @@ def test_blocks_whose_parts_do_not_fit_are_refused(payload: bytes, reason: str) 
 
 def test_exposures_of_walks_stand_in_a_recording_and_cost_others_nothing(tmp_path: Path) -> None:
     rows = regular(5000, 100)
-    plain = decision_log_sha256(rows)
+    plain = log_sha256(rows)
     assert plain == "63f7ea273cb08c6019f7e672c69d2521231946b9d7a9fd99fd01fbf880fbfda0"  # must not change
     rows["exposures"] = 1 + rows["counts_crc"] % 28
     with Recorder(tmp_path / "walks", {}) as recorder:
@@ -176,7 +177,7 @@ def test_exposures_of_walks_stand_in_a_recording_and_cost_others_nothing(tmp_pat
         recorder.close({})
     found = read_recording(tmp_path / "walks")
     assert found.decisions().tobytes() == rows.tobytes()
-    assert found.decisions_sha256 == decision_log_sha256(rows) != plain
+    assert found.decisions_sha256 == log_sha256(rows) != plain
 
 
 @pytest.mark.parametrize("version", [0, 2])

@@ -68,7 +68,7 @@ def test_every_part_replays_and_verifies_by_itself(parts: Path) -> None:
     numbers, found = check_each(parts), [read_recording(path) for path in parts_in(parts)]
     assert len(found) > 2
     assert numbers == list(range(len(numbers)))
-    assert all(part.complete and len(part.clock_samples()) for part in found)
+    assert all(part.complete and any(map(len, part.iter_clock_samples())) for part in found)
     assert all(part.n_decisions > 50 for part in found[:-1])
     assert not list(parts.glob(".*"))
 

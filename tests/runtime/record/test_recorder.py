@@ -15,14 +15,13 @@ import numpy as np
 import pytest
 from automata import automaton_bundle
 from bundles import made_bundle
-from small_runs import Disk, fails
+from small_runs import Disk, fails, log_sha256
 
 from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
 from pans.runtime.errors import DamagedFileError, PansError, RecordingError, UsageError
 from pans.runtime.record import Recorder, Recording, read_recording
 from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind
-from pans.runtime.record.log import decision_log_sha256
 from pans.runtime.record.sent_plan import automaton_of
 from pans.runtime.timing.clock import CLOCK_DTYPE
 
@@ -69,9 +68,9 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert list(found.messages()) == [(100 + i, bytes([i]) * i) for i in range(5)]
     assert list(found.commands()) == [(10, b"arm")]
     np.testing.assert_array_equal(found.decisions(), decisions(5))
-    assert digest == found.decisions_sha256 == decision_log_sha256(decisions(5))
+    assert digest == found.decisions_sha256 == log_sha256(decisions(5))
     assert found.timings().tolist() == [(index, 1, 2, 3, 4) for index in range(5)]
-    assert found.clock_samples().tolist() == [(5, 6, 7), (8, 9, 10)]
+    assert np.concatenate(list(found.iter_clock_samples())).tolist() == [(5, 6, 7), (8, 9, 10)]
     assert list(found.events()) == [{"kind": "gap", "lost": 3}, {"kind": "late", "text": "a line\nof two"}]
     assert found.bundle_data() == b""
     with pytest.raises(UsageError, match="no bundle"):
@@ -421,7 +420,7 @@ def test_decisions_in_bulk_make_the_same_log(tmp_path: Path) -> None:
         digest = recorder.close({})
     with Recorder(many, HEADER) as recorder:
         recorder.add_decisions(wanted)
-        assert recorder.close({}) == digest == decision_log_sha256(wanted)
+        assert recorder.close({}) == digest == log_sha256(wanted)
     for path in (one, many):
         np.testing.assert_array_equal(read_recording(path).decisions(), wanted)
 

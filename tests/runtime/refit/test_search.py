@@ -9,9 +9,10 @@ import pytest
 from pans.firmware_sim.testing import small_automaton_bundle
 from pans.runtime.bundle import load_bundle
 from pans.runtime.errors import DamagedFileError, PlanError
-from pans.runtime.refit.tune import BENDS, STILL, UNLIMITED, Cost, Move, Search, Step, moved, paired
+from pans.runtime.refit.tune import BENDS, STILL, Cost, Move, Search, Step, moved, paired
 
 NAMES = ("right_px", "down_px", "rotation_deg")
+UNLIMITED = Cost(math.inf, math.inf)
 HARD = np.random.default_rng(0).exponential(size=1000)
 
 
