@@ -1,7 +1,9 @@
-"""Runs of automata, driven by the device and by the host, in virtual time: the same walks, and no guess where something is missing."""
+"""Runs of automata in virtual time, by the device and by the host, of one detector and of several: the same walks, and no guesses."""
 
 from __future__ import annotations
 
+import csv
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -11,15 +13,24 @@ import pytest
 from automata import automaton_bundle, random_automaton
 from commands import json_of
 
-from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.bundle.model import write_bundle
+from pans.firmware_sim.ports.serve import SimOptions, build_instrument
+from pans.runtime.bundle.automaton import Automaton, walk_nodes
+from pans.runtime.bundle.model import Bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
+from pans.runtime.core.plan import build_plan
+from pans.runtime.decide.expectation import expected_walk
+from pans.runtime.errors import DeviceError, PlanError
+from pans.runtime.instrument.click_law import click_law, object_transmission
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.link.fit import check_automaton
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.parts import parts_in
 from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.wire.commands import count_announcement
 from pans.runtime.wire.messages import DARK_PATTERN
+from pans.runtime.wire.schema import AUTOMATON_SCHEMA
 
 N_OBJECTS = 40
 WALKS = ("object", "shot", "clicks", "label", "truth", "flags", "probability", "counts_crc", "exposures")
@@ -73,19 +84,25 @@ def test_the_host_and_the_device_give_the_same_walks(
         assert main(["verify", str(tmp_path / drive / "run.pansrec")]) == 0
 
 
-def walked_by_hand(automaton: Automaton, recording: Recording) -> list[tuple[int, int, int]]:
-    """Photons, label and exposures of every walk, from the recorded bytes of COUNTS as protocol.md lays them out."""
+def sent(recording: Recording, largest: int, slots: int) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps and numbers of all exposures (cycles, slots), from the recorded bytes of COUNTS as protocol.md lays them out."""
     exposures: dict[int, tuple[int, int]] = {}
     for _, body in recording.messages():
         if body[0] == 0x93:
-            first, _, n, largest, _ = struct.unpack_from("<QIHHI", body, 8 + 16)
-            assert largest == automaton.n_outcomes - 1
+            first, _, n, found, _ = struct.unpack_from("<QIHHI", body, 8 + 16)
+            assert found == largest
             stamps, numbers = struct.unpack_from(f"<{n}H", body, 8 + 36), body[8 + 36 + 2 * n :]
-            exposures |= {first + i: (stamps[i], numbers[i]) for i in range(n)}
-    rows, slots = [], automaton.n_slots + 1  # one dark slot in a cycle
-    for cycle in range(len(exposures) // slots):
+            exposures |= dict(enumerate(zip(stamps, numbers), first))
+    rows = np.array([exposures[i] for i in range(len(exposures))])
+    return rows[:, 0].reshape(-1, slots), rows[:, 1].reshape(-1, slots)
+
+
+def walked_by_hand(automaton: Automaton, recording: Recording) -> list[tuple[int, int, int]]:
+    """Photons, label and exposures of every walk."""
+    rows = []
+    for shown, numbers in zip(*sent(recording, automaton.n_outcomes - 1, automaton.n_slots + 1)):  # one dark slot
         node, photons, taken = 0, 0, 0
-        for stamp, number in (exposures[cycle * slots + slot] for slot in range(slots)):
+        for stamp, number in zip(shown.tolist(), numbers.tolist()):
             if node < automaton.n_states and stamp == node:
                 node, photons, taken = int(automaton.successors[node][number]), photons + number, taken + 1
         rows.append((photons, int(automaton.posteriors[node].argmax()), taken))
@@ -202,3 +219,148 @@ def test_what_makes_no_sense_with_walks_is_refused(
         assert main(["run", bundle, "--device", device, "--decisions", "3", "--out", str(tmp_path / "no"), *words]) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
+
+
+# -- several detectors at once -------------------------------------------------------------------------------------------
+
+TRIALS, CHANNELS = 6, 3
+PROFILE = load_profile("dmd-four-snspd")
+IMAGES = np.random.default_rng(2).integers(0, 256, (N_OBJECTS, 2, 2)).astype(np.uint8)
+
+
+def bundle() -> Bundle:
+    automaton = random_automaton(4, slots=5, width=6, patterns=6, channels=CHANNELS)
+    return automaton_bundle(automaton, levels=2, photons_per_level=0.5)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle, a scene, and a run by either drive."""
+    folder = tmp_path_factory.mktemp("at-once")
+    write_bundle(bundle(), folder / "walk.pans")
+    labels = np.arange(N_OBJECTS, dtype=np.int16) % 3
+    np.savez(folder / "tiny.npz", images=IMAGES, labels=labels, classes=np.array(["c0", "c1", "c2"]))
+    for drive in ("device", "host"):
+        device = f"sim:dmd-four-snspd?scene={folder / 'tiny.npz'}&seed=5&pace=fast"
+        words = ["--decisions", str(TRIALS * N_OBJECTS), "--trials", str(TRIALS), "--drive", drive, "-q"]
+        assert main(["run", str(folder / "walk.pans"), "--device", device, *words, "--out", str(folder / drive)]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("drive", ["device", "host"])
+def test_a_run_is_its_walks_and_replays(runs: Path, drive: str, capsys: pytest.CaptureFixture[str]) -> None:
+    automaton = bundle().automaton
+    assert automaton is not None
+    recording = read_recording(runs / drive / "run.pansrec")
+    assert recording.header["config"]["channels_at_once"] == CHANNELS
+    stamps, words = sent(recording, 2**CHANNELS - 1, automaton.n_slots + 1)
+    rows = recording.decisions()
+    for walk, (shown, numbers) in enumerate(zip(stamps, words)):
+        lit = shown != DARK_PATTERN
+        bits = np.zeros(automaton.n_bits, np.int64)
+        clicks = numbers[lit][:, None] >> np.arange(CHANNELS) & 1
+        bits[: clicks.size] = clicks.reshape(-1)
+        nodes = walk_nodes(automaton, bits[None])[0]
+        assert nodes[: lit.sum()].tolist() == shown[lit].tolist()
+        wanted = (clicks.sum(), automaton.posteriors[nodes[-1]].argmax(), lit.sum())
+        assert rows[walk][["clicks", "label", "exposures"]].tolist() == wanted
+    assert main(["replay", str(runs / drive / "run.pansrec")]) == 0
+    assert main(["verify", str(runs / drive / "run.pansrec")]) == 0
+
+
+def test_device_and_host_lead_the_same_walks(runs: Path) -> None:
+    by_device, by_host = (read_recording(runs / drive / "run.pansrec").decisions() for drive in ("device", "host"))
+    assert by_device[list(WALKS)].tolist() == by_host[list(WALKS)].tolist()
+    assert len(set(by_device["exposures"].tolist())) > 2
+
+
+def test_a_run_is_within_its_exact_expectation(runs: Path) -> None:
+    made = bundle()
+    assert made.automaton is not None
+    plan = build_plan(PROFILE, made)
+    seen = object_transmission(PROFILE, IMAGES.reshape(N_OBJECTS, -1))
+    law = click_law(PROFILE, plan.exposure_us)
+    found = expected_walk(made.automaton, made.pattern_levels, seen, law, made.photons_per_level)
+    rows = read_recording(runs / "device" / "run.pansrec").decisions()
+    for name, wanted in (("clicks", found.clicks), ("exposures", found.exposures)):
+        of_objects = rows[name].reshape(N_OBJECTS, TRIALS)
+        error = math.sqrt(of_objects.var(axis=1, ddof=1).sum() / TRIALS) / N_OBJECTS
+        assert abs(of_objects.mean() - wanted.mean()) < 3.5 * error
+    decided = np.bincount(rows["label"], minlength=3) / len(rows)
+    of_class = made.automaton.posteriors[made.automaton.n_states :].argmax(axis=1)
+    chance = np.array([found.leaves[:, of_class == label].sum() / N_OBJECTS for label in range(3)])
+    assert np.abs(decided - chance).max() < 3.5 * 0.5 / math.sqrt(len(rows))
+
+
+def test_clicks_are_exported_by_channel_and_reported(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, automaton = runs / "host" / "run.pansrec", bundle().automaton
+    assert automaton is not None
+    recording = read_recording(path)
+    plan = recorded_plan(recording)
+    clicks = click_list(recording, plan)
+    lit = clicks.pattern != DARK_PATTERN
+    assert lit.sum() == recording.decisions()["clicks"].sum()
+    assert set(clicks.channel.tolist()) == set(range(CHANNELS))
+    assert (clicks.pattern[lit] == automaton.pattern[clicks.state[lit]] + clicks.channel[lit]).all()
+    assert main(["export", "--format", "csv", "--out", str(tmp_path), str(path)]) == 0
+    with (tmp_path / "clicks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["channel"]) for row in rows] == clicks.channel.tolist()
+    assert "photons" not in rows[0]
+    assert main(["report", str(path), "--out", str(tmp_path / "page.html")]) == 0
+    assert "shows 3 patterns at once" in (tmp_path / "page.html").read_text()
+    facts = json_of(capsys, "", "info", runs / "walk.pans")
+    assert (facts["automaton"]["channels"], facts["automaton"]["outcomes"]) == (CHANNELS, 1 << CHANNELS)
+
+
+def test_an_instrument_of_fewer_detectors_is_refused_with_the_numbers() -> None:
+    made = bundle()
+    with pytest.raises(PlanError, match="reads 3 detectors at once, dmd-spad measures in sequential mode and has 1"):
+        build_plan(load_profile("dmd-spad"), made)
+    plan = build_plan(PROFILE, made)
+    facts = {"automaton_schema": AUTOMATON_SCHEMA, "automaton_states": 100, "dwell_steps": 8}
+    check_automaton(facts | count_announcement(1, 3), plan)
+    for told in ({}, count_announcement(15), count_announcement(1, 2), {"channels_at_once": 4, "count_schema": 1}):
+        with pytest.raises(DeviceError, match=r"reads [12] detector\(s\) at once, needed 3"):
+            check_automaton(facts | told, plan)
+    device, _ = build_instrument(SimOptions("dmd-four-snspd", "uniform"), 0)
+    assert (device.number_max, device.channels_max) == (1, 4)
+
+
+def test_a_dead_detector_never_clicks(runs: Path, tmp_path: Path) -> None:
+    """Walks that are followed exposure by exposure: the scene changes with time."""
+    scene = tmp_path / "dead.toml"
+    source = f'kind = "still"\nimages = "{runs / "tiny.npz"}"\n'
+    scene.write_text(source + '[[change]]\nkind = "dead"\nat_s = 0\nchannel = 1\n')
+    device = f"sim:dmd-four-snspd?scene={scene}&seed=5&pace=fast"
+    words = ["--decisions", str(2 * N_OBJECTS), "--trials", "2", "-q", "--out", str(tmp_path / "out")]
+    assert main(["run", str(runs / "walk.pans"), "--device", device, *words]) in (0, 1)
+    recording = read_recording(tmp_path / "out" / "run.pansrec")
+    channels = click_list(recording, recorded_plan(recording)).channel.tolist()
+    assert channels.count(1) == 0
+    assert min(channels.count(0), channels.count(2)) > 20
+
+
+@pytest.mark.parametrize(
+    ("change", "policy", "kind", "level"),
+    [("dead:at_s=0.2", "abstain", "dead", "warning"), ("hot:at_s=0.2:rate_hz=20000", "warn", "hot", "alarm")],
+)
+def test_what_one_of_several_detectors_does_in_the_dark_is_told_of_it_alone(
+    runs: Path, tmp_path: Path, change: str, policy: str, kind: str, level: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device = f"sim:dmd-four-snspd?scene={runs / 'tiny.npz'}&seed=5&pace=fast&changes={change}:channel=1"
+    words = ("--dark-slots", 2, "--decisions", 900, "--trials", 30, "--on-dark", policy, "--out", tmp_path)
+    summary = json_of(capsys, "run", runs / "walk.pans", "--device", device, *words, code=None)
+    dark = summary["dark"]
+    found = [finding for finding in dark["findings"] if finding["state"] == kind]
+    assert [(finding["channels"], finding["level"]) for finding in found] == [([1], level)]
+    for channel, row in enumerate(dark["channels"]):
+        assert (row["low"] <= row["expected"] * 1.15 and row["high"] >= row["expected"] * 0.85) == (channel != 1)
+    assert dark["expected"] == pytest.approx(1 - (1 - dark["channels"][0]["expected"]) ** CHANNELS)
+    without = np.flatnonzero(read_recording(tmp_path / "run.pansrec").decisions()["flags"] & DecisionFlag.DARK_ALARM)
+    assert len(without) == summary["abstained"]
+    assert (len(without) > 100) == (policy == "abstain")
+    assert (np.diff(without) == 1).all()
+    assert main(["replay", str(tmp_path / "run.pansrec")]) == 0
