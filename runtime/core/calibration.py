@@ -197,9 +197,6 @@ class CalibrationCore(Follower):
         """See Follower."""
         return self._tallies
 
-    def warm_up(self) -> None:
-        """Nothing here is compiled."""
-
     def cycles_left(self, n_cycles: int) -> int:
         """Return the cycles that were not seen whole."""
         return n_cycles - self.tracker.next_exposure // self._slots_per_cycle
@@ -249,9 +246,6 @@ class CalibrationCore(Follower):
         self._before, self._next = None, 0
         return Output([], [], None)
 
-    def _nothing_left(self) -> bool:
-        return self.tracker.next_exposure >= self.end_exposure
-
 
 def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[Counts]:
     """Return each channel's counts, with what the exposure before and the neighbours add to a click's probability."""
@@ -264,15 +258,9 @@ def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[C
         own = np.arange(channel, len(design.drives), core.channels)  # what it was shown; in parallel mode one pattern
         drive, pattern = np.append(design.drives[own], 0.0), np.append(own, -1)
         primed = -_memory_of_patterns(afterpulses, rate[channel], design.plan, core.parallel)
-        result.append(
-            Counts(
-                np.repeat(drive, 2),
-                core.sums[channel, :, :, 1].ravel(),
-                core.sums[channel, :, :, 0].ravel(),
-                (primed + across[channel][:, None]).ravel(),
-                np.repeat(pattern, 2),
-            )
-        )
+        exposures, clicks = (core.sums[channel, :, :, column].ravel() for column in range(2))
+        other = (primed + across[channel][:, None]).ravel()
+        result.append(Counts(np.repeat(drive, 2), clicks, exposures, other, np.repeat(pattern, 2)))
     if not any(int(counts.exposures.sum()) for counts in result):
         raise UsageError("the device sent no exposures that could be counted")
     return result

@@ -197,7 +197,6 @@ class Follower:
 
     def warm_up(self) -> None:
         """Run every compiled kernel of the hot path once, before arming."""
-        raise NotImplementedError
 
     def cycles_left(self, n_cycles: int) -> int:
         """Return how many of a whole run's `n_cycles` cycles stand out when what is under way is given up."""
@@ -220,7 +219,7 @@ class Follower:
 
     def _nothing_left(self) -> bool:
         """Whether another stream would have nothing to show."""
-        raise NotImplementedError
+        return self.tracker.next_exposure >= self.end_exposure
 
     def _place(self) -> dict[str, Any] | None:
         """What this core must be given to go on from here; None while something is open that the clicks so far are part of."""
@@ -318,7 +317,8 @@ class Follower:
             return Output([], [*events, self._contradicts(wrong)], None)
         end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
         self.last_tick = end_tick
-        self._check_slot(message.exposure_index + n_exposures - 1, end_tick)
+        planned = self.start_tick + self._rules.planned(message.exposure_index + n_exposures - 1)
+        self.jitter_ticks = max(self.jitter_ticks, abs(end_tick - planned - self._exposure_ticks))
         skipped = self._skip_to(message.exposure_index, message.tick)
         taken = self._take(message, n_exposures, end_tick)
         return joined(Output(skipped.decisions, events, None, skipped.passages, skipped.actions), taken, end_tick)
@@ -332,13 +332,6 @@ class Follower:
     def _contradicts(self, wrong: Contradiction) -> Contradiction:
         self.contradictions[wrong.what] += 1
         return wrong
-
-    def _check_slot(self, exposure_index: int, end_tick: int) -> None:
-        """Compare when an exposure ended with when the plan says that it should."""
-        plan = self._plan
-        cycle, slot = divmod(exposure_index, plan.slots_per_cycle)
-        planned = self.start_tick + cycle * plan.cycle_ticks + int(plan.slot_offset_ticks[slot])
-        self.jitter_ticks = max(self.jitter_ticks, abs(end_tick - planned - plan.exposure_ticks))
 
     def _on_status(self, frame: Frame) -> Output:
         """When the device says that the plan is done, settle what will never be complete.

@@ -110,29 +110,39 @@ class CoreState:
 
     def load(self) -> None:
         """Copy what Core, its tracker and its windows know into the kernel's state."""
-        core, state = self.core, self._state
-        state[kernels.N_ROWS], state[kernels.START_TICK] = 0, min(core.start_tick, _LARGEST)
-        state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE], state[place.DROPS] = core.tracker.position
-        state[place.MESSAGES] = state[place.EXPOSURES] = 0
+        state = self._state
+        load_core(self.core, state)
         state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT] = self.windows.position
-        state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED] = core.n_decisions, core.n_abstained
-        state[place.END_EXPOSURE], state[kernels.LAST_TICK] = (
-            min(core.end_exposure, 1 << 62),
-            min(core.last_tick, _LARGEST),
-        )
-        state[kernels.JITTER] = min(core.jitter_ticks, _LARGEST)
 
     def store(self) -> None:
         """Copy what the kernel did back."""
-        core, state = self.core, self._state.tolist()
-        if state[place.MESSAGES]:
-            position = state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]
-            core.tracker.advance(position, state[place.MESSAGES], state[place.EXPOSURES])
+        state = self._state.tolist()
+        if store_core(self.core, state):
             self.windows.advance((state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT]))
-            if state[kernels.LAST_TICK] != min(core.last_tick, _LARGEST):  # a larger one only Python's integers hold
-                core.last_tick = state[kernels.LAST_TICK]
-            core.jitter_ticks = max(core.jitter_ticks, state[kernels.JITTER])
-        core.n_decisions, core.n_abstained = state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED]
+
+
+def load_core(core: Any, state: npt.NDArray[np.int64]) -> None:
+    """Copy where a core (a Follower) and its tracker stand into the kernel's state."""
+    state[kernels.N_ROWS], state[kernels.START_TICK] = 0, min(core.start_tick, _LARGEST)
+    state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE], state[place.DROPS] = core.tracker.position
+    state[place.MESSAGES] = state[place.EXPOSURES] = 0
+    state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED] = core.n_decisions, core.n_abstained
+    state[place.END_EXPOSURE] = min(core.end_exposure, 1 << 62)
+    state[kernels.LAST_TICK], state[kernels.JITTER] = min(core.last_tick, _LARGEST), min(core.jitter_ticks, _LARGEST)
+
+
+def store_core(core: Any, state: list[int]) -> bool:
+    """Copy what the kernel did back; return whether it took any message."""
+    core.n_decisions, core.n_abstained = state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED]
+    if not state[place.MESSAGES]:
+        return False
+    core.tracker.advance(
+        (state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]), state[place.MESSAGES], state[place.EXPOSURES]
+    )
+    if state[kernels.LAST_TICK] != min(core.last_tick, _LARGEST):  # a larger one only Python's integers hold
+        core.last_tick = state[kernels.LAST_TICK]
+    core.jitter_ticks = max(core.jitter_ticks, state[kernels.JITTER])
+    return True
 
 
 class IdleSteps:

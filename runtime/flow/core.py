@@ -29,7 +29,7 @@ from pans.runtime.core.decision import (
     joined,
 )
 from pans.runtime.core.follower import Follower
-from pans.runtime.core.kernel_state import decision_tables
+from pans.runtime.core.kernel_state import decision_tables, load_core, store_core
 from pans.runtime.core.marks import mark_of
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.stream_kernels import DecisionTables
@@ -38,7 +38,6 @@ from pans.runtime.decide.backends import Decider
 from pans.runtime.decide.verdict import Verdict, log_evidence, softmax_winner
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import Finding
-from pans.runtime.wire import wire_kernels as place
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock, Mark, Status
 
 from . import kernels
@@ -209,27 +208,13 @@ class FlowCore(Follower):
     def load(self) -> None:
         """Copy what the core and its tracker know into the kernel's state."""
         state = self.walk.state
-        state[columns.N_ROWS] = state[place.MESSAGES] = state[place.EXPOSURES] = state[kernels.ASKS] = 0
-        state[columns.START_TICK] = min(self.start_tick, _LARGEST)
-        state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE], state[place.DROPS] = self.tracker.position
-        state[columns.N_DECISIONS], state[columns.N_ABSTAINED] = self.n_decisions, self.n_abstained
-        state[place.END_EXPOSURE] = min(self.end_exposure, 1 << 62)
-        state[columns.LAST_TICK], state[columns.JITTER] = (
-            min(self.last_tick, _LARGEST),
-            min(self.jitter_ticks, _LARGEST),
-        )
+        load_core(self, state)
+        state[kernels.ASKS] = 0
         state[kernels.WATCH_AT] = self.watched_frames + WATCHED_FRAMES if self.watches_empty else 1 << 62
 
     def store(self) -> None:
         """Copy what the kernel did back."""
-        state = self.walk.state.tolist()
-        if state[place.MESSAGES]:
-            position = state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]
-            self.tracker.advance(position, state[place.MESSAGES], state[place.EXPOSURES])
-            if state[columns.LAST_TICK] != min(self.last_tick, _LARGEST):  # a larger one only Python's integers hold
-                self.last_tick = state[columns.LAST_TICK]
-            self.jitter_ticks = max(self.jitter_ticks, state[columns.JITTER])
-        self.n_decisions, self.n_abstained = state[columns.N_DECISIONS], state[columns.N_ABSTAINED]
+        store_core(self, self.walk.state.tolist())
 
     def told_empty(self) -> list[list[int]]:
         """Return what the empty field gave and has not been accounted for: rows of `FlowWalk.empty`."""
@@ -415,9 +400,6 @@ class FlowCore(Follower):
         output = joined(super()._finish(status), self._close())
         self.matcher.finish()
         return output
-
-    def _nothing_left(self) -> bool:
-        return self.tracker.next_exposure >= self.end_exposure
 
     def remember_rows(self, rows: npt.NDArray[np.void]) -> None:
         """See Follower."""

@@ -53,12 +53,8 @@ class FlowSettings:
     sure: float = _within(0.0, 0, 1)  # a posterior below is ambiguous: no label
     # tape
     bars_per_s: float = _within(10_000.0, 1e-3, 1e9)
-    track: int = _within(
-        0, 0, 8
-    )  # follow phase and speed by the clicks: an edge corrects 2^-track of its error; 0: not
-    first_bar: float = _within(
-        1.0, 0, 1e9
-    )  # when the window of bar position 0 is aligned, in bar pitches from the start
+    track: int = _within(0, 0, 8)  # follow phase and speed: an edge corrects 2^-track of its error; 0: not at all
+    first_bar: float = _within(1.0, 0, 1e9)  # when the window of bar 0 is aligned, in bar pitches from the start
     # gate
     gate_delay_us: float = _within(900.0, 0, 1e6)  # from leaving to the pulse
     gate_us: float = _within(50.0, 0.01, 1e6)  # length of the pulse

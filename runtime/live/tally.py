@@ -78,7 +78,8 @@ class RunTally:
         cells = (truths * n_classes + labels)[labels != NO_LABEL]
         self.confusion += np.bincount(cells, minlength=n_classes**2).reshape(n_classes, n_classes)
         trials = rows["shot"][known] // self.shots
-        self._make_room(int(trials.max()))
+        while trials.max() >= len(self._trials):  # twice as long each time; a visit has at most 2^24 exposures
+            self._trials = np.concatenate([self._trials, np.zeros_like(self._trials)])
         self._trials[:, 0] += np.bincount(trials, minlength=len(self._trials))
         self._trials[:, 1] += np.bincount(trials[right], minlength=len(self._trials))
         self._add_objects(rows["object"][known].astype(np.int64), right)
@@ -89,22 +90,11 @@ class RunTally:
         begins = np.flatnonzero(np.diff(which, prepend=which[0] - 1))
         decided, well = np.diff(begins, append=len(which)), np.add.reduceat(right.astype(np.int64), begins)
         for index, n_decided, n_right in zip(which[begins].tolist(), decided.tolist(), well.tolist()):
-            sums = self._object_sums(index)
+            if index not in self._objects and len(self._objects) >= MAX_OBJECTS:
+                self._sum_up(next(iter(self._objects)))
+            sums = self._objects.setdefault(index, [0, 0])
             sums[0] += n_decided
             sums[1] += n_right
-
-    def _make_room(self, trial: int) -> None:
-        """Make the sums of trials long enough for one more, twice as long each time; a visit has at most 2^24 exposures."""
-        while trial >= len(self._trials):
-            self._trials = np.concatenate([self._trials, np.zeros_like(self._trials)])
-
-    def _object_sums(self, index: int) -> list[int]:
-        sums = self._objects.get(index)
-        if sums is None:
-            if len(self._objects) >= MAX_OBJECTS:
-                self._sum_up(next(iter(self._objects)))
-            sums = self._objects[index] = [0, 0]
-        return sums
 
     def _sum_up(self, index: int) -> None:
         """Keep of an object only what it adds to the sums; should it come back, it counts as another one."""
@@ -169,14 +159,11 @@ class RunResult:
     reconnects: int = 0
     late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (blame.CAUSES)
     lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
-    contradictions: dict[str, int] = field(
-        default_factory=dict
-    )  # messages that the evidence excludes, by what is wrong
+    contradictions: dict[str, int] = field(default_factory=dict)  # messages that are excluded, by what is wrong
     late_slots: int = 0  # that stayed dark because the host named no state in time
     turn_us: dict[str, float] = field(default_factory=dict)  # of the host's turns, where it drives
-    states_shown: npt.NDArray[np.int64] = field(
-        default_factory=lambda: np.zeros(0, np.int64)
-    )  # exposures of each state
+    # exposures of each state
+    states_shown: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
     page_faults: dict[str, int] = field(default_factory=dict)  # of the loop's thread while armed; its switches too
