@@ -21,6 +21,7 @@ NEEDS = {  # command line: what it needs, and the extra that has it
     "reproduce alpha --collect --cache new -o out": ("torch", "train"),
     "export r.pansrec --format photon-hdf5 -o new.h5": ("h5py", "export"),
     "run fashion10 --device sim:ideal?pace=fast --decisions 3 --metrics 0 --out new": ("prometheus-client", "metrics"),
+    "bench decide --quick --plot new.png": ("matplotlib", "plot"),
     "export r.pansrec --format parquet -o new.parquet": ("pyarrow", "parquet"),
     "evaluate fashion10 --task s.npz --objects 2 --pictures new": ("matplotlib", "plot"),
 }

@@ -39,9 +39,10 @@ COMMANDS = {  # words, what is there already, what else is read
     "reproduce md": ("reproduce alpha --collect --cache C -o DIR", "DIR/figures.md", None),
     "refit": ("refit b.pans r.pansrec -o OUT", "OUT", "b.pans"),
     "order": ("order b.pans -o OUT", "OUT", "b.pans"),
+    "bench": ("bench ingest --quick --plot OUT", "OUT", None),
     "tune": (f"tune b.pans --device {DEVICE} -o OUT", "OUT", "b.pans"),
 }
-WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "bench", "completion", "runs"}
+WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "completion", "runs"}
 CHECKED_ELSEWHERE = {"demo", "sweep", "conform"}  # tests/runtime/commands/test_run_files.py, below; conform writes none
 
 

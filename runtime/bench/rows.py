@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime import SHIPPED
+from pans.runtime.outputs import whole_file
+from pans.runtime.report.figures import pyplot
 
 Row = dict[str, Any]
 REPEATS = 7
@@ -123,6 +125,25 @@ def _processor() -> str:
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
+
+
+def write_plot(rows: list[Row], path: Path, *, force: bool = False) -> None:
+    """Draw speed against error of the rows that have both (`ns`, `score_error`), and the rates of the others."""
+    points = [row for row in rows if "ns" in row and isinstance(row.get("score_error"), float)]
+    others = [row for row in rows if "rate" in row]
+    figure, axes = pyplot("--plot").subplots(1, 2, figsize=(14, 6), layout="constrained")
+    for row in points:
+        axes[0].loglog(row["ns"], max(row["score_error"], 1e-9), "o", label=row["name"])
+    if points:
+        axes[0].legend(fontsize=8)
+    axes[0].set(xlabel="ns per decision", ylabel="largest score error against float64 (below 1e-9 drawn there)")
+    axes[1].barh([row["name"] for row in others], [row["rate"] for row in others], log=True)
+    axes[1].set(xlabel="items per second")
+    for panel, shown in zip(axes, (points, others)):
+        panel.set_visible(bool(shown))
+    with whole_file(path, force=force) as beside:
+        figure.savefig(beside, dpi=120, format=path.suffix[1:] or "png")
+    pyplot().close(figure)
 
 
 def table_text(rows: list[Row]) -> str:

@@ -10,9 +10,10 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.cli import EXIT_FINE, Command, emit, say
+from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
 from pans.runtime.offered import load_offered
+from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
 NAMES = ("decide", "link", "loop", "ingest", "turn")
@@ -28,11 +29,14 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     seconds = "loop: length of each of its six runs (default 5)"
     add("--seconds", type=Range(0.01, 86_400).option, default=5.0, help=seconds)
     add("--load", action="store_true", help="loop: keep both cores busy with other processes")
+    add("--plot", type=Path, help="write a plot of speed against error (plot extra)")
+    add_force(parser)
     add("--quick", action="store_true", help="fewer and shorter runs")
 
 
 def _run(args: argparse.Namespace) -> int:
-    from pans.runtime.bench.rows import BenchOptions, machine_facts, table_text
+    from pans.runtime.bench.rows import BenchOptions, machine_facts, table_text, write_plot
+    from pans.runtime.report.figures import pyplot
 
     for option, name in USES.items():
         if getattr(args, option) and args.what not in (name, "all"):
@@ -41,11 +45,16 @@ def _run(args: argparse.Namespace) -> int:
         what = f"{len(args.inputs)} times --inputs and {len(args.bundle)} times --bundle"
         raise UsageError(what, remedy="give one --inputs for each --bundle")
     options = BenchOptions(tuple(args.bundle), tuple(args.inputs), args.seconds, args.load, args.quick)
+    if args.plot is not None:
+        pyplot("--plot")
+        check_outputs([args.plot], inputs=[*args.bundle, *args.inputs], force=args.force)
     before, rows = machine_facts(), list[dict[str, Any]]()
     benches = {point.name: point for point in entry_points(group="pans.benches")}
     for name in NAMES if args.what == "all" else (args.what,):
         say(f"pans bench {name} ...")
         rows += [{"bench": name, **row} for row in load_offered(benches[name])(options)]
+    if args.plot is not None:
+        write_plot(rows, args.plot, force=args.force)
     machine = before | {"load_1min_after": machine_facts()["load_1min"]}
     text = "\n".join(f"{key:<16} {value}" for key, value in machine.items())
     emit(args, {"machine": machine, "rows": rows}, f"{text}\n\n{table_text(rows)}")
