@@ -18,7 +18,6 @@ from commands import json_of
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
-from pans.runtime.errors import UsageError
 from pans.runtime.operate import batch
 from pans.runtime.operate.batch import FORMAT, items_of, run_item
 
@@ -57,16 +56,6 @@ def test_items_are_inputs_times_values(lab: Path) -> None:
     assert items_of("reproduce", ["alpha", "eta"], [], "", files=False)[1].words == ("reproduce", "eta")
     Path("b/grid.pans").write_bytes(b"changed")
     assert items_of("report", ["b/grid.pans"], ["seed=7"], extra, files=True)[0].key != item.key
-
-
-@pytest.mark.parametrize(
-    ("inputs", "vary", "extra"),
-    [("none*", "seed=1", ""), ("a/grid.pans", "seed", ""), ("a/grid.pans", "seed=", ""), ("a/grid.pans", "=1", ""),
-     ("a/grid.pans", "seed=0-999999", ""), ("a/grid.pans", "seed=1", "'open")],
-)  # fmt: skip
-def test_what_makes_no_items(inputs: str, vary: str, extra: str, lab: Path) -> None:
-    with pytest.raises(UsageError):
-        items_of("evaluate", [inputs], [vary], extra, files=True)
 
 
 def test_a_batch_goes_on_where_it_was(

@@ -108,8 +108,3 @@ def test_times_and_sizes() -> None:
     for text in ("30", "d", "5 parsecs", "-1d"):
         with pytest.raises(ArgumentTypeError):
             duration_s(text)
-
-
-@pytest.mark.parametrize("words", ["prune", "--keep 3", "--yes", "a b"])
-def test_words_without_effect_are_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    listed(capsys, *words.split(), code=2)

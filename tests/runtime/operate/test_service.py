@@ -89,22 +89,6 @@ def test_foreign_units_stay(lab: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert unit.read_text() == "[Service]\nExecStart=/bin/true\n"
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        ("remove", "--name"),
-        ("show", "--config"),
-        ("monitoring", "--out"),
-        ("verify --config lab.toml", "--config has no effect"),
-        ("show --config lab.toml --folder none", "none is not a folder"),
-    ],
-)
-def test_an_action_needs_and_takes_its_own_options(
-    words: str, named: str, lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert named in str(service(capsys, *words.split(), code=2)["error"])
-
-
 @pytest.mark.skipif(not hasattr(socket, "AF_UNIX") or sys.platform == "win32", reason="needs AF_UNIX")
 def test_a_run_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(
     lab: Path, capsys: pytest.CaptureFixture[str]

@@ -27,7 +27,6 @@ from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.commands.one_run import _exit_code
 from pans.runtime.core.decision import DECISION_DTYPE
-from pans.runtime.errors import UsageError
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.parts import parts_in
@@ -60,14 +59,11 @@ def test_a_state_file_that_cannot_be_written_does_not_end_the_run(tmp_path: Path
     assert "No such file" in state.trouble
 
 
-def test_metrics_are_served_and_a_busy_port_is_refused() -> None:
+def test_metrics_are_served() -> None:
     pytest.importorskip("prometheus_client")
     picture: dict[str, Any] = {"decisions": 7, "late_cause": {"link": 3}, "state": "running", "handles": 7}
     with closing(MetricsServer("0", lambda: picture)) as server:
-        with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=10) as answer:
-            lines = answer.read().decode().splitlines()
-        with pytest.raises(UsageError, match="cannot listen"):
-            MetricsServer(f"127.0.0.1:{server.port}", lambda: picture)
+        lines = urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics").read().decode().splitlines()
     causes = 'pans_late_decisions_by_cause_total{cause="link"} 3.0'
     assert {"pans_decisions_total 7.0", causes, "pans_running 1.0", "pans_open_handles 7.0"} <= set(lines)
 

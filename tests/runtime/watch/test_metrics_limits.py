@@ -111,6 +111,3 @@ def test_other_machines_may_read_only_if_it_is_said(text: str) -> None:
 def test_addresses() -> None:
     read = [parse_address(text) for text in ("9464", "0.0.0.0:1", "[::1]:80", ":5")]
     assert read == [("127.0.0.1", 9464), ("0.0.0.0", 1), ("::1", 80), ("127.0.0.1", 5)]
-    for text in ("", "host:", "host:x", "1.2.3.4:70000"):
-        with pytest.raises(UsageError):
-            parse_address(text)
