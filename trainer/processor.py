@@ -56,11 +56,6 @@ class Trial:
     gflops: dict[str, float]
     failed: dict[str, str]
 
-    @property
-    def complete(self) -> bool:
-        """Whether every type worked."""
-        return not self.failed
-
 
 @dataclass(frozen=True, slots=True)
 class Choice:
@@ -92,7 +87,7 @@ def settle() -> Choice | None:
         if choice is None:
             say("pans: trying which products this processor computes: once per machine and torch version")
             trials = [attempt(LIMITS[0])]
-            while not trials[-1].complete and len(trials) < len(LIMITS):
+            while trials[-1].failed and len(trials) < len(LIMITS):
                 trials.append(attempt(LIMITS[len(trials)]))
             choice = choose(trials)
             _keep(choice)
@@ -201,25 +196,21 @@ def check_torch() -> Iterator[Finding]:
     if choice is None:
         yield Finding("torch's products", True, "torch is not installed; only training needs it")
         return
-    first = choice.trials[0]
     works = "; ".join(
         f"{' '.join(f'{name}={value}' for name, value in trial.limits.items()) or 'as it comes'}: "
         + ", ".join([_rates(trial.gflops), *(f"{name} failed ({why})" for name, why in trial.failed.items())])
         for trial in choice.trials
     )
-    found = f"announced {_announced() or 'nothing special'}; works {works}; taken {choice.words()}"
+    wide = ("amx", "avx512_bf16", "avx512f", "avx2")
+    announced = ", ".join(sorted(flag for flag in _cpu().split() if flag.startswith(wide))) or "nothing special"
+    found = f"announced {announced}; works {works}; taken {choice.words()}"
     remedy = "nothing: training uses what works. A host that grants all that its processor announces may be faster"
-    yield Finding("torch's products", first.complete, found, "" if first.complete else remedy)
+    refused = bool(choice.trials[0].failed)
+    yield Finding("torch's products", not refused, found, remedy if refused else "")
 
 
 def _rates(gflops: dict[str, float]) -> str:
     return ", ".join(f"{name} {rate:.0f} GFLOP/s" for name, rate in gflops.items()) or "nothing"
-
-
-def _announced() -> str:
-    """Return the wide instruction sets that the processor's flags name."""
-    wide = ("amx", "avx512_bf16", "avx512f", "avx2")
-    return ", ".join(sorted(flag for flag in _cpu().split() if flag.startswith(wide)))
 
 
 def _cpu() -> str:

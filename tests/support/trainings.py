@@ -34,6 +34,23 @@ def bars_task(n: int = 1200, seed: int = 0) -> Task:
     return Task("bars", ("a", "b", "c", "d"), train, test, "0" * 64, "the test part of the data")
 
 
+def columns_task(n_train: int, n_test: int, n_classes: int, side: int, name: str = "columns", seed: int = 0) -> Task:
+    """On `side` x `side` pixels a bright column names the class, over noise; classes are letters."""
+    rng, n = np.random.default_rng(seed), n_train + n_test
+    labels = rng.permutation(np.arange(n) % n_classes)
+    images = rng.integers(0, 60, (n, side, side), dtype=np.uint8)
+    images[np.arange(n), :, labels * side // n_classes] = 230
+    train, test = (Objects(images[at], labels[at]) for at in (slice(n_train), slice(n_train, n)))
+    return Task(name, tuple("abcdefghij"[:n_classes]), train, test, "0" * 64, "made here")
+
+
+def kept_task(path: Path, task: Task) -> Path:
+    """Write both parts of `task` as a .npz file and return its path."""
+    arrays = {"train_images": task.train.images, "train_labels": task.train.labels}
+    np.savez(path, **arrays, test_images=task.test.images, test_labels=task.test.labels)
+    return path
+
+
 def random_machine(seed: int = 0, bits: bool = False, shared: bool = False) -> Any:
     """Three levels of 1, 2 and 3 states on 5 pixels, four classes; a leaf behind level 0, two behind level 1, five behind level 2."""
     import torch

@@ -53,20 +53,14 @@ def price_of(photons: float) -> float:
     return PRICE_AT_10 * (10.0 / photons) ** PRICE_POWER
 
 
-def default_size(photons: float) -> tuple[int, int]:
-    """Return the exposures and states per level that serve a budget: many cheap exposures beat few dear ones."""
-    exposures = min(96, max(16, 4 * round(photons * 0.45 + 7)))
-    return exposures, 256 if photons <= 12 else 384
-
-
 def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int]:
     """Return exposures and states per level: those asked for, else those of the budget, as far as the profile holds them.
 
-    Several channels need fewer exposures, in proportion.
+    Many cheap exposures beat few dear ones; several channels need fewer, in proportion.
     """
-    wanted, states = default_size(photons_wanted(options))
-    wanted = -(-wanted // options.channels)
-    exposures = options.exposures or wanted
+    photons = photons_wanted(options)
+    wanted, states = min(96, max(16, 4 * round(photons * 0.45 + 7))), 256 if photons <= 12 else 384
+    exposures = options.exposures or -(-wanted // options.channels)
     if options.states:
         return exposures, options.states
     most = min(profile.projector.pattern_memory // options.channels, profile.projector.automaton_states or STATES_MAX)

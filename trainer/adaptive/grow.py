@@ -98,12 +98,8 @@ class Growth:
         blocks, alphas = self.blocks[:tried], self.alphas[:tried]
         sums = []
         for label in range(blocks[0].one_hot.shape[0]):
-            sums.append(
-                sum_of(
-                    self.sight.mask_slope((alpha * block.one_hot[label]), block.grey)
-                    for alpha, block in zip(alphas, blocks)
-                )
-            )
+            seen = (self.sight.mask_slope(a * block.one_hot[label], block.grey) for a, block in zip(alphas, blocks))
+            sums.append(sum_of(seen))
         masses = sum_of(alpha @ block.one_hot.T for alpha, block in zip(alphas, blocks))
         means = torch.stack(sums, dim=1)
         return means / (masses.unsqueeze(2) + 1e-6), masses
@@ -142,9 +138,8 @@ class Growth:
         options = self.options
         optimiser = torch.optim.Adam([light.root], lr=RATE, fused=True)
         n = sum(len(block) for block in self.blocks)
-        whole = (
-            self.counts.double() + len(self.clicks) * COUNT_FLOOR
-        )  # in float32 a child's count could vanish beside another's
+        # in float32 a child's count could vanish beside another's
+        whole = self.counts.double() + len(self.clicks) * COUNT_FLOOR
         parts = [torch.minimum(p.double() + COUNT_FLOOR, whole - COUNT_FLOOR) for p in self._outcome_counts(light)]
         steps, done = options.grow_epochs * len(self.blocks), 0
         for epoch in range(options.grow_epochs):
@@ -314,13 +309,8 @@ def _merge(counts: F64, wanted: int, label: NDArray[np.int64]) -> None:
 def merged(counts: F64, wanted: int) -> NDArray[np.int64]:
     """Return the new number 0..wanted-1 of every node, int64 (nodes,), after merging `counts` (nodes, classes) down to `wanted`.
 
-    Nodes keep their order; a group has the place of its lowest member. ValueError for counts that are negative or not finite, or
-    fewer than one group.
+    Nodes keep their order; a group has the place of its lowest member.
     """
-    if counts.ndim != 2 or wanted < 1 or not (np.isfinite(counts).all() and (counts >= 0).all()):
-        raise ValueError(
-            f"counts {counts.shape} to {wanted} groups, allowed: finite counts of at least 0, a group or more"
-        )
     label = np.arange(len(counts), dtype=np.int64)
     if wanted < len(counts):
         _merge(np.array(counts, np.float64), wanted, label)

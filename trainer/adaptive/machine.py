@@ -190,9 +190,8 @@ def _parts_as_bits(grey: Tensor, mean_object: Tensor, log_light: Tensor, top: fl
     wanted = (grey * mean_object).sum(dim=1, keepdim=True)
     common = by_state(wanted * log_light, parts) / by_state(wanted, parts).clamp(min=1e-30)
     least = (wanted / ((grey > 0) * mean_object).sum(dim=1, keepdim=True).clamp(min=1e-9)).clamp(min=BRIGHTNESS_MIN)
-    common = torch.maximum(
-        common, 1e-3 + least.log().unflatten(0, (-1, parts)).amax(dim=1)
-    )  # else no part could be as bright
+    # else no part could be as bright
+    common = torch.maximum(common, 1e-3 + least.log().unflatten(0, (-1, parts)).amax(dim=1))
     values, order = grey.sort(dim=1, descending=True)
     lit = (mean_object.gather(1, order).cumsum(dim=1) * by_row(common.exp(), parts) < wanted).sum(dim=1, keepdim=True)
     last = values.gather(1, lit.clamp(max=grey.shape[1] - 1))  # the darkest pixel that is lit

@@ -73,8 +73,6 @@ class TrainingObjects:
 
     def soften(self, answers: NDArray[np.float32], weight: float) -> None:
         """Give every object to fit class probabilities for its label: `weight` of `answers` (objects, classes), of the label the rest."""
-        if answers.shape != (self.n_fit, self.n_classes):
-            raise ValueError(f"answers {answers.shape}, allowed: {(self.n_fit, self.n_classes)}")
         labels = np.eye(self.n_classes, dtype=np.float32)[self._fit.labels]
         self._targets = weight * answers + np.float32(1.0 - weight) * labels
 

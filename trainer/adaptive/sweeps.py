@@ -338,7 +338,11 @@ def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool,
             continue
         candidates = pool.near[light.rows[state]]
         seen, alpha = pool.light[candidates][:, some], alphas[state, some]
-        bright = _brightness(seen @ alpha, before[state], pool.factors).clamp(light.bottom, light.top)
+        # about the brightness that keeps the light; the same where all states share one
+        brought, now = seen @ alpha, before[state]
+        several = len(pool.factors) > 1
+        keeping = brought[0] / brought.clamp(min=1e-9) * now if several else now.expand(len(brought))
+        bright = (keeping.unsqueeze(1) * pool.factors).clamp(light.bottom, light.top)
         lights = seen.unsqueeze(1) * bright.unsqueeze(2)  # (candidates, factors, objects)
         sent = glare * pool.lit[candidates].unsqueeze(1) * bright * alpha.sum()
         chances, _ = readings(lights, sweep.sight.law)
@@ -347,17 +351,11 @@ def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool,
         best = int(costs.argmin())
         if costs.flatten()[best] < costs[0, len(pool.factors) // 2] - SURE_OF_PATTERN * alpha.sum():
             light.rows[state] = candidates[best // len(pool.factors)]
-            if len(pool.factors) > 1:
+            if several:
                 light.log_light[state] = bright.flatten()[best].log()
             changed += 1
     _keep_new_light(light, number, sweep, pool)
     return changed
-
-
-def _brightness(mean: Tensor, now: Tensor, factors: Tensor) -> Tensor:
-    """Return what to try, (candidates, factors): about the brightness that keeps the light; the same where all states share one."""
-    keeping = mean[0] / mean.clamp(min=1e-9) * now if len(factors) > 1 else now.expand(len(mean))
-    return keeping.unsqueeze(1) * factors
 
 
 def _keep_new_light(light: Bits, number: int, sweep: Sweep, pool: _Pool) -> None:

@@ -200,16 +200,16 @@ class _Run:
         if self.answers is None and file is not None and file.exists():
             self.answers = read_targets(file, taught, self.objects.n_classes)
         if self.answers is None:
-            epochs = self.options.teacher_epochs
-            self.answers = soft_targets(self.objects.fitted, self.objects.n_classes, epochs, self._taught)
+            epochs, price = self.options.teacher_epochs, self.price.value
+
+            def report(epoch: int, loss: float) -> None:
+                self.report(Progress(NETWORK, epoch + 1, epochs, loss, math.nan, 0.0, 0.0, price))
+
+            self.answers = soft_targets(self.objects.fitted, self.objects.n_classes, epochs, report)
             if file is not None:
                 write_targets(file, self.answers, taught)
             keep()
         self.objects.soften(self.answers, weight)
-
-    def _taught(self, epoch: int, loss: float) -> None:
-        epochs = self.options.teacher_epochs
-        self.report(Progress(NETWORK, epoch + 1, epochs, loss, math.nan, 0.0, 0.0, self.price.value))
 
     def grow(self, keep: Callable[[], None]) -> None:
         """Grow levels until there are as many as exposures."""
@@ -310,7 +310,8 @@ class _Run:
             self.tuning.sight = self.sight(self.products)
             self.tuning.decide = self.options.decide if stage == "shown" and self.epoch else 0.0
             if stage == "shown" and 1 <= self.epoch <= min(self.options.reroutes, epochs - 2):
-                self._reroute()
+                sight, blocks = self.tuning.sight, self._sweep_blocks()
+                reroute(self.machine, sight, blocks, self.price.value, self.options.exposure_price)
             if stage == "shown" and 1 <= self.epoch <= epochs - 2:
                 self._choose_patterns()
             blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
@@ -337,10 +338,6 @@ class _Run:
         states = sum(level.n_states for level in self.machine.levels)
         blocks = self.objects.epoch(FIRST_EPOCH["shown"] + max(0, self.epoch - 1), GROWTH_BLOCK, self.products)
         return blocks[: max(1, REROUTE_NUMBERS // (GROWTH_BLOCK * states))]
-
-    def _reroute(self) -> None:
-        sight = self.sight(self.products)
-        reroute(self.machine, sight, self._sweep_blocks(), self.price.value, self.options.exposure_price)
 
     def _choose_patterns(self) -> None:
         light = self.machine.levels[0].light

@@ -47,10 +47,8 @@ def log_joint(
     """Return log sum P(readout | object) / objects over the training objects of every class, float64 (n, classes).
 
     Exact under the model that the world holds just these objects, up to a term that all classes share: the arg max is the
-    Bayes decision, the softmax its posterior. `left_out` (training objects,) are no part of the mixture.
+    Bayes decision, the softmax its posterior. `floor` or `dark` is above 0; `left_out` (training objects,) are no part of the mixture.
     """
-    if not (floor > 0 or dark > 0):
-        raise ValueError(f"floor is {floor:g} and dark is {dark:g}: one must be above 0 (try a floor of 0.001)")
     labels = measurement.train_labels if left_out is None else np.where(left_out, -1, measurement.train_labels)
     # log weights are taken relative to a typical object: smaller numbers, fewer lost digits in float32
     typical = measurement.photoelectrons(measurement.train[::50], photons, floor).mean(axis=0, keepdims=True) + dark

@@ -88,8 +88,6 @@ class Measurement:
 
 def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str = "source") -> Measurement:
     """Measure all objects of `task` by `patterns` (d_f, pixels, at least 0), or pixel by pixel without them (direct imaging)."""
-    if brightness not in BRIGHTNESS:
-        raise ValueError(f"brightness is {brightness!r}, allowed: {', '.join(BRIGHTNESS)}")
     n_pixels = math.prod(task.image_shape)
     if not task.test.images.any():
         raise ValueError(f"the test objects of {task.name} are black: no light can reach the detector")
@@ -192,8 +190,6 @@ def run_trials(
     dark: float = 0.0,
 ) -> Trials:
     """Detect every test object `trials` times at `photons` per object and let `decide` (readouts -> labels) judge."""
-    if not (trials >= 1 and 0 < photons < math.inf and 0 <= dark < math.inf):
-        raise ValueError(f"{trials} trials, {photons:g} photons, dark {dark:g}; allowed: from 1, above 0, from 0")
     light = measurement.photoelectrons(measurement.test, photons)
     rng = np.random.default_rng([seed, 1])
     right = np.empty((trials, len(light)), bool)

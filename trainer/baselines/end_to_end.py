@@ -21,17 +21,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Task
 
 from .common import Decide, Measurement, Report, measure, named, silent
-from .networks import decider, feature_net, fit, seeded, size
+from .networks import Inputs, decider, feature_net, fit, seeded, size
 
 EPOCHS = 15
 ACTIVATION_BITS = 4
@@ -93,19 +93,14 @@ def train_conventionally(
     report: Report = silent,
 ) -> EndToEnd:
     """Return patterns and head trained together on the expected values of the training objects of `task`."""
-    if n_features < 1 or (bits is not None and not 1 <= bits <= 16):
-        raise ValueError(f"features is {n_features}, bits is {bits}; allowed: from 1, 1 to 16")
     n_pixels = math.prod(task.image_shape)
     model = seeded(lambda: EndToEnd(n_features, n_pixels, len(task.classes), bits), seed)
     assert isinstance(model, EndToEnd)
     images = task.train.images.reshape(len(task.train), n_pixels)
 
-    def objects(which: Tensor, _generator: torch.Generator) -> Tensor:
-        return torch.from_numpy(images[which.numpy()].astype(np.float32)) / 255
-
-    labels = torch.from_numpy(task.train.labels)
-    rates = {"weight": PATTERN_RATE, "head": 1e-3}
-    fit(model, objects, labels, epochs=epochs, seed=seed, batch=512, rates=rates, report=named("end-to-end", report))
+    labels, rates = torch.from_numpy(task.train.labels), {"weight": PATTERN_RATE, "head": 1e-3}
+    progress = named("end-to-end", report)
+    fit(model, transmissions(images), labels, epochs=epochs, seed=seed, batch=512, rates=rates, report=progress)
     return model
 
 
@@ -129,19 +124,6 @@ def patterns_measured(
     return measurement, at
 
 
-@dataclass(frozen=True, slots=True)
-class FsiOptions:
-    """One training: `features` masks, from principal components; `frozen` ones are not learnt."""
-
-    features: int
-    photons: float
-    seed: int = 0
-    epochs: int = EPOCHS
-    frozen: bool = False
-    detector: str = "counting"
-    dark: float = 0.0
-
-
 def principal_masks(images: NDArray[np.uint8], n_masks: int) -> F64:
     """Return masks (n_masks, pixels), at least 0: positive and negative parts of the first principal components of images (n, pixels).
 
@@ -163,20 +145,21 @@ class FeatureSpecific(nn.Module):
 
     mean_image: Tensor
 
-    def __init__(self, masks: F64, mean_image: NDArray[np.float32], n_classes: int, options: FsiOptions) -> None:
+    def __init__(
+        self, masks: F64, mean_image: NDArray[np.float32], n_classes: int, options: BaselineOptions, photons: float
+    ) -> None:
         super().__init__()
-        start = masks if options.frozen else masks + START_LIGHT
-        self.weight = nn.Parameter(
-            torch.from_numpy(np.sqrt(start).astype(np.float32)), requires_grad=not options.frozen
-        )
+        frozen = options.method == "pca"
+        start = torch.from_numpy(np.sqrt(masks if frozen else masks + START_LIGHT).astype(np.float32))
+        self.weight = nn.Parameter(start, requires_grad=not frozen)
         self.register_buffer("mean_image", torch.from_numpy(mean_image))
         self.head = feature_net(len(masks), n_classes)
-        self.options = options
+        self.options, self.photons = options, photons
 
     def masks(self) -> Tensor:
         """Return the masks (features, pixels), scaled so that the mean training object gives the photons asked for."""
         light = self.weight**2
-        return light * (self.options.photons / (light.sum(dim=0) @ self.mean_image).clamp(min=1e-12))
+        return light * (self.photons / (light.sum(dim=0) @ self.mean_image).clamp(min=1e-12))
 
     def forward(self, transmission: Tensor) -> Tensor:
         """Return scores (n, classes) of fresh counts of objects (n, pixels); random numbers are those of torch's own generator."""
@@ -200,31 +183,24 @@ def noisy(expected: Tensor, detector: str = "counting") -> Tensor:
     return carried + (counts - carried).detach()  # the value is the number itself, whatever was rounded or cut
 
 
-def train_masks(task: Task, options: FsiOptions, report: Report = silent) -> FeatureSpecific:
-    """Return masks and network trained on fresh counts of the training objects of `task`; ValueError for what is no training."""
-    _check(options)
+def train_masks(task: Task, options: BaselineOptions, photons: float, report: Report = silent) -> FeatureSpecific:
+    """Return masks and network trained on fresh counts of the training objects of `task`, `photons` per object."""
     n_pixels = math.prod(task.image_shape)
     images = task.train.images.reshape(len(task.train), n_pixels)
     mean_image = (images.mean(axis=0) / 255).astype(np.float32)
     masks = principal_masks(images, options.features)
-    model = seeded(lambda: FeatureSpecific(masks, mean_image, len(task.classes), options), options.seed)
+    model = seeded(lambda: FeatureSpecific(masks, mean_image, len(task.classes), options, photons), options.seed)
     assert isinstance(model, FeatureSpecific)
 
-    def objects(which: Tensor, _generator: torch.Generator) -> Tensor:
-        return torch.from_numpy(images[which.numpy()].astype(np.float32)) / 255
-
-    progress = named(f"{options.features} masks at {options.photons:g} photons", report)
-    labels = torch.from_numpy(task.train.labels)
-    rates = {"weight": MASK_RATE}
-    fit(model, objects, labels, epochs=options.epochs, seed=options.seed, batch=256, rates=rates, report=progress)
+    progress = named(f"{options.features} masks at {photons:g} photons", report)
+    labels, epochs, rates = torch.from_numpy(task.train.labels), options.epochs or EPOCHS, {"weight": MASK_RATE}
+    fit(model, transmissions(images), labels, epochs=epochs, seed=options.seed, rates=rates, report=progress)
     return model
 
 
-def _check(options: FsiOptions) -> None:
-    if options.features < 1 or options.epochs < 1 or not 0 < options.photons < math.inf:
-        raise ValueError(
-            f"{options.features} masks, {options.epochs} epochs, {options.photons:g} photons, allowed: above 0"
-        )
+def transmissions(images: NDArray[np.uint8]) -> Inputs:
+    """Return what a network sees of objects without a detector before it: their transmission."""
+    return lambda which, _generator: torch.from_numpy(images[which.numpy()].astype(np.float32)) / 255
 
 
 def masks_measured(model: FeatureSpecific, task: Task, brightness: str) -> tuple[Measurement, Decide]:

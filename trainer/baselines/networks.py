@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,6 @@ WORDS = {"cnn": "noise-aware CNN", "mlp": "noise-aware MLP"} | dict.fromkeys(
 
 F64 = NDArray[np.float64]
 FIELDS = 12  # along each side
-PAIRS_MAX = FIELDS**2
 
 
 class FrameNet(nn.Module):
@@ -85,15 +83,9 @@ def _convolution(before: int, after: int, kernel: int, stride: int = 1) -> tuple
     return layer, nn.BatchNorm2d(after), nn.ReLU()
 
 
-@dataclass(frozen=True, slots=True)
-class EpochOfFit:
-    """Means over the objects of one epoch, while the network learnt from them."""
-
-    loss: float
-    accuracy: float
-
-
-Watch = Callable[[EpochOfFit, Decide], None]
+Watch = Callable[
+    [float, float, Decide], None
+]  # loss and accuracy, means over an epoch while it learnt, and the network now
 
 
 def feature_net(n_features: int, n_classes: int, n_hidden: int = 512) -> nn.Module:
@@ -129,7 +121,7 @@ def fit(
     batch: int = 256,
     rates: dict[str, float] | None = None,
     report: Report = silent,
-    watch: Callable[[EpochOfFit], None] = lambda _: None,
+    watch: Callable[[float, float], None] = lambda _loss, _accuracy: None,
 ) -> None:
     """Train `net` on fresh `inputs` of every batch by cross-entropy, Adam and one cycle of the learning rate.
 
@@ -162,7 +154,7 @@ def fit(
                 if step % 20 == 0 or step == steps:
                     report(f"loss {float(loss.detach()):.3f}", step / steps)
             net.eval()
-            watch(EpochOfFit(*(sums / len(labels)).tolist()))
+            watch(*(sums / len(labels)).tolist())
 
 
 def _by_rate(net: nn.Module, rates: dict[str, float]) -> dict[float, list[nn.Parameter]]:
@@ -203,11 +195,15 @@ def fitted(
     seed: int,
     epochs: int,
     report: Report,
-    watch: Watch = lambda _epoch, _decide: None,
+    watch: Watch = lambda _loss, _accuracy, _decide: None,
 ) -> Decide:
     """Train `net` on `inputs` of the training objects and return its decision; `watch` gets it after every epoch."""
     decide, labels = decider(net), torch.from_numpy(measurement.train_labels)
-    fit(net, inputs, labels, epochs=epochs, seed=seed, report=report, watch=lambda epoch: watch(epoch, decide))
+
+    def each(loss: float, accuracy: float) -> None:
+        watch(loss, accuracy, decide)
+
+    fit(net, inputs, labels, epochs=epochs, seed=seed, report=report, watch=each)
     return decide
 
 
@@ -231,8 +227,6 @@ def patterns(family: str, n_features: int, shape: tuple[int, int], seed: int) ->
     values of normal numbers, as light has no sign. `binning`: each pattern lights one block of a grid of d_f blocks, as square as d_f
     has divisors; blocks differ by a pixel where the sides cannot be divided.
     """
-    if n_features < 1:
-        raise ValueError(f"features is {n_features}, allowed: 1 or more")
     height, width = shape
     if family == "binary":
         return np.random.default_rng([seed, 3]).integers(0, 2, (n_features, height * width)).astype(np.float64)
@@ -242,12 +236,18 @@ def patterns(family: str, n_features: int, shape: tuple[int, int], seed: int) ->
         return _bins(n_features, shape)
     if family != "hadamard":
         raise ValueError(f"patterns are {family!r}, allowed: {', '.join(FAMILIES)}")
-    rows, columns = walsh(height), walsh(width)
-    order = sorted(((u, v) for u in range(len(rows)) for v in range(len(columns))), key=lambda uv: (sum(uv), uv))
-    if n_features > len(order):
-        raise ValueError(f"features is {n_features}, allowed for Walsh patterns of {height} x {width}: {len(order)}")
-    signs = [np.outer(rows[u, :height], columns[v, :width]).ravel() for u, v in order[:n_features]]
-    return (np.array(signs) + 1) / 2
+    return _products(walsh(height), walsh(width), np.arange(height), np.arange(width), n_features)
+
+
+def _products(of_rows: F64, of_columns: F64, down: I64, across: I64, count: int) -> F64:
+    """The coarsest products of two sets of signs as patterns, -1 dark; pixels take the signs at the places `down` and `across`."""
+    changes = [(np.diff(signs, axis=1) != 0).sum(axis=1) for signs in (of_rows, of_columns)]
+    every = ((u, v) for u in range(len(of_rows)) for v in range(len(of_columns)))
+    order = sorted(every, key=lambda uv: (changes[0][uv[0]] + changes[1][uv[1]], uv))
+    if count > len(order):
+        raise ValueError(f"features is {count}, allowed on {len(down)} x {len(across)} pixels: {len(order)}")
+    signs = [np.outer(of_rows[u, down], of_columns[v, across]).ravel() for u, v in order[:count]]
+    return np.array(signs) / 2 + 0.5
 
 
 def _bins(n_features: int, shape: tuple[int, int]) -> F64:
@@ -320,7 +320,7 @@ def clean_mlp(
     epochs: int = EPOCHS["clean-mlp"],
     convolutions: bool = False,
     report: Report = silent,
-    watch: Watch = lambda _epoch, _decide: None,
+    watch: Watch = lambda _loss, _accuracy, _decide: None,
 ) -> Callable[[float, str], Decide]:
     """Return (photons, detector) -> decision, by one feature network that was trained on noiseless features.
 
@@ -364,15 +364,8 @@ def pairs(n_pairs: int, shape: tuple[int, int]) -> F64:
 
     A field covers the pixels whose row and column, times 12 / side and rounded down, are its own.
     """
-    if not 1 <= n_pairs <= PAIRS_MAX:
-        raise ValueError(f"features is {n_pairs} pairs, allowed: 1 to {PAIRS_MAX}")
-    signs = hadamard_12()
-    changes = (np.diff(signs, axis=1) != 0).sum(axis=1)
-    order = sorted(
-        ((u, v) for u in range(FIELDS) for v in range(FIELDS)), key=lambda uv: (changes[uv[0]] + changes[uv[1]], uv)
-    )
-    rows, columns = (np.arange(side) * FIELDS // side for side in shape)
-    positive = np.array([np.outer(signs[u, rows], signs[v, columns]).ravel() for u, v in order[:n_pairs]]) / 2 + 0.5
+    signs, (down, across) = hadamard_12(), (np.arange(side) * FIELDS // side for side in shape)
+    positive = _products(signs, signs, down, across, n_pairs)
     return np.concatenate([positive, 1 - positive])
 
 

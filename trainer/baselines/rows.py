@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -163,11 +163,9 @@ def _hadamard(task: Task, options: BaselineOptions, report: Report) -> tuple[Mea
 
 def _masks(task: Task, options: BaselineOptions, report: Report) -> AtLevel:
     """Masks are trained anew for every level: the measurement is of the level too."""
-    from .end_to_end import EPOCHS, FsiOptions, masks_measured, train_masks
+    from .end_to_end import masks_measured, train_masks
 
     def at(photons: float) -> tuple[Measurement, Decide, dict[str, Any]]:
-        how = FsiOptions(options.features, photons, options.seed, options.epochs or EPOCHS, options.method == "pca")
-        model = train_masks(task, replace(how, detector=options.detector, dark=options.dark), report)
-        return *masks_measured(model, task, options.brightness), {}
+        return *masks_measured(train_masks(task, options, photons, report), task, options.brightness), {}
 
     return at

@@ -73,8 +73,6 @@ class Mixture:
 
 def mixture(measurement: Measurement, floor: float, left_out: I64 | None = None) -> Mixture:
     """Return the training objects of `measurement` but those numbered `left_out`, every transmission lifted by `floor` (above 0)."""
-    if not floor > 0:
-        raise ValueError(f"floor is {floor:g}, allowed: above 0")
     kept = np.ones(len(measurement.train_labels), bool)
     if left_out is not None:
         kept[left_out] = False
@@ -103,7 +101,7 @@ def follow(known: Mixture, heard: Arrivals, report: Report = silent) -> Course:
     waits = np.diff(heard.times[alive], axis=1, prepend=np.float32(0)).astype(np.float32)
     labels[:] = known.labels[
         np.argmax(np.diff(known.starts, append=len(known.totals)))
-    ]  # without light: the most frequent
+    ]  # the most frequent: without light
     place, taken = np.arange(min(_ROWS, len(alive))), min(_ROWS, len(alive))  # into `alive`
     step = np.zeros(len(place), np.int64)
     log_joint = np.zeros((len(place), len(known.totals)), np.float32)
@@ -120,10 +118,8 @@ def follow(known: Mixture, heard: Arrivals, report: Report = silent) -> Course:
         step += 1
         ended = np.flatnonzero((step == most) | (lost < SURE))
         for i in ended:  # what is sure stays so
-            labels[who[i], step[i] :], doubt[who[i], step[i] :] = (
-                labels[who[i], step[i] - 1],
-                doubt[who[i], step[i] - 1],
-            )
+            for known_now in (labels, doubt):
+                known_now[who[i], step[i] :] = known_now[who[i], step[i] - 1]
         place, step, log_joint, taken = _replaced(ended, place, step, log_joint, taken, len(alive))
         report("photon by photon", taken / max(1, len(alive)))
     return Course(labels, doubt)

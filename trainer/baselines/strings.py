@@ -13,7 +13,7 @@ from pans.trainer.tasks.barcode import N_BARS, all_strings, weights
 
 from .common import F64
 
-_MOST = 1e3  # photoelectrons of a bright bar: beyond, it never stays silent
+LIT = N_BARS / 2  # bars of a string that are bright, on average
 
 
 def word_chances(bright: float, dark: float = 0.0) -> F64:
@@ -29,40 +29,30 @@ def word_chances(bright: float, dark: float = 0.0) -> F64:
     return chances
 
 
-def imaged(bright: float, dark: float = 0.0, prior: str = "uniform") -> dict[str, float]:
+def imaged(bright: float, dark: float = 0.0) -> dict[str, float]:
     """Return `value` (accuracy in % of the best decision), and mean `clicks`, `photons` and `illumination` of one decision.
 
-    `prior` is one of `barcode.PRIORS`; the illumination is the light of all bars, as a camera needs it.
+    All strings are equally likely; the illumination is the light of all bars, as a camera needs it.
     """
-    if not 0 <= bright <= _MOST or not 0 <= dark <= _MOST:
-        raise ValueError(f"{bright:g} photoelectrons, dark {dark:g}; allowed: 0 to {_MOST:g}")
-    bars, labels = all_strings()
-    share = weights(prior)
-    chances = word_chances(bright, dark)
+    labels = all_strings()[1]
+    share, chances = weights(), word_chances(bright, dark)
     joint = np.stack([share[labels == label] @ chances[labels == label] for label in (0, 1)])
-    lit = float(share @ bars.sum(axis=1))
     return {
         "value": 100 * float(joint.max(axis=0).sum()),
-        "clicks": -lit * math.expm1(-bright - dark) - (N_BARS - lit) * math.expm1(-dark),
-        "photons": lit * bright,
+        "clicks": -LIT * math.expm1(-bright - dark) - (N_BARS - LIT) * math.expm1(-dark),
+        "photons": LIT * bright,
         "illumination": N_BARS * bright,
     }
 
 
-def at_photons(photons: float, dark: float = 0.0, prior: str = "uniform") -> dict[str, float]:
+def at_photons(photons: float, dark: float = 0.0) -> dict[str, float]:
     """Return what `imaged` gives at that many detected photoelectrons per decision."""
-    return imaged(photons / _lit(prior), dark, prior)
+    return imaged(photons / LIT, dark)
 
 
-def at_clicks(clicks: float, dark: float = 0.0, prior: str = "uniform") -> dict[str, float] | None:
+def at_clicks(clicks: float, dark: float = 0.0) -> dict[str, float] | None:
     """Return what `imaged` gives at that many clicks per decision; None where no light gives so many, or none so few."""
-    lit = _lit(prior)
-    clicking = (clicks + (N_BARS - lit) * math.expm1(-dark)) / lit  # share of the bright bars that click
+    clicking = (clicks + (N_BARS - LIT) * math.expm1(-dark)) / LIT  # share of the bright bars that click
     if not -math.expm1(-dark) <= clicking < 1.0:
         return None
-    return imaged(-math.log1p(-clicking) - dark, dark, prior)
-
-
-def _lit(prior: str) -> float:
-    bars, _ = all_strings()
-    return float(weights(prior) @ bars.sum(axis=1))
+    return imaged(-math.log1p(-clicking) - dark, dark)

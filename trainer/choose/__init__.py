@@ -2,15 +2,3 @@
 
 A task and a profile come in, a `Recipe` with its reasons goes out. Everything is in `recipe.py`.
 """
-
-from .recipe import (
-    Choice,
-    Recipe,
-    choose_encoder,
-    choose_training,
-    choose_variation,
-    class_warnings,
-    warnings_of,
-)
-
-__all__ = ["Choice", "Recipe", "choose_encoder", "choose_training", "choose_variation", "class_warnings", "warnings_of"]

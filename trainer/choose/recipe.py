@@ -8,7 +8,7 @@ other images as the world, and the mean log-loss on photon frames of the left-ou
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,9 +43,7 @@ TRIES: tuple[dict[str, Any], ...] = (  # one after the other: the best of each g
     {"stretch": (0.15,)},
     {"bend": (0.02,)},
 )
-FRAME_PHOTONS = (
-    20.0  # per frame: enough that shapes count, few enough that a left-out image need not be matched pixel by pixel
-)
+FRAME_PHOTONS = 20.0  # so many that shapes count, so few that a left-out image need not be matched pixel by pixel
 WORLD = 5000  # images of the world, changed copies included
 LEFT_OUT_PART = 5
 LEFT_OUT_MAX = 400
@@ -53,8 +51,6 @@ FRAMES = 400  # of all left-out images, several of each where they are few
 LOSS_MAX = 4.0  # nats: one photon where no image of the class has light must not outweigh all others
 FLOOR = 5e-3  # least transmission in the posterior
 GAIN_SE = 0.5  # standard errors, over the images, of the mean gain that a change must bring
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,19 +85,15 @@ def choose_training(task: Task, variation: Variation, encoder: str) -> Recipe:
     kept = max(1, n // KEPT_PART)
     objects = n if variation == Variation() else max(n, min(OBJECTS, PIXELS_MAX // pixels))
     batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
-    reasons = [_varied_words(n, objects, variation)]
+    reasons = [f"{objects} training images from {n}: {variation}; these changes made left-out images more likely"]
+    if variation == Variation():
+        reasons = [f"{n} training images as they are: no change of them made left-out images more likely"]
     if encoder == "automaton":
         reasons.append(f"{EXPOSURES} exposures of at most {STATES} states: more would learn so few images by heart")
         return Recipe(encoder, objects, kept, PHOTONS, batch, 6, tuple(reasons), EXPOSURES, STATES)
     epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
     reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
     return Recipe(encoder, objects, kept, PHOTONS, batch, epochs, tuple(reasons), features=FEATURES)
-
-
-def _varied_words(n: int, objects: int, variation: Variation) -> str:
-    if variation == Variation():
-        return f"{n} training images as they are: no change of them made left-out images more likely"
-    return f"{objects} training images from {n}: {variation}; these changes made left-out images more likely"
 
 
 def warnings_of(task: Task, profile: Profile, recipe: Recipe, clicks: float | None) -> Iterator[str]:
@@ -130,13 +122,9 @@ def class_warnings(task: Task) -> Iterator[str]:
             f"class {task.classes[most]!r} has {counts[most]} training images, {task.classes[fewest]!r} has {counts[fewest]}: the "
             "sensor prefers the larger class, so give classes the shares that they have in use"
         )
-    yield from _test_words(len(task.test))
-
-
-def _test_words(n_test: int) -> Iterator[str]:
-    error = 0.5 / math.sqrt(n_test)
+    error = 0.5 / math.sqrt(len(task.test))
     if error > 0.05:
-        yield f"{n_test} held-out images: the standard error of the accuracy is up to {100 * error:.0f} points"
+        yield f"{len(task.test)} held-out images: the standard error of the accuracy is up to {100 * error:.0f} points"
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,13 +136,12 @@ class Choice:
     loss: float
 
 
-def choose_variation(task: Task, seed: int = 0, report: Report = lambda _what, _done: None) -> Choice:
+def choose_variation(task: Task, seed: int = 0) -> Choice:
     """Return the changes that serve the training images of `task` best; none where none helps."""
     judge = _Judge(task, seed)
     best = Variation()
     losses = before = judge.losses(best)
-    for number, tried in enumerate(TRIES):
-        report("which changes leave the class as it is", number / len(TRIES))
+    for tried in TRIES:
         (name, sizes), won = next(iter(tried.items())), None
         for size in sizes:
             changed = replace(best, **{name: size})

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import functools
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from pans.runtime.cli import warn
+from pans.runtime.cli import say, warn
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import Tolerance
 from pans.runtime.instrument.profile import Profile
@@ -16,19 +18,12 @@ from pans.runtime.ranges import Range
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
-import sys
-from collections.abc import Sequence
-from itertools import pairwise
-
-from pans.runtime.cli import say
 
 CURVE_WIDTH = 48
 HISTORY_FILES = ("history.json", "curves.png", "evolution.png")
 _BLOCKS = "▁▂▃▄▅▆▇█"
 
-Show = Callable[
-    [str, float, int, int, bool], None
-]  # words, value of the curve, done, of how many, whether a line is due
+Show = Callable[[str, float, int, int, bool], None]  # words, value of the curve, done, of how many, whether to print
 
 
 def add_data_dir(parser: argparse.ArgumentParser) -> None:
@@ -66,8 +61,6 @@ def warn_of_laws(bundle: Bundle, profile: Profile, *, eta: float = 1.0, one_by_o
 
 def torch_with(threads: int, what: str = "training") -> Any:
     """Return torch, set to that many threads; UsageError where it is not installed."""
-    if not 1 <= threads <= 1024:
-        raise UsageError(f"--threads is {threads}, allowed: 1 to 1024")
     try:
         import torch
 
@@ -90,7 +83,7 @@ def stated_tolerance(profile: Profile) -> str | None:
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Kernel a ValueError of the numeric code into a UsageError: what the user asked for cannot be computed."""
+    """Turn a ValueError of the numeric code into a UsageError: what the user asked for cannot be computed."""
     try:
         yield
     except ValueError as error:
@@ -99,7 +92,7 @@ def usage_errors() -> Iterator[None]:
 
 @contextmanager
 def needing(option: str, extra: str) -> Iterator[None]:
-    """Kernel a missing package into a UsageError that names the `option` which needs it, and the `extra` that holds it."""
+    """Turn a missing package into a UsageError that names the `option` which needs it, and the `extra` that holds it."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -59,7 +59,11 @@ def _run(args: argparse.Namespace) -> int:
     try:
         with usage_errors(), _progress() as report:
             for row in baseline_rows(task, options, args.photons, report):
-                say(_line(row))
+                first, words = (
+                    row["first_200"],
+                    f"{row['photons_asked']:>9g} photons: {100 * row['accuracy_mean']:6.2f} %  ",
+                )
+                say(f"{words}(first {first['objects']}: {100 * first['accuracy_mean']:6.2f} %)  {row['seconds']:.0f} s")
                 rows.append(row)
     except KeyboardInterrupt:
         say("interrupted; the photon levels above are whole")
@@ -85,13 +89,6 @@ def _options(args: argparse.Namespace) -> BaselineOptions:
             "--information is allowed with --method bayes, --detector counting and --brightness source only"
         )
     return options_from(args, BaselineOptions)
-
-
-def _line(row: dict[str, Any]) -> str:
-    return (
-        f"{row['photons_asked']:>9g} photons: {100 * row['accuracy_mean']:6.2f} %  "
-        f"(first {row['first_200']['objects']}: {100 * row['first_200']['accuracy_mean']:6.2f} %)  {row['seconds']:.0f} s"
-    )
 
 
 def _table(task: Task, args: argparse.Namespace, rows: list[dict[str, Any]]) -> str:

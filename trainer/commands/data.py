@@ -36,10 +36,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _data(args: argparse.Namespace) -> int:
-    return _scene(args) if args.action == "scene" else _sets(args)
-
-
-def _scene(args: argparse.Namespace) -> int:
+    if args.action != "scene":
+        return _sets(args)
     if len(args.names) != 1 or args.out is None:
         raise UsageError(
             "a scene is made of one task and written to one file", remedy="pans data scene TASK -o FILE.npz"

@@ -19,7 +19,7 @@ from pans.runtime.bundle.optics import amplification
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, note, warn
 from pans.runtime.cli.option_fields import add_options, options_from
 from pans.runtime.errors import UsageError
-from pans.runtime.imaging import NO_BLEACHING, Bleaching, bleaching_of, imaging_of, tolerance_of
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of, imaging_of, tolerance_of
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 from pans.runtime.safe_text import one_line
@@ -54,7 +54,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     way = parser.add_mutually_exclusive_group()
     way.add_argument(
-        "--trials", type=int, metavar="N", help="sampled decisions per object (default 30; of an automaton: exact)"
+        "--trials",
+        type=COUNT.option,
+        metavar="N",
+        help="sampled decisions per object (default 30; of an automaton: exact)",
     )
     way.add_argument(
         "--exact", action="store_true", help="sum over all click words or walks: no trials, no sampling error"
@@ -94,6 +97,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path, load_bundle
     from pans.trainer.evaluate import held_out as h
     from pans.trainer.evaluate.walks import measured_walks, walk_payload
+    from pans.trainer.tasks.public_sets import PUBLIC_SETS
     from pans.trainer.tasks.registry import remembered_task
 
     if args.pictures is not None:
@@ -114,7 +118,10 @@ def _evaluate(args: argparse.Namespace) -> int:
         conditions = options_from(args, Conditions, imaging=imaging, bleaching=bleaching_given(args))
         task = args.task or remembered_task(bundle.provenance, bundle.task, bundle_path(args.bundle))
         held_out = h.held_out_of(bundle, task, args.objects, args.data_dir, conditions)
-        _check_data_seed(args, held_out)
+        name = held_out.task.name
+        if args.data_seed is not None and (held_out.task.split_here or name in PUBLIC_SETS):
+            remedy = "leave it out: it belongs to drawn tasks"
+            raise UsageError(f"--data-seed has no effect on the task {name}", remedy=remedy)
         note(f"evaluating {bundle.name} on {held_out.task.name}")
         warn_of_laws(bundle, held_out.profile, eta=args.eta, one_by_one=args.exact and args.shots > 1)
         started = time.perf_counter()
@@ -148,16 +155,6 @@ def _evaluate(args: argparse.Namespace) -> int:
     differences = more.get("expected_differences") or []
     answered(payload, "\n".join([words_of(measured, more), _profile_words(bundle, held_out, args), *differences]))
     return EXIT_ALERT if differences else EXIT_FINE
-
-
-def _check_data_seed(args: argparse.Namespace, held_out: HeldOut) -> None:
-    from pans.trainer.tasks.public_sets import PUBLIC_SETS
-
-    name = held_out.task.name
-    if args.data_seed is not None and (held_out.task.split_here or name in PUBLIC_SETS):
-        raise UsageError(
-            f"--data-seed has no effect on the task {name}", remedy="leave it out: it belongs to drawn tasks"
-        )
 
 
 def _profile_words(bundle: Bundle, held_out: HeldOut, args: argparse.Namespace) -> str:
@@ -308,6 +305,7 @@ def _light_words(figures: Mapping[str, Any]) -> str:
 # ---- several tables (--draws, --optics tolerance), a dose cap, samples that bleach ----
 
 Answer = tuple[dict[str, Any], str]  # as JSON and in words
+Points = Sequence[Mapping[str, Any]]
 Row = tuple[str, str, float, str]  # of a small table: label, key of a point, factor, format
 
 
@@ -380,10 +378,15 @@ def _misaligned(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, con
         from pans.trainer.evaluate.pictures import draw_optics
 
         payload["pictures"] = [str(draw_optics(args.pictures, {bundle.name: curves}, force=args.force))]
-    head = f"SIMULATED accuracy of {bundle.name} (%), {objects} objects, exact expectation, one misalignment beside {about.words()}"
+    return payload, optics_curve_words(bundle.name, objects, about, curves)
+
+
+def optics_curve_words(name: str, objects: int, about: Imaging, curves: Mapping[str, Points]) -> str:
+    """Return accuracy against each misalignment as small tables."""
+    head = f"SIMULATED accuracy of {name} (%), {objects} objects, exact expectation, one misalignment beside {about.words()}"
     rows: tuple[Row, ...] = (("accuracy (%)", "accuracy_mean", 100.0, ".2f"), ("photons", "photons_mean", 1.0, ".2f"))
     lines = [line for key, points in curves.items() for line in _point_lines(((key, "value", 1.0, "g"), *rows), points)]
-    return payload, "\n".join([head, *lines])
+    return "\n".join([head, *lines])
 
 
 def _within_dose(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
@@ -420,8 +423,13 @@ def _dose_curve(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, con
         from pans.trainer.evaluate.pictures import draw_dose
 
         payload["pictures"] = [str(draw_dose(args.pictures, {bundle.name: points}, force=args.force))]
-    head = f"SIMULATED accuracy of {bundle.name} against dose, {objects} objects, {bleaching.words()}"
-    return payload, "\n".join([head, *_point_lines(_DOSE_ROWS, points)])
+    return payload, dose_curve_words(bundle.name, objects, bleaching, points)
+
+
+def dose_curve_words(name: str, objects: int, bleaching: Bleaching, points: Points) -> str:
+    """Return accuracy against dose as a small table."""
+    head = f"SIMULATED accuracy of {name} against dose, {objects} objects, {bleaching.words()}"
+    return "\n".join([head, *_point_lines(_DOSE_ROWS, points)])
 
 
 _DOSE_ROWS: tuple[Row, ...] = (
@@ -436,7 +444,7 @@ _DOSE_ROWS: tuple[Row, ...] = (
 )
 
 
-def _point_lines(rows: Iterable[Row], points: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _point_lines(rows: Iterable[Row], points: Points) -> Iterator[str]:
     """The points of a curve as a small table, one column each; rows that no point has are left out."""
     for label, key, factor, form in rows:
         values = [point[key] for point in points]

@@ -46,6 +46,7 @@ def _order(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path, load_bundle, write_bundle
     from pans.trainer.evaluate.dose import of_first, patterns_within, training_readings
     from pans.trainer.evaluate.held_out import held_out_of, trained_bleaching
+    from pans.trainer.export.ordering import information_order, order_facts, reordered
     from pans.trainer.options import Conditions
     from pans.trainer.tasks.registry import remembered_task
 
@@ -70,7 +71,9 @@ def _order(args: argparse.Namespace) -> int:
         note(f"ordering {bundle.name} by the training images of {held_out.task.name}")
         new, order = bundle, None
         if args.by != "none":
-            new, order = _by(args.by, bundle, held_out, bleaching)
+            order = information_order(bundle, held_out.profile, held_out.task.train, by=args.by, bleaching=bleaching)
+            with needing("a head in eight bits", "train"):
+                new = reordered(bundle, order.patterns, order_facts(order, bundle))
         kept = new.n_features
         if args.dose_cap is not None:
             kept = patterns_within(new, args.dose_cap)
@@ -91,14 +94,6 @@ def _order(args: argparse.Namespace) -> int:
     }
     emit(args, payload, "\n".join(_lines(args.out, digest, rows, order, new)))
     return EXIT_FINE
-
-
-def _by(way: str, bundle: Bundle, held_out: Any, bleaching: Any) -> tuple[Bundle, Order]:
-    from pans.trainer.export.ordering import information_order, order_facts, reordered
-
-    order = information_order(bundle, held_out.profile, held_out.task.train, by=way, bleaching=bleaching)
-    with needing("a head in eight bits", "train"):
-        return reordered(bundle, order.patterns, order_facts(order, bundle)), order
 
 
 def _rows(bundle: Bundle, order: Order | None, kept: int) -> list[dict[str, Any]]:

@@ -11,13 +11,14 @@ from pathlib import Path
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, make_folder
+from pans.runtime.ranges import Range
 from pans.trainer.reproduce.page import NAMES, Asked, Made, is_page_file, page_of, read_rows, rewrite_page, write_page
 from pans.trainer.reproduce.printed import ACTIVE, PASSIVE
 
-from .arguments import interruptible, torch_with
+from .arguments import add_data_dir, add_threads, interruptible, torch_with
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
-SEEDS_MAX = 100
+SEEDS = Range(1, 100, whole=True)
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +27,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dark", type=float, nargs="+", metavar="R", help="only these dark counts (not of all tables)")
     words = "another draw of a task that is drawn (default 0); not with -o"
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help=words)
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="of the frontier: seeds per row (default 5)")
+    words = "of the frontier: seeds per row (default 5)"
+    parser.add_argument("--seeds", type=SEEDS.option, default=5, metavar="N", help=words)
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
     words = "write NAME.json, the pictures and the tables of the Markdown page there; its text around the tables stays"
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", help=words)
@@ -34,8 +36,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from-json", action="store_true", help=words)
     parser.add_argument("--collect", action="store_true", help="train nothing: put finished rows together")
     add_force(parser)
-    parser.add_argument("--threads", type=int, default=1, metavar="T", help="of torch (default 1)")
-    parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
+    add_threads(parser, "")
+    add_data_dir(parser)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -80,13 +82,11 @@ def _rewrite(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse rows, dark counts, draws and seeds that a table does not have."""
+    """Refuse rows, dark counts and draws that a table does not have."""
     from pans.trainer.reproduce.printed import recipe_facts
     from pans.trainer.tasks.generators import GENERATORS
 
     name, table = args.name, PASSIVE.get(args.name)
-    if not 1 <= args.seeds <= SEEDS_MAX:
-        raise UsageError(f"--seeds is {args.seeds}, allowed: 1 to {SEEDS_MAX}")
     features = [row.features for row in ACTIVE.get(name, table.rows if table else ())]
     if features and args.rows is not None and not {*features} & {*args.rows}:
         raise UsageError(f"--rows {args.rows}", remedy=f"{name} has {', '.join(map(str, features))}")

@@ -1,14 +1,14 @@
 """`pans train`: train patterns and head, or an automaton, through a profile, and export a bundle. All accuracies here are SIMULATED.
 
-What both kinds of training share is here; `train_fixed.py` and `train_automaton.py` hold one class each that trains, exports and says what
-came out. Heavy packages are imported when the command runs, not before.
+What both kinds of training share is here; `train_fixed.py` and `train_automaton.py` hold one class each, with the same methods. Heavy
+packages are imported when the command runs, not before.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_new_bundle, emit, say
 from pans.runtime.errors import UsageError
@@ -25,7 +25,6 @@ from pans.trainer.options import (
 
 from .arguments import (
     HISTORY_FILES,
-    Show,
     add_data_dir,
     add_threads,
     displayed_progress,
@@ -39,27 +38,12 @@ from .evaluate import warn_of_majority
 from .train_own import AUTOMATON, as_given, choose, finish, is_own, set_encoder
 
 if TYPE_CHECKING:
-    from pans.runtime.bundle.model import Bundle
+    from .train_automaton import AutomatonTraining
+    from .train_fixed import FixedTraining
 
 SHARED = tuple(name for name in option_names(Options) if name in option_names(AutomatonOptions))
 ONLY_AUTOMATA = (*(name for name in option_names(AutomatonOptions) if name not in SHARED), "teacher", "start")
 ONLY_FIXED = (*(name for name in option_names(Options) if name not in SHARED), "order", "unconstrained")
-
-
-class Training(Protocol):
-    """One training that a command line asks for: its options are checked when it is made."""
-
-    quantity: str  # whose curve the progress shows
-    bundle: Bundle
-
-    def run(self, show: Show, checkpoint: Path) -> None:
-        """Train; KeyboardInterrupt passes through, with the checkpoint on disk."""
-
-    def export(self, provenance: dict[str, Any]) -> tuple[str, dict[str, Any], list[str]]:
-        """Write the bundle; return its SHA-256, the answer as JSON and in lines."""
-
-    def write_history(self, folder: Path, force: bool) -> list[Path]:
-        """Write how the training went; return the files."""
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -138,11 +122,12 @@ def _train(args: argparse.Namespace) -> int:
 
     profile = load_profile(args.profile or ("ideal" if automaton else "oled-qcmos"))
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
-    chosen = choose(args, task, profile) if own else as_given(args, task)
+    varied, facts = choose(args, task, profile) if own else (as_given(args, task), {})
     if args.history is not None:
         with needing("--history", "plot"):
             import matplotlib  # noqa: F401 - asked for before the training, not after it
-    training: Training = (AutomatonTraining if automaton else FixedTraining)(args, task, chosen.task, profile)
+    kind: type[AutomatonTraining | FixedTraining] = AutomatonTraining if automaton else FixedTraining
+    training = kind(args, task, varied, profile)
     try:
         with (
             usage_errors(),
@@ -155,7 +140,7 @@ def _train(args: argparse.Namespace) -> int:
         say(f"interrupted; the last whole step is in {checkpoint}\n  continue with the same command and --resume")
         return EXIT_INTERRUPTED
     with usage_errors(), computing_on(args.device if automaton else "cpu"):
-        digest, answer, lines = training.export(_provenance(args, watch.seconds()) | chosen.facts)
+        digest, answer, lines = training.export(_provenance(args, watch.seconds()) | facts)
     warn_of_laws(training.bundle, profile, one_by_one=not automaton)
     checkpoint.unlink(missing_ok=True)
     if args.history is not None:
@@ -165,8 +150,8 @@ def _train(args: argparse.Namespace) -> int:
     seconds = watch.seconds()
     payload = {"bundle": str(args.out), "sha256": digest, **answer, "seconds": seconds, "simulated": True}
     if own and task.target == "class":
-        after = finish(args, task, profile, answer)
-        payload, lines = payload | after.payload, [*lines, after.words]
+        more, words = finish(args, task, profile, answer)
+        payload, lines = payload | more, [*lines, words]
     emit(args, payload, "\n".join([f"{args.out}  {digest[:12]}  trained in {seconds:.0f} s", *lines]))
     return EXIT_FINE
 

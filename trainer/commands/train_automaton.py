@@ -30,7 +30,7 @@ BUDGET_TOLERANCE = 0.01  # of the light or the clicks that were asked for
 
 
 class AutomatonTraining:
-    """A training of an automaton, see `train.Training`."""
+    """A training of an automaton; see train.py."""
 
     quantity = "accuracy %"
     bundle: Bundle
@@ -52,7 +52,7 @@ class AutomatonTraining:
         keep_freed_memory()
 
     def run(self, show: Show, checkpoint: Path) -> None:
-        """See `train.Training`."""
+        """Train; KeyboardInterrupt passes through, with the checkpoint on disk."""
 
         def report(step: Progress) -> None:
             self.reports.append(step)
@@ -77,7 +77,7 @@ class AutomatonTraining:
         )
 
     def export(self, provenance: dict[str, Any]) -> tuple[str, dict[str, Any], list[str]]:
-        """See `train.Training`."""
+        """Write the bundle; return its SHA-256, the answer as JSON and in lines."""
         args, trained = self.args, self.trained
         name, own = args.name or args.out.stem, {"threads": args.threads, "device": args.device}
         facts = provenance | {"options": asdict(trained.options) | own}
@@ -87,6 +87,7 @@ class AutomatonTraining:
         bundle = self.bundle = exported.bundle
         automaton, measured = bundle.automaton, exported.measured
         assert automaton is not None
+        off, missed = budget_off(trained.options, measured)
         answer = {
             **asdict(measured),
             "first_200": asdict(exported.first_200),
@@ -95,42 +96,33 @@ class AutomatonTraining:
             "patterns": bundle.n_patterns,
             "exposures": automaton.n_slots,
             "price": trained.price,
-            "budget_off": budget_off(trained.options, measured),
+            "budget_off": off,
         }
         lines = [
             f"{automaton.n_states} states, {bundle.n_patterns} patterns, at most {automaton.n_slots} exposures",
             _words("all held-out objects", measured),
             *class_words(answer["by_class"]),
             _words("the first 200", exported.first_200),
-            *budget_words(trained.options, measured),
+            *missed,
         ]
         return exported.sha256, answer, lines
 
     def write_history(self, folder: Path, force: bool) -> list[Path]:
-        """See `train.Training`."""
+        """Write how the training went; return the files."""
         return write_course(folder, self.reports, force=force)
 
 
-def budget_off(options: AutomatonOptions, found: MeasuredWalks) -> float:
-    """Return by which part of the budget the held-out objects get more light or clicks; negative for less."""
-    if options.photons is not None:
-        return found.photons_mean / options.photons - 1
-    assert options.clicks is not None
-    return found.clicks_mean / options.clicks - 1
+def budget_off(options: AutomatonOptions, found: MeasuredWalks) -> tuple[float, list[str]]:
+    """Return by which part of the budget the held-out objects get more light or clicks (negative for less), and a line where it is missed.
 
-
-def budget_words(options: AutomatonOptions, found: MeasuredWalks) -> list[str]:
-    """Return a line when the budget is missed: the price was found on training objects, and dwell times have steps."""
-    off = budget_off(options, found)
-    if abs(off) <= BUDGET_TOLERANCE:
-        return []
-    name, wanted = ("photons", options.photons) if options.photons is not None else ("clicks", options.clicks)
-    assert wanted is not None
+    The price was found on training objects, and dwell times have steps.
+    """
+    name = "clicks" if options.photons is None else "photons"
+    wanted, got = getattr(options, name), getattr(found, f"{name}_mean")
+    off = got / wanted - 1
     again = f"--{name} {wanted / (1 + off):.4g}" if off > -1 else f"a larger --{name}"
-    return [
-        f"budget missed by {off:+.1%}: {wanted * (1 + off):.3g} {name} on all held-out objects, asked for {wanted:g}; "
-        f"to come closer, train with {again}"
-    ]
+    words = f"budget missed by {off:+.1%}: {got:.3g} {name} on all held-out objects, asked for {wanted:g}; "
+    return off, [f"{words}to come closer, train with {again}"] if abs(off) > BUDGET_TOLERANCE else []
 
 
 def _words(which: str, found: MeasuredWalks) -> str:

@@ -31,7 +31,7 @@ from .evaluate import passive_light, words_of
 
 
 class FixedTraining:
-    """A training of fixed patterns or of passive optics, see `train.Training`."""
+    """A training of fixed patterns or of passive optics; see train.py."""
 
     quantity = "loss"
     bundle: Bundle
@@ -45,7 +45,7 @@ class FixedTraining:
         self.history: History | None = None
 
     def run(self, show: Show, checkpoint: Path) -> None:
-        """See `train.Training`."""
+        """Train; KeyboardInterrupt passes through, with the checkpoint on disk."""
         options = self.options
         self.history = None if self.args.history is None else History(checkpoint, options, self.varied.sha256)
         step, steps = max(1, options.epochs // 10), options.epochs * options.restarts
@@ -65,7 +65,7 @@ class FixedTraining:
         self.trained = train(self.varied, self.profile, options, checkpoint=checkpoint, resume=resume, report=report)
 
     def export(self, provenance: dict[str, Any]) -> tuple[str, dict[str, Any], list[str]]:
-        """See `train.Training`."""
+        """Write the bundle; return its SHA-256, the answer as JSON and in lines."""
         args, trained, task, profile = self.args, self.trained, self.task, self.profile
         name, own = args.name or args.out.stem, {"threads": args.threads, "device": args.device}
         facts = provenance | {"options": plain_options(trained.options) | own}
@@ -91,7 +91,7 @@ class FixedTraining:
         return exported.sha256, figures, [words_of(measured, light)]
 
     def write_history(self, folder: Path, force: bool) -> list[Path]:
-        """See `train.Training`."""
+        """Write how the training went; return the files."""
         assert self.history is not None
         last = self.trained.quantised.patterns() if self.trained.quantised else None
         return self.history.write(folder, last, self.task.image_shape, force=force)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,28 +46,19 @@ def set_encoder(args: argparse.Namespace, of_fixed: tuple[str, ...]) -> None:
     say(why)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Chosen:
-    """The task to train on, and the facts that the bundle and the answer keep of the choice."""
-
-    task: Task
-    facts: dict[str, Any]
-
-
-def as_given(args: argparse.Namespace, task: Task) -> Chosen:
+def as_given(args: argparse.Namespace, task: Task) -> Task:
     """Return the task as it is, and warn of the classes of a user's own images."""
     if args.as_is:
-        from pans.trainer.choose import class_warnings
+        from pans.trainer.choose.recipe import class_warnings
 
         for text in class_warnings(task):
             warn(text)
-    return Chosen(task, {})
+    return task
 
 
-def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Chosen:
-    """Choose what the options leave open, say what and why, warn, and return the task with its varied copies."""
-    from pans.trainer.choose import choose_training, choose_variation, warnings_of
-    from pans.trainer.choose.recipe import Choice
+def choose(args: argparse.Namespace, task: Task, profile: Profile) -> tuple[Task, dict[str, Any]]:
+    """Choose what the options leave open, say what and why, and warn; return the task with its varied copies, and facts of the choice."""
+    from pans.trainer.choose.recipe import Choice, choose_training, choose_variation, warnings_of
     from pans.trainer.tasks.changes import Variation, enlarged
 
     given = any(getattr(args, name) for name in CHANGES)
@@ -84,7 +75,7 @@ def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Chosen:
     bigger = enlarged(task, choice.variation, recipe.objects, recipe.kept, args.seed or 0)
     changes = {name: value for name, value in asdict(choice.variation).items() if value}
     facts = {"training_objects": len(bigger.train), "variation": changes}
-    return Chosen(bigger, facts | {"left_out_loss": [round(choice.loss_before, 4), round(choice.loss, 4)]})
+    return bigger, facts | {"left_out_loss": [round(choice.loss_before, 4), round(choice.loss, 4)]}
 
 
 def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
@@ -104,24 +95,24 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
     return []
 
 
-@dataclass(frozen=True, slots=True)
-class After:
-    """What follows the figures of a training: keys of the answer, and words."""
-
-    payload: dict[str, Any]
-    words: str
-
-
-def finish(args: argparse.Namespace, task: Task, profile: Profile, figures: Mapping[str, Any]) -> After:
-    """Warn of a budget that was not met, compare with direct imaging at equal photons, and name the next commands."""
+def finish(
+    args: argparse.Namespace, task: Task, profile: Profile, figures: Mapping[str, Any]
+) -> tuple[dict[str, Any], str]:
+    """Warn of a missed budget, compare with direct imaging at equal photons, name the next commands: keys of the answer, and words."""
     photons = figures["photons_mean"]
     if args.encoder != AUTOMATON:  # whose own words tell it
         warn_of_budget(args, figures["clicks_mean"], photons, figures["illumination"])
-    words, payload = [], {}
+    words: list[str] = []
+    payload: dict[str, Any] = {}
     if task.light == "transmission" and photons >= LEAST_PHOTONS:
         direct = compared(task, photons, args.seed or 0)
-        words, payload = [compared_words(direct)], {"direct_imaging": direct}
-    return After(payload, "\n".join([*words, next_commands(args, profile.name)]))
+        payload = {"direct_imaging": direct}
+        words.append(
+            "SIMULATED direct imaging, the exact posterior of an ideal camera at the same photons: "
+            f"{100 * direct['accuracy_mean']:.2f} %  (error from the objects {100 * direct['accuracy_se_objects']:.2f} points, "
+            f"illumination {direct['illumination']:.1f})"
+        )
+    return payload, "\n".join([*words, next_commands(args, profile.name)])
 
 
 def compared(task: Task, photons: float, seed: int) -> dict[str, Any]:
@@ -134,14 +125,6 @@ def compared(task: Task, photons: float, seed: int) -> dict[str, Any]:
     return {
         key: row[key] for key in ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
     }
-
-
-def compared_words(found: dict[str, Any]) -> str:
-    """Return the comparison as a line for people."""
-    return (
-        f"SIMULATED direct imaging, the exact posterior of an ideal camera at the same photons: {100 * found['accuracy_mean']:.2f} %  "
-        f"(error from the objects {100 * found['accuracy_se_objects']:.2f} points, illumination {found['illumination']:.1f})"
-    )
 
 
 def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float, illumination: float) -> None:

@@ -321,8 +321,6 @@ def evaluate_sampled(
     bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1, trials: int = 30, seed: int = 0
 ) -> Measured:
     """Sample `trials` independent decisions per object, each from `shots` shots."""
-    if trials < 1:
-        raise ValueError(f"trials is {trials}, allowed: 1 or more")
     decider = make_decider(bundle, shots=shots)
     rng = np.random.default_rng(seed)
     right = np.zeros(len(labels))
@@ -360,8 +358,6 @@ def evaluate_pictures(
     bundle: Bundle, light: Light, images: NDArray[np.uint8], *, shots: int = 1, trials: int = 1, seed: int = 0
 ) -> MeasuredPictures:
     """Give back `trials` pictures of every object from `shots` shots and compare them with its image, uint8 (n, height, width)."""
-    if trials < 1:
-        raise ValueError(f"trials is {trials}, allowed: 1 or more")
     decider = PictureDecider(bundle)
     rng = np.random.default_rng(seed)
     likes, of_trial, squares, clicks = np.zeros(len(images)), np.empty(trials), 0.0, 0

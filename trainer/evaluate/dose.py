@@ -8,8 +8,9 @@ Exact expectations, but for automata before samples that bleach: what is left de
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects
 
-from .accuracy import EXACT_OUTCOMES_MAX, Measured, light_of
+from .accuracy import Measured, light_of
 from .held_out import HeldOut, measure, trained_bleaching, trials_needed
 from .readings import vector_chances
 from .walks import MeasuredWalks
@@ -70,8 +71,6 @@ def training_readings(bundle: Bundle, profile: Profile, training: Objects) -> F6
 def word_chances(readings: F64) -> F64:
     """Return the mean P(word) over objects with `readings` (n, d_f, outcomes): (outcomes**d_f,), pattern 0 the lowest digit."""
     words = readings.shape[2] ** readings.shape[1]
-    if words > EXACT_OUTCOMES_MAX:
-        raise ValueError(f"{words} words, allowed: {EXACT_OUTCOMES_MAX}")
     total, step = np.zeros(words), max(1, _CHUNK_NUMBERS // words)
     for start in range(0, len(readings), step):
         total += vector_chances(readings[start : start + step]).sum(axis=0)
@@ -104,8 +103,6 @@ def of_first(bundle: Bundle, count: int, readings: F64) -> Bundle:
     head that is no plain chain of layers.
     """
     demand_fixed_patterns(bundle)
-    if not 1 <= count <= bundle.n_features:
-        raise ValueError(f"{count} patterns of {bundle.n_features}")
     if count == bundle.n_features:
         return bundle
     outcomes = bundle.largest + 1
@@ -114,18 +111,19 @@ def of_first(bundle: Bundle, count: int, readings: F64) -> Bundle:
         back_end = BackEnd(table=scores, outcomes=outcomes)
     else:
         means = readings.mean(axis=0) @ np.arange(outcomes) / bundle.largest
-        back_end = BackEnd(head_onnx=chain_onnx(_of_means(_layers(bundle), count, means)), outcomes=outcomes)
-    return _with(bundle, back_end, bundle.pattern_levels[:count], {"patterns_left_out": bundle.n_features - count})
+        back_end = BackEnd(head_onnx=chain_onnx(_of_means(plain_layers(bundle), count, means)), outcomes=outcomes)
+    return rebuilt(bundle, back_end, range(count), {"patterns_left_out": bundle.n_features - count})
 
 
-def _layers(bundle: Bundle) -> tuple[Layer, ...]:
+def plain_layers(bundle: Bundle) -> tuple[Layer, ...]:
+    """Return the layers of the head of `bundle`; ValueError where it is no plain chain of them (Gemm, Relu), or there is none."""
     layers = None
     if bundle.head_onnx is not None:
         layers = read_layers(bundle.head_onnx, bundle.n_features, bundle.n_classes)
     if layers is None:
         raise ValueError(
-            f"{bundle.name} has {bundle.n_features} patterns and no head of plain layers, allowed: a table of at most "
-            f"{WORDS_MAX} words, or such a head"
+            f"the head of {bundle.name} is no plain chain of layers (Gemm, Relu), allowed: such a head, or to leave patterns out of a "
+            f"table of at most {WORDS_MAX} words"
         )
     return layers
 
@@ -138,13 +136,14 @@ def _of_means(layers: tuple[Layer, ...], count: int, means: F64) -> tuple[Layer,
     return (Layer(wide[:count].astype(np.float32), bias.astype(np.float32), first.relu), *layers[1:])
 
 
-def _with(bundle: Bundle, back_end: BackEnd, levels: NDArray[Any], facts: Mapping[str, Any]) -> Bundle:
+def rebuilt(bundle: Bundle, back_end: BackEnd, patterns: Sequence[int], facts: Mapping[str, Any]) -> Bundle:
+    """Return `bundle` with these of its patterns, another back end, and `facts` beside its provenance."""
     return make_bundle(
         name=bundle.name,
         task=bundle.task,
         classes=bundle.classes,
         image_shape=bundle.image_shape,
-        optics=Shown(bundle.levels, levels, bundle.photons_per_level),
+        optics=Shown(bundle.levels, bundle.pattern_levels[list(patterns)], bundle.photons_per_level),
         provenance={**bundle.provenance, **facts},
         back_end=back_end,
     )
@@ -164,19 +163,17 @@ class Capped:
         return {"dose_cap": self.cap, "exposures_most": self.exposures_most, "states": self.states}
 
 
+@dataclass(frozen=True, eq=False)
 class Knowledge:
     """What training objects show under a bundle's fixed patterns, computed when it is first needed."""
 
-    def __init__(self, bundle: Bundle, held_out: HeldOut) -> None:
-        self._bundle, self._held_out = bundle, held_out
-        self._readings: F64 | None = None
+    bundle: Bundle
+    held_out: HeldOut
 
-    @property
+    @cached_property
     def readings(self) -> F64:
         """P(reading) of training objects, (n, d_f, outcomes)."""
-        if self._readings is None:
-            self._readings = training_readings(self._bundle, self._held_out.profile, self._held_out.task.train)
-        return self._readings
+        return training_readings(self.bundle, self.held_out.profile, self.held_out.task.train)
 
 
 def within_cap(bundle: Bundle, cap: float, held_out: HeldOut, known: Knowledge, eta: float = 1.0) -> Capped:

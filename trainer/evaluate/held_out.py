@@ -28,9 +28,7 @@ from .walks import MeasuredWalks, Walks, measured_walks, walks_of
 DEFAULT_PROFILE = "oled-qcmos"
 DEFAULT_TRIALS = 30  # as many as the paper's experiment repeats
 PICTURE_TRIALS = 3  # a picture is hundreds of numbers
-EXACT_NUMBERS_MAX = (
-    1 << 16
-)  # vectors of photon numbers that are gone through unasked: ten thousand objects in half a minute
+EXACT_NUMBERS_MAX = 1 << 16  # vectors of photon numbers, gone through unasked: ten thousand objects in half a minute
 
 
 def trained_bleaching(bundle: Bundle) -> Bleaching:
@@ -120,6 +118,8 @@ def measure(
 ) -> Measured | MeasuredPictures | MeasuredWalks:
     """Return what `bundle` decides on the objects: from `trials` decisions per object, or exact without (not of pictures)."""
     objects = held_out.objects
+    if trials is not None and trials < 1:
+        raise ValueError(f"trials is {trials}, allowed: 1 or more")
     if bundle.automaton is not None:
         return measured_walks(walks_on(bundle, held_out, shots=shots, trials=trials, conditions=conditions))
     if conditions.confidence:
@@ -154,9 +154,7 @@ def walks_on(
 ) -> Walks:
     """Return what the automaton of `bundle` does on the objects: `trials` walks of each, or exact without."""
     if shots != 1:
-        raise ValueError(
-            f"shots is {shots}, allowed with an automaton: 1 (a walk is one shot; several are several trials)"
-        )
+        raise ValueError(f"shots is {shots}, allowed with an automaton: 1 (several shots are several trials)")
     objects = held_out.objects
     return walks_of(bundle, held_out.profile, objects.images, objects.labels, conditions, trials)
 

@@ -1,6 +1,6 @@
 """How much the readouts know of the label: exact for click words, bounded for frames, and Fisher's ratio (paper, Fig. 2C). In bits.
 
-- **Click words** (`word_information`): all (shots + 1)**d_f count vectors are enumerated, so that I(label; clicks) of a set of
+- **Click words** (`word_information`): all 2**d_f click words of one shot are enumerated, so that I(label; clicks) of a set of
   objects is a sum, not an estimate. On the training objects it is optimistic about new ones: quote the held-out figures.
 - **Frames** (`posterior_information`): nothing can be enumerated. A posterior q gives I >= H(label) - E[-log2 q(label)],
   whatever q is; the gap is how wrong q is. The mixture over the training objects knows the noise exactly and the world only as
@@ -10,7 +10,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,6 @@ from pans.runtime.instrument.click_law import ClickLaw, click_probability
 
 from .accuracy import outcome_probabilities
 
-OUTCOMES_MAX = 1 << 16  # 16 patterns at one shot
 SMOOTHING = 1e-9  # of a word's probability, given to every class: words that no training object shows say nothing
 DISCRIMINANT_MAX = 2048
 _CHUNK_NUMBERS = 1 << 22
@@ -42,28 +41,18 @@ class Information:
     heldout_bayes_accuracy: float
 
 
-def word_joint(probability: F64, labels: I64, n_classes: int, shots: int = 1) -> F64:
-    """Return P(count vector, label), float64 ((shots + 1)**d_f, classes), over objects with click probabilities (n, d_f).
+def word_joint(probability: F64, labels: I64, n_classes: int) -> F64:
+    """Return P(click word, label), float64 (2**d_f, classes), over objects with click probabilities (n, d_f).
 
-    Row index: pattern 0 is the lowest digit, as in a bundle's table. ValueError beyond `OUTCOMES_MAX` outcomes.
+    Row index: pattern 0 is the lowest bit, as in a bundle's table.
     """
-    outcomes = (shots + 1) ** probability.shape[1]
-    if outcomes > OUTCOMES_MAX:
-        raise ValueError(
-            f"{probability.shape[1]} patterns at {shots} shots: {outcomes} outcomes, allowed: {OUTCOMES_MAX}"
-        )
-    joint = np.zeros((outcomes, n_classes))
-    for rows, chance in _chunks(probability, shots):
-        joint += chance.T @ (labels[rows, None] == np.arange(n_classes)).astype(np.float64)
-    return joint / len(labels)
-
-
-def _chunks(probability: F64, shots: int) -> Iterator[tuple[slice, F64]]:
-    """Pieces of the objects, and P(count vector | object) of each."""
-    step = max(1, _CHUNK_NUMBERS // (shots + 1) ** probability.shape[1])
+    words = 1 << probability.shape[1]
+    joint, step = np.zeros((words, n_classes)), max(1, _CHUNK_NUMBERS // words)
     for start in range(0, len(probability), step):
         rows = slice(start, start + step)
-        yield rows, outcome_probabilities(probability[rows], shots)
+        of_class = (labels[rows, None] == np.arange(n_classes)).astype(np.float64)
+        joint += outcome_probabilities(probability[rows], 1).T @ of_class
+    return joint / len(labels)
 
 
 def mutual_information_bits(joint: F64) -> float:
@@ -88,22 +77,21 @@ def word_information(
     n_classes: int,
     *,
     law: ClickLaw = ClickLaw(),  # noqa: B008  frozen
-    shots: int = 1,
 ) -> Information:
     """Return what the click words of an encoder know, exactly; `train` and `test` are photoelectrons per exposure (n, d_f).
 
-    `photons` and `clicks` are means over the test objects and all shots. Enumeration: (shots + 1)**d_f up to 65536.
+    `photons` and `clicks` are means over the test objects.
     """
     p_train, p_test = click_probability(law, train), click_probability(law, test)
-    joint = word_joint(p_train, train_labels, n_classes, shots)
+    joint = word_joint(p_train, train_labels, n_classes)
     smooth = joint + SMOOTHING * joint.sum(axis=0)
     log_posterior = np.log2(smooth / smooth.sum(axis=1, keepdims=True))
     decided = log_posterior.argmax(axis=1)
-    heldout = word_joint(p_test, test_labels, n_classes, shots)
+    heldout = word_joint(p_test, test_labels, n_classes)
     label_bits = entropy_bits(heldout.sum(axis=0))
     return Information(
-        photons=shots * float(test.sum()) / len(test),
-        clicks=shots * float(p_test.sum()) / len(test),
+        photons=float(test.sum()) / len(test),
+        clicks=float(p_test.sum()) / len(test),
         label_bits=label_bits,
         bits=mutual_information_bits(joint),
         bayes_accuracy=float(joint.max(axis=1).sum()),
@@ -187,10 +175,6 @@ def fisher(mean: F64, variance: F64, labels: I64) -> FisherRatio:
     Within-class scatter is that of the objects' means plus the noise; classes weigh by their objects. Counting: mean =
     variance = lambda. Clicks: p and p(1-p). Exact: nothing is sampled.
     """
-    if mean.shape != variance.shape or len(mean) != len(labels):
-        raise ValueError(
-            f"means are {mean.shape}, variances {variance.shape}, labels {labels.shape}; allowed: (n, m), (n,)"
-        )
     return _Scatter(mean, labels).ratio(variance.mean(axis=0))
 
 

@@ -85,9 +85,7 @@ def over_optics(
 
 
 def drawn_tables(tolerance: Tolerance, count: int, seed: int) -> list[Imaging]:
-    """Return `count` optics drawn within `tolerance`; ValueError below one."""
-    if count < 1:
-        raise ValueError(f"draws is {count}, allowed: 1 or more")
+    """Return `count` optics drawn within `tolerance`."""
     random = np.random.default_rng([DRAW_STREAM, seed])
     return [tolerance.draw(random) for _ in range(count)]
 

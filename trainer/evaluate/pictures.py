@@ -28,7 +28,6 @@ from .walks import Walks, calibration_bins, confusion_of, measured_walks
 MAPPED_OBJECTS = 600
 SHOWN_PICTURES = 8
 LEAST_SHARE = 1e-4  # of the decisions, for a point of the reliability diagram: exact expectations have bins of 1e-10
-OBJECTS_MAX = 2000  # the method is exact: several matrices of n x n
 PERPLEXITY = 30.0  # the default of van der Maaten and Hinton's code (2008)
 
 F64 = NDArray[np.float64]
@@ -40,7 +39,10 @@ AXES = {
     "psf_px": "blur, standard deviation (pixels)",
     "black": "light of a dark pixel / full pixel",
 }
-Curves = Mapping[str, Sequence[Mapping[str, Any]]]
+DOSE_AXES = {
+    "illumination of an object (photoelectrons, mean)": "illumination",
+    "photoelectrons detected (mean)": "photons_mean",
+}
 
 
 def write_pictures(
@@ -162,21 +164,16 @@ def _given_back(
 
 
 def tsne(features: NDArray[np.floating], *, perplexity: float = PERPLEXITY, seed: int = 0) -> F64:
-    """Return positions, float64 (n, 2), of `features` (n, d); ValueError for too few or too many points.
+    """Return positions, float64 (n, 2), of `features` (n, d); more than three times the perplexity, and hardly above 2000.
 
     The map starts from the principal components, so that it does not depend on where random points fall; a little noise on top
     lets equal features part.
     """
     from sklearn.manifold import TSNE
 
-    n = len(features)
-    if features.ndim != 2 or not 3 * perplexity < n <= OBJECTS_MAX:
-        raise ValueError(
-            f"{n} points, allowed for a map at perplexity {perplexity:g}: {int(3 * perplexity) + 1} to {OBJECTS_MAX}"
-        )
     centred = features.astype(np.float64) - features.mean(axis=0, dtype=np.float64)
     axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
-    start = np.zeros((n, 2))
+    start = np.zeros((len(features), 2))
     start[:, : len(axes)] = centred @ axes.T
     start *= 1e-4 / max(float(start.std()), 1e-12)  # the size that scikit-learn gives its own starts
     start += np.random.default_rng(seed).normal(0, 1e-5, start.shape)
@@ -185,58 +182,33 @@ def tsne(features: NDArray[np.floating], *, perplexity: float = PERPLEXITY, seed
 
 
 def draw_dose(folder: Path, curves: Mapping[str, Points], *, force: bool = False) -> Path:
-    """Write dose.png into `folder`, a curve by name of each bundle or sample, and return its path.
+    """Write dose.png into `folder` and return its path: accuracy against illumination, and against the photons that come back.
 
-    Left against illumination, right against the photons that come back. Bars are the error from trials and objects together.
+    A curve by name of each bundle or sample; bars are the error from trials and objects together.
     """
-    make_folder(folder)
-    figure, axes = new_figure(width=10.0, height=4.0, panels=2)
-    for axis, key in zip(axes, ("illumination", "photons_mean")):
-        for marker, (name, points) in zip(MARKERS * len(curves), curves.items()):
-            axis.errorbar(
-                [point[key] for point in points],
-                [100 * (point["accuracy_mean"] or 0.0) for point in points],
-                yerr=[100 * _error(point) for point in points],
-                marker=marker,
-                markersize=4,
-                linewidth=1,
-                capsize=2,
-                label=name,
-            )
-        axis.set_ylim(0, 100)
+    return _curves(folder / "dose.png", [(label, key, curves) for label, key in DOSE_AXES.items()], force)
+
+
+def draw_optics(folder: Path, bundles: Mapping[str, Mapping[str, Points]], *, force: bool = False) -> Path:
+    """Write optics.png into `folder` and return its path: accuracy against each misalignment, the curves of every bundle by name."""
+    panels = [(label, "value", {name: of[key] for name, of in bundles.items()}) for key, label in AXES.items()]
+    return _curves(folder / "optics.png", panels, force)
+
+
+def _curves(path: Path, panels: Sequence[tuple[str, str, Mapping[str, Points]]], force: bool) -> Path:
+    """Accuracy over points in panels: label of the axis, key of a point, and curves by name."""
+    make_folder(path.parent)
+    figure, axes = new_figure(width=11.0, height=3.6, panels=len(panels))
+    for axis, (label, key, curves) in zip(axes, panels):
+        for number, (name, points) in enumerate(curves.items()):
+            shown = [[point[key] for point in points], [100 * (point["accuracy_mean"] or 0.0) for point in points]]
+            errors = [(point["accuracy_se_objects"] or 0.0, point.get("accuracy_se_trials", 0.0)) for point in points]
+            bars = [100 * math.hypot(*both) for both in errors]
+            marker = MARKERS[number % len(MARKERS)]
+            axis.errorbar(*shown, yerr=bars, label=name, marker=marker, markersize=4, linewidth=1, capsize=2)
+        axis.set(xlabel=label, ylim=(0, 100))
         axis.grid(alpha=0.3)
-    axes[0].set_xlabel("illumination of an object (photoelectrons, mean)")
-    axes[1].set_xlabel("photoelectrons detected (mean)")
     axes[0].set_ylabel("accuracy (%), SIMULATED")
     axes[0].legend(fontsize=8, loc="lower right")
-    path = folder / "dose.png"
-    save_figure(figure, path, force=force)
-    return path
-
-
-def _error(point: Mapping[str, Any]) -> float:
-    return math.hypot(point["accuracy_se_objects"] or 0.0, point["accuracy_se_trials"])
-
-
-def draw_optics(folder: Path, bundles: Mapping[str, Curves], *, force: bool = False) -> Path:
-    """Write optics.png into `folder`, the curves of every bundle by name, and return its path."""
-    make_folder(folder)
-    figure, axes = new_figure(width=11.0, height=3.2, panels=len(AXES))
-    for axis, (name, label) in zip(axes, AXES.items()):
-        for marker, (bundle, curves) in zip(MARKERS * len(bundles), bundles.items()):
-            points = curves[name]
-            axis.plot(
-                [point["value"] for point in points],
-                [100 * (point["accuracy_mean"] or 0.0) for point in points],
-                marker=marker,
-                markersize=4,
-                label=bundle,
-            )
-        axis.set_xlabel(label)
-        axis.set_ylim(0, 100)
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("accuracy (%), SIMULATED")
-    axes[0].legend(fontsize=8, loc="lower left")
-    path = folder / "optics.png"
     save_figure(figure, path, force=force)
     return path

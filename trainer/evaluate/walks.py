@@ -127,9 +127,8 @@ def walks_of(
     if trials is None and afterpulses.time:
         some = np.linspace(0, len(images) - 1, min(step, BEGIN_OBJECTS, len(images))).astype(np.int64)
         few = object_transmission(profile, images[some].reshape(len(some), -1))
-        for _ in range(
-            BEGIN_ROUNDS
-        ):  # objects begin with the memory that those before them leave, which begin with it too
+        # objects begin with the memory that those before them leave, which begin with it too
+        for _ in range(BEGIN_ROUNDS):
             ends = expected(few, begins).ends
             assert ends is not None
             mean, square = ends.mean(axis=0).tolist()
@@ -158,8 +157,6 @@ def _fitting(
         raise ValueError(f"{bundle.name} has no automaton")
     if images.shape[1:] != bundle.image_shape:
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
-    if trials is not None and trials < 1:
-        raise ValueError(f"trials is {trials}, allowed: 1 or more")
     if not conditions.bleaching.is_none:
         demand_sequence(profile)
         if trials is None:
@@ -200,9 +197,8 @@ class _Lit:
         self, automaton: Automaton, patterns: NDArray[Any], seen: NDArray[Any], scale: float, law: Bleaching
     ) -> None:
         self.n, self.automaton, self._patterns, self._scale, self._law = len(seen), automaton, patterns, scale, law
-        self.illumination = np.asarray(
-            patterns.sum(axis=1, dtype=np.float64) * scale
-        )  # of one exposure of each pattern
+        # of one exposure of each pattern
+        self.illumination = np.asarray(patterns.sum(axis=1, dtype=np.float64) * scale)
         self._share = automaton.dwell / automaton.dwell_steps
         self._displayed = automaton.rows if automaton.channels > 1 else automaton.pattern
         self._light = pattern_light(patterns, seen, scale) if law.is_none else np.empty(0)
@@ -258,9 +254,8 @@ def _sampled(
                 memory = afterpulses.in_the_dark(memory)
                 continue
             state = node[active]
-            sent = lit.illumination[automaton.rows[state]].sum(axis=1) * (
-                automaton.dwell[state] / automaton.dwell_steps
-            )
+            share = automaton.dwell[state] / automaton.dwell_steps
+            sent = lit.illumination[automaton.rows[state]].sum(axis=1) * share
             photoelectrons = lit.photoelectrons(active, state)
             clicks = outcome = _drawn(law, photoelectrons, afterpulses.sight(memory[:, active]), rng)
             if automaton.channels > 1:
@@ -300,9 +295,8 @@ def measured_walks(walks: Walks) -> MeasuredWalks:
     accuracy = float(walks.right.sum()) / decided if decided else 0.0
     # the ratio's error by its derivative: of each object right - accuracy * decided, whose mean is 0
     excess = walks.right - accuracy * walks.decided
-    per_walk = (
-        walks.right * (1 - 2 * accuracy) + accuracy**2 * walks.decided - excess**2
-    )  # its variance within one walk
+    # its variance within one walk
+    per_walk = walks.right * (1 - 2 * accuracy) + accuracy**2 * walks.decided - excess**2
     return MeasuredWalks(
         accuracy_mean=accuracy if decided else None,
         accuracy_std=math.sqrt(max(float(per_walk.sum()), 0.0)) / decided if decided else None,
@@ -357,13 +351,8 @@ def expected_figures(found: MeasuredWalks, profile: str, task: str, split: str) 
     if found.trials:
         raise ValueError("sampled figures are no expectation")
     conditions: dict[str, Any] = {"profile": profile, "task": task, "split": split, "objects": found.objects}
-    return conditions | {
-        "accuracy": found.accuracy_mean,
-        "clicks": found.clicks_mean,
-        "photons": found.photons_mean,
-        "illumination": found.illumination,
-        "exposures": found.exposures_mean,
-    }
+    conditions |= {"accuracy": found.accuracy_mean, "clicks": found.clicks_mean, "photons": found.photons_mean}
+    return conditions | {"illumination": found.illumination, "exposures": found.exposures_mean}
 
 
 def walk_payload(walks: Walks) -> dict[str, Any]:

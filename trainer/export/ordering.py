@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.layers import Int8Head, Layer, read_layers
-from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
+from pans.runtime.bundle.layers import Int8Head, Layer
+from pans.runtime.bundle.model import BackEnd, Bundle
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, mean_left, met
 from pans.runtime.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import demand_sequence, outcome_law_of
-from pans.trainer.evaluate.dose import demand_fixed_patterns
+from pans.trainer.evaluate.dose import demand_fixed_patterns, plain_layers, rebuilt
 from pans.trainer.evaluate.information import mutual_information_bits
 from pans.trainer.evaluate.readings import vector_chances
 from pans.trainer.tasks.registry import Objects
@@ -94,8 +94,6 @@ def information_order(
     `by` "dose": most information per light that the pattern sends. `training` are the objects it is measured on, the first of them.
     ValueError for a bundle without fixed patterns, and for a profile that shows all of them at once.
     """
-    if by not in WAYS:
-        raise ValueError(f"an order by {by!r}, allowed: {', '.join(WAYS)}")
     exact = (bundle.largest + 1) ** bundle.n_features <= EXACT_WORDS_MAX
     objects = training.first(OBJECTS if exact else SAMPLED_OBJECTS)
     readings = _Readings(bundle, profile, objects, bleaching)
@@ -185,21 +183,11 @@ def _entropy(rows: F64) -> F64:
 def reordered(bundle: Bundle, order: Sequence[int], facts: Mapping[str, Any]) -> Bundle:
     """Return `bundle` with pattern `order[i]` as its pattern i, and `facts` beside its provenance.
 
-    ValueError for what is no order of its patterns, for a bundle without fixed patterns, and for a head that is no plain chain of layers.
+    ValueError for a bundle without fixed patterns, and for a head that is no plain chain of layers.
     """
     places = [int(place) for place in order]
     demand_fixed_patterns(bundle)
-    if sorted(places) != list(range(bundle.n_features)):
-        raise ValueError(f"{places[:20]} is no order of {bundle.n_features} patterns")
-    return make_bundle(
-        name=bundle.name,
-        task=bundle.task,
-        classes=bundle.classes,
-        image_shape=bundle.image_shape,
-        optics=Shown(bundle.levels, bundle.pattern_levels[places], bundle.photons_per_level),
-        provenance={**bundle.provenance, **facts},
-        back_end=_back_end(bundle, places),
-    )
+    return rebuilt(bundle, _back_end(bundle, places), places, facts)
 
 
 def order_facts(order: Order, bundle: Bundle) -> dict[str, Any]:
@@ -217,11 +205,7 @@ def _back_end(bundle: Bundle, places: list[int]) -> BackEnd:
     table = None if bundle.table is None else bundle.table[_old_rows(places, outcomes)]
     if bundle.head_onnx is None:
         return BackEnd(table=table, outcomes=outcomes)
-    layers = read_layers(bundle.head_onnx, bundle.n_features, bundle.n_classes)
-    if layers is None:
-        raise ValueError(
-            f"the head of {bundle.name} is no plain chain of layers (Gemm, Relu), which alone can be reordered"
-        )
+    layers = plain_layers(bundle)
     first = Layer(np.ascontiguousarray(layers[0].weights[places]), layers[0].bias, layers[0].relu)
     int8 = None if bundle.int8_head is None else _int8(bundle.int8_head, places)
     quantised = None

@@ -71,17 +71,10 @@ def with_tolerance(bundle: Bundle, task: Task, profile: Profile, optics: str | N
 
 
 def _rounded(found: OverOptics) -> dict[str, Any]:
-    return {
-        "accuracy": round(found.accuracy_mean, 5),
-        "accuracy_std_optics": round(found.accuracy_std_optics, 5),
-        "accuracy_se_objects": round(found.accuracy_se_objects, 5),
-        "accuracy_worst": round(found.accuracy_worst, 5),
-        "clicks": round(found.clicks_mean, 4),
-        "photons": round(found.photons_mean, 4),
-        "illumination": round(found.illumination, 3),
-        "objects": found.objects,
-        "tables": found.tables,
-    }
+    digits = {"accuracy_mean": 5, "accuracy_std_optics": 5, "accuracy_se_objects": 5, "accuracy_worst": 5}
+    digits |= {"clicks_mean": 4, "photons_mean": 4, "illumination": 3}
+    rounded = {name.removesuffix("_mean"): round(getattr(found, name), places) for name, places in digits.items()}
+    return rounded | {"objects": found.objects, "tables": found.tables}
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,8 +217,7 @@ def export_trained(
 def analyser_of(trained: Trained, task: Task, profile: Profile) -> Analyser:
     """Return the passive optics that `train` returned, for the exposure that it assumed."""
     encoder, options = trained.encoder, trained.options
-    if isinstance(encoder, ActiveIllumination):
-        raise ValueError("an active encoder shows patterns, it has no optics of its own")
+    assert not isinstance(encoder, ActiveIllumination), "it shows patterns, and has no optics of its own"
     matrix = encoder.matrix().detach().numpy()
     matrix.flags.writeable = False
     scale = full_scale_photoelectrons(task, options)

@@ -212,13 +212,8 @@ def new_encoder(n_inputs: int, profile: Profile, options: Options, random: torch
 
 def concentration(patterns: Tensor) -> Tensor:
     """Return the mean over patterns (patterns, pixels), none below 0, of the logarithm of their concentration."""
-    return concentrations(patterns).mean()
-
-
-def concentrations(patterns: Tensor) -> Tensor:
-    """Return the logarithm of the concentration of every pattern, (patterns,)."""
     squares, whole = patterns.square().sum(dim=1), patterns.sum(dim=1).square()
-    return torch.log(patterns.shape[1] * squares.clamp(min=FAINT) / whole.clamp(min=FAINT))
+    return torch.log(patterns.shape[1] * squares.clamp(min=FAINT) / whole.clamp(min=FAINT)).mean()
 
 
 def concentration_slope(patterns: Tensor) -> Tensor:

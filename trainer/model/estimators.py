@@ -25,7 +25,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from pans.runtime.instrument.click_law import CountLaw, outcome_weights
 
@@ -116,7 +116,7 @@ class Readings:
         """Return the mean of what the head is given, (n, d_f) from 0 to 1."""
         return (chances * self._values(chances)).sum(dim=-1)
 
-    def sample(self, chances: Tensor, random: torch.Generator) -> Tensor:
+    def sample(self, chances: Tensor, random: Generator) -> Tensor:
         """Return what the head is given of one exposure of each pattern, (n, d_f); its gradient is that of the mean."""
         uniform = torch.rand(chances.shape[:-1], generator=random, dtype=torch.float64)
         with torch.no_grad():
@@ -161,7 +161,7 @@ class Clicks(Readings):
     def mean(self, chances: Tensor) -> Tensor:
         return chances
 
-    def sample(self, chances: Tensor, random: torch.Generator) -> Tensor:
+    def sample(self, chances: Tensor, random: Generator) -> Tensor:
         return sample_clicks(chances, random)
 
     def word_chances(self, chances: Tensor) -> Tensor:
@@ -202,19 +202,15 @@ def outcome_chances(mu: Tensor, law: CountLaw) -> Tensor:
 
 # ---- estimators ----
 
-Estimator = Callable[[Tensor, Tensor, Head, LossOf, torch.Generator, Readings], Tensor]
+Estimator = Callable[[Tensor, Tensor, Head, LossOf, Generator, Readings], Tensor]
 
 
-def straight_through(
-    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, readings: Readings = CLICKS
-) -> Tensor:
+def ste(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Generator, readings: Readings) -> Tensor:
     """The paper's: the gradient of a sampled click is given to its probability, of a number to the mean."""
     return loss_of(head(readings.sample(p, random), None), target).mean()  # normalised by the clicks of the batch
 
 
-def exact(
-    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: torch.Generator, readings: Readings = CLICKS
-) -> Tensor:
+def exact(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: Generator, readings: Readings) -> Tensor:
     """All words, each once: no sampling noise in loss or gradient."""
     chances = readings.word_chances(p)
     return word_loss(chances, head(readings.words(p.shape[1]), readings.mean(p).mean(dim=0)), target, loss_of)
@@ -225,16 +221,12 @@ def word_loss(words: Tensor, scores: Tensor, target: Tensor, loss_of: LossOf) ->
     if not target.is_floating_point():  # the same as below, by a matrix product instead of n * words losses
         n_classes = scores.shape[1]
         of_class = torch.nn.functional.one_hot(target, n_classes).to(words.dtype)
-        losses = loss_of(
-            scores.unsqueeze(1), torch.arange(n_classes, device=words.device).unsqueeze(0)
-        )  # (words, classes)
+        losses = loss_of(scores.unsqueeze(1), torch.arange(n_classes, device=words.device)[None])  # (words, classes)
         return ((words.T @ of_class) * losses).sum() / len(words)
     return (words * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(words)
 
 
-def local_expectation(
-    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, readings: Readings = CLICKS
-) -> Tensor:
+def local(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Generator, readings: Readings) -> Tensor:
     """Every exposure with each of its readings, the others as sampled."""
     drawn, mean = readings.sample(p, random).detach(), readings.mean(p).mean(dim=0)
     loss = loss_of(head(drawn, mean), target)
@@ -247,9 +239,7 @@ def local_expectation(
     return loss.mean() + gradient_only(p, slope)
 
 
-def identity(
-    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, _readings: Readings | None = None
-) -> Tensor:
+def identity(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Generator, _readings: Readings) -> Tensor:
     """The gradient of a sampled click is given to the photoelectrons, as if d click / d lambda were 1.
 
     The click law behind damps by exp(-lambda), the chance of no click of a plain detector: divided by that beforehand.
@@ -259,9 +249,7 @@ def identity(
     return loss_of(head(clicks + (undamped - undamped.detach()), None), target).mean()
 
 
-def disarm(
-    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, _readings: Readings | None = None
-) -> Tensor:
+def disarm(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Generator, _readings: Readings) -> Tensor:
     """Two words from the same random numbers, one from u and one from 1 - u; only clicks that differ get a gradient."""
     uniform = torch.rand(p.shape, generator=random, dtype=torch.float64)
     first, second = (uniform < p).to(p.dtype), (1 - uniform < p).to(p.dtype)
@@ -273,12 +261,10 @@ def disarm(
     return 0.5 * (losses[0] + losses[1]).mean() + gradient_only(p, slope)
 
 
-def leave_one_out(
-    p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator, _readings: Readings | None = None
-) -> Tensor:
+def loo(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Generator, _readings: Readings) -> Tensor:
     """Score function times how much worse a sample is than the others."""
     mean = p.mean(dim=0)
-    drawn = [_draw(p, random) for _ in range(LOO_SAMPLES)]
+    drawn = [sample_clicks(p, random).detach() for _ in range(LOO_SAMPLES)]
     losses = torch.stack([loss_of(head(clicks, mean), target) for clicks in drawn])
     with torch.no_grad():
         excess = (losses - losses.mean(dim=0)) * (LOO_SAMPLES / (LOO_SAMPLES - 1))
@@ -287,21 +273,10 @@ def leave_one_out(
     return losses.mean() + gradient_only(p, slope)
 
 
-def _draw(p: Tensor, random: torch.Generator) -> Tensor:
-    return (torch.rand(p.shape, generator=random, dtype=torch.float64) < p).to(p.dtype)
-
-
 def gradient_only(p: Tensor, slope: Tensor) -> Tensor:
     """Return a scalar of value 0 whose gradient in p (n, ...) is `slope` / n."""
     weighted = (slope * p).sum() / len(p)
     return weighted - weighted.detach()
 
 
-ESTIMATORS: dict[str, Estimator] = {
-    "ste": straight_through,
-    "identity": identity,
-    "exact": exact,
-    "local": local_expectation,
-    "disarm": disarm,
-    "loo": leave_one_out,
-}
+ESTIMATORS: dict[str, Estimator] = {one.__name__: one for one in (ste, identity, exact, local, disarm, loo)}

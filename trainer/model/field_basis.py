@@ -27,7 +27,7 @@ def discriminant_basis(
     `fields` (n, pixels) are real amplitudes; each basis field is scaled to a mean square of 1 over all objects. With `turned` the
     moments are those of every object in all turns and reflections: for scenes without an up, and square images.
     """
-    side = _binning(image_shape)
+    side = max(1, math.ceil(math.sqrt(math.prod(image_shape) / INPUTS_MAX)))
     coarse = _binned(fields, image_shape, side).double()
     regular = RIDGE * torch.eye(coarse.shape[1], dtype=torch.float64)
     found = []
@@ -50,10 +50,7 @@ def turns(image_shape: tuple[int, int]) -> list[Tensor]:
 
     `image.flatten()[turns(shape)[0]]` is the image itself.
     """
-    height, width = image_shape
-    if height != width:
-        raise ValueError(f"images are {height} x {width}, allowed for turns: as high as wide")
-    pixels = torch.arange(height * width).reshape(height, width)
+    pixels = torch.arange(math.prod(image_shape)).reshape(image_shape)
     quarters = [torch.rot90(pixels, quarter) for quarter in range(4)]
     return [view.flatten() for quarter in quarters for view in (quarter, quarter.flip(1))]
 
@@ -71,10 +68,6 @@ def in_pixels(encoder: Encoder, basis: Tensor) -> CoherentField:
     with torch.no_grad():
         whole.weight.copy_(encoder.weight @ basis.T)
     return whole
-
-
-def _binning(image_shape: tuple[int, int]) -> int:
-    return max(1, math.ceil(math.sqrt(math.prod(image_shape) / INPUTS_MAX)))
 
 
 def _second_moment(rows: Tensor) -> Tensor:

@@ -25,16 +25,8 @@ def ssim(shown: Tensor, wanted: Tensor) -> Tensor:
 
     Differentiable in both; 1 for equal images. Use float64 where the last digits matter: the variances are differences.
     """
-    _check(shown, wanted)
-    values: Tensor = _Mean.apply(*_stacked(shown, wanted))
+    values: Tensor = _Mean.apply(*(images.reshape(-1, *shown.shape[-2:]) for images in (shown, wanted)))
     return values.reshape(shown.shape[:-2])
-
-
-def ssim_map(shown: Tensor, wanted: Tensor) -> Tensor:
-    """Return the SSIM of every pixel, the shape of the images (..., height, width)."""
-    _check(shown, wanted)
-    _, _, above, below = _terms(*_stacked(shown, wanted))
-    return (above[0] * above[1] / (below[0] * below[1])).reshape(shown.shape)
 
 
 class _Mean(torch.autograd.Function):
@@ -58,9 +50,8 @@ class _Mean(torch.autograd.Function):
         own = -2 * scale * values / power - 2 * of_square
 
         def through(image: Tensor, mean: Tensor, other: Tensor, other_mean: Tensor) -> Tensor:
-            by_mean, by_square, by_product = _blur(
-                torch.stack([cross * other_mean + own * mean, of_square, of_product])
-            )
+            by_mean = cross * other_mean + own * mean
+            by_mean, by_square, by_product = _blur(torch.stack([by_mean, of_square, of_product]))
             return by_mean + 2 * image * by_square + other * by_product
 
         wanted = ctx.needs_input_grad
@@ -76,19 +67,6 @@ def _terms(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor],
     both, power = mean_x * mean_y, mean_x**2 + mean_y**2
     above = 2 * both + C1, 2 * (product - both) + C2
     return mean_x, mean_y, above, (power + C1, square_x + square_y - power + C2)
-
-
-def _check(shown: Tensor, wanted: Tensor) -> None:
-    if shown.shape != wanted.shape or shown.dim() < 2 or 0 in shown.shape:
-        raise ValueError(
-            f"images are {tuple(shown.shape)} and {tuple(wanted.shape)}, allowed: equal (..., height, width)"
-        )
-    if not shown.dtype.is_floating_point or shown.dtype != wanted.dtype:
-        raise ValueError(f"images are {shown.dtype} and {wanted.dtype}, allowed: one floating-point type, in [0, 1]")
-
-
-def _stacked(shown: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
-    return shown.reshape(-1, *shown.shape[-2:]), wanted.reshape(-1, *wanted.shape[-2:])
 
 
 def _blur(images: Tensor) -> Tensor:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +32,6 @@ from .page import (
     finished,
     flat,
     interpolated,
-    kept,
     sampling_error,
 )
 from .printed import ACTIVE, DIRECT, SHOTS, ActiveRow, recipe
@@ -66,34 +64,22 @@ def make_row(asked: Asked, row: ActiveRow, seed: int = 0) -> Row:
     from pans.trainer.export.writer import export_trained
     from pans.trainer.train.loop import train
 
-    name, path, options = (
-        asked.name,
-        row_path(asked.cache, asked.name, row.features, seed),
-        options_of(asked.name, row, seed),
-    )
+    name, path = asked.name, row_path(asked.cache, asked.name, row.features, seed)
+    options = options_of(name, row, seed)
     bundle_path, checkpoint = path.with_suffix(".pans"), path.with_suffix(".checkpoint")
     check_cached_bundle(bundle_path)
     task, profile = load_task(name, asked.data_dir), load_profile(PROFILE)
-    seconds_path, resume, started = path.with_suffix(".seconds"), checkpoint.is_file(), time.process_time()
-    before = float(seconds_path.read_text()) if resume and seconds_path.is_file() else 0.0
 
     def said(epoch: Any) -> None:
-        replace_file(seconds_path, f"{before + time.process_time() - started:.1f}".encode())
         if epoch.epoch % 5 == 0:
             where = f"{name} d_f={row.features} run {epoch.restart} epoch {epoch.epoch} {epoch.stage}"
             asked.report(f"{where}: loss {epoch.loss:.3f}, {epoch.clicks:.2f} clicks, {epoch.photons:.1f} photons")
 
-    trained = train(task, profile, options, checkpoint=checkpoint, resume=resume, report=said)
-    seconds = before + time.process_time() - started
+    trained = train(task, profile, options, checkpoint=checkpoint, resume=checkpoint.is_file(), report=said)
     provenance = {"task_argument": name, "command": f"pans reproduce {name}", "options": plain_options(options)}
     title = f"{name}-{row.features}"
     exported = export_trained(bundle_path, trained, task, profile, name=title, provenance=provenance, force=True)
-    facts = {
-        "features": row.features,
-        "options": plain_options(options),
-        "sha256": exported.sha256,
-        "cpu_seconds": seconds,
-    }
+    facts: Row = {"features": row.features, "options": plain_options(options), "sha256": exported.sha256}
     figures = facts | measure_row(load_bundle(bundle_path)[0], task)
     replace_file(path, json.dumps(figures, indent=1).encode())
     checkpoint.unlink(missing_ok=True)
@@ -158,9 +144,8 @@ def row_beside(name: str, row: ActiveRow, trained: Rows) -> Rows:
     rows = [beside_paper(row, shots, first, trained) for shots in SHOTS]
     one = shot_figures(first)
     direct = {key: direct_at(name, one["photons"], key) for key in ("value", "error_objects")}
-    compared = against(
-        one["value"], direct["value"], one["error_objects"], spread(trained, "all", 1), direct["error_objects"]
-    )
+    errors = one["error_objects"], spread(trained, "all", 1), direct["error_objects"]
+    compared = against(one["value"], direct["value"], *errors)
     facts: Row = {"features": row.features, "direct": direct["value"], "trainings": len(trained)}
     rows.append({"table": "direct"} | one | facts | compared)
     for other in others:
@@ -232,13 +217,4 @@ def trained_rows(asked: Asked, name: str) -> list[TrainedRow]:
 
 def measured_on(asked: Asked, row: TrainedRow, facts: Row, make: Callable[[], Row]) -> Row | None:
     """Return what the page `asked.name` measured on `row` by the method that `facts` states; with `collect` None where it did not."""
-
-    def measured() -> Row:
-        asked.report(f"{asked.name}: measuring {row.name}, d_f = {row.features}")
-        return make()
-
-    path = asked.cache / f"{asked.name}-{row.name}-{row.features}.json"
-    found = kept(path, {"sha256": row.sha256, **facts}, measured, collect=asked.collect)
-    if found is None:
-        asked.report(f"{asked.name}: {row.name}, d_f = {row.features} is not measured yet")
-    return found
+    return asked.kept(f"{asked.name}-{row.name}-{row.features}", {"sha256": row.sha256, **facts}, make)

@@ -18,7 +18,7 @@ from pans.trainer.train.history import follow
 
 from . import plots
 from .active import PROFILE
-from .page import Asked, Made, Row, Rows, against, by_epoch, kept
+from .page import Asked, Made, Row, Rows, against, by_epoch
 from .passive import measure
 from .printed import ACTIVE, recipe
 
@@ -42,9 +42,10 @@ def options_of(features: int, alpha: float, schedule: str = SHORT) -> Options:
 
 
 def training(asked: Asked, features: int, alpha: float, schedule: str = SHORT) -> Row | None:
-    """Return one training: `epochs` (columns of history.EpochFigures) and `final`; None if it was not made."""
+    """Return one training: `epochs` (columns of history.Course) and `final`; None if it was not made."""
     options = options_of(features, alpha, schedule)
-    path = asked.cache / f"alpha-{features}-{alpha:g}{'' if schedule == SHORT else '-paper'}.json"
+    name = f"alpha-{features}-{alpha:g}{'' if schedule == SHORT else '-paper'}"
+    path = asked.cache / f"{name}.json"
     shown = (features, alpha, schedule) == (*SHOWN, SHORT)
     if shown and not path.with_suffix(".npz").is_file():
         path.unlink(missing_ok=True)  # figures without their patterns are half a part
@@ -54,11 +55,9 @@ def training(asked: Asked, features: int, alpha: float, schedule: str = SHORT) -
         course = follow(task, load_profile(PROFILE), options, patterns_after=STAGES if shown else ())
         if shown:
             _keep_patterns(path.with_suffix(".npz"), course.patterns)
-        return {"epochs": course.columns(), "final": measure(TASK, task, course.trained)}
+        return {"epochs": course.columns, "final": measure(TASK, task, course.trained)}
 
-    found = kept(path, differing_options(options), make, collect=asked.collect)
-    asked.report(f"d_f = {features}, alpha = {alpha:g}: {'not trained yet' if found is None else 'trained'}")
-    return found
+    return asked.kept(name, differing_options(options), make)
 
 
 def _keep_patterns(path: Path, patterns: dict[int, NDArray[np.float32]]) -> None:
@@ -69,8 +68,7 @@ def _keep_patterns(path: Path, patterns: dict[int, NDArray[np.float32]]) -> None
 
 def alpha_page(asked: Asked) -> Made:
     """Return one row per training, beside that without alpha, and their epochs."""
-    rows: Rows = []
-    epochs: Rows = []
+    rows, epochs = [], []
     for schedule, cells in CELLS.items():
         done: Rows = []
         for features, alpha in cells:

@@ -10,7 +10,6 @@ import importlib.resources
 import json
 import math
 import re
-import time
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -65,6 +64,24 @@ class Asked:
     def wants(self, features: int) -> bool:
         """Return whether the row of that many patterns was asked for."""
         return self.rows is None or features in self.rows
+
+    def kept(self, name: str, made_with: Row, make: Callable[[], Row]) -> Row | None:
+        """Return the part NAME.json of the cache if it was made with `made_with`, else what `make` returns, after writing it there.
+
+        With `collect` nothing is made: a missing part is reported, and None returned.
+        """
+        path, plain = self.cache / f"{name}.json", json.loads(json.dumps(made_with))
+        found = cached_row(path, "made_with")
+        if found is not None and found.get("made_with") == plain:
+            return found
+        if self.collect:
+            self.report(f"{self.name}: {name} is not measured yet")
+            return None
+        self.report(f"{self.name}: measuring {name}")
+        text = json.dumps({"made_with": plain, **make()})
+        replace_file(path, text.encode())
+        whole: Row = json.loads(text)  # a part just made and one read again are the same to the caller
+        return whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,25 +391,6 @@ def _put(folder: Path, page: Page, block: str) -> None:
 
 
 # ---- finished parts ----
-
-
-def kept(path: Path, made_with: Row, make: Callable[[], Row], *, collect: bool) -> Row | None:
-    """Return the part in `path` if it was made with `made_with`, else the part that `make` returns, after writing it there.
-
-    `cpu_seconds` (of this process) is added. With `collect` nothing is made: None.
-    """
-    plain = json.loads(json.dumps(made_with))
-    found = cached_row(path, "made_with")
-    if found is not None and found.get("made_with") == plain:
-        return found
-    if collect:
-        return None
-    started = time.process_time()
-    part = make()
-    text = json.dumps({"made_with": plain, "cpu_seconds": time.process_time() - started, **part})
-    replace_file(path, text.encode())
-    whole: Row = json.loads(text)  # a part just made and one read again are the same to the caller
-    return whole
 
 
 def finished(path: Path, options: Options) -> Row | None:

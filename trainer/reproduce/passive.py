@@ -8,9 +8,9 @@ measure. `barcode` is judged on all 1024 strings by their exact weights. The ima
 from __future__ import annotations
 
 import functools
+import io
 import json
-import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,11 @@ from pans.trainer.baselines.bayes import bayes
 from pans.trainer.baselines.common import measure as measure_frames
 from pans.trainer.baselines.common import run_trials
 from pans.trainer.evaluate.accuracy import row_of
-from pans.trainer.evaluate.picture_samples import first_of_each_class, keep_samples, read_samples, take_samples
 from pans.trainer.export.writer import analyser_of, export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.field_basis import discriminant_basis
+from pans.trainer.model.heads import Heads
 from pans.trainer.model.ssim import ssim
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks import barcode as task_barcode
@@ -56,12 +56,12 @@ from .page import (
     check_cached_bundle,
     finished,
     flat,
-    kept,
     sampling_error,
 )
 from .printed import PASSIVE, PassiveRow, recipe, recipe_facts
 
 TRIALS = 5
+SAMPLE_SEED = 2  # of pictures that are drawn: not the clicks that the table is made of
 SHOWN_CELLS = ((4, 0.01), (32, 0.01), (64, 0.01), (64, 0.05))  # the paper draws the last three
 SPECKLE_LEVELS = (10.0, 20.0, 30.0, 50.0, 100.0, 200.0, 300.0, 600.0, 1000.0)  # photons of direct imaging
 FIELD = "mmf-mnist-field"
@@ -179,32 +179,45 @@ def make_cell(asked: Asked, row: PassiveRow, dark: float) -> Row:
     name, options, profile = asked.name, recipe(asked.name, row, dark), load_profile(PROFILE)
     path = cell_path(asked.cache, name, row.features, dark, asked.data_seed)
     check_cached_bundle(path.with_suffix(".pans"))
-    task, started = load(name, asked.data_dir, asked.data_seed), time.process_time()
+    task = load(name, asked.data_dir, asked.data_seed)
     trained = _trained(name, task, options)
-    figures: Row = {"cpu_seconds": time.process_time() - started, "options": plain_options(options)}
-    figures |= measure(name, task, trained)
+    figures: Row = {"options": plain_options(options)} | measure(name, task, trained)
     if name == "barcode" and dark == 0:
         best = solve_patterns(options, profile, "balanced")[0][0]
         figures |= {"balanced": 100 * best.accuracy, "balanced_clicks": best.clicks}
     if task.target == "image":
         objects = first_of_each_class(task.test)
         p = click_probability(light_of(task, objects, trained), trained.law)
-        keep_samples(path.with_suffix(".npz"), take_samples(trained.head, p, objects))
+        archive = io.BytesIO()
+        np.savez_compressed(archive, **asdict(take_samples(trained.head, p, objects)))
+        replace_file(path.with_suffix(".npz"), archive.getvalue())
     if task.imaged is None:  # what a bundle looks at must be what the task shows
         command = f"pans reproduce {name} --rows {row.features} --dark {dark:g} --data-seed {asked.data_seed}"
-        provenance = {
-            "task_argument": recipe_facts(name).get("task", name),
-            "command": command,
-            "options": figures["options"],
-        }
-        title = f"{name}-{row.features}-dark{dark:g}"
-        bundle = export_trained(
-            path.with_suffix(".pans"), trained, task, profile, name=title, provenance=provenance, force=True
-        )
-        figures["sha256"] = bundle.sha256
+        facts = {"task_argument": recipe_facts(name).get("task", name), "command": command}
+        facts |= {"options": figures["options"]}
+        title, out = f"{name}-{row.features}-dark{dark:g}", path.with_suffix(".pans")
+        exported = export_trained(out, trained, task, profile, name=title, provenance=facts, force=True)
+        figures["sha256"] = exported.sha256
     asked.report(f"{name} d_f={row.features} dark={dark:g}: {figures['value']:.3f} at {figures['clicks']:.2f} clicks")
     replace_file(path, json.dumps(figures, indent=1).encode())
     return figures
+
+
+def first_of_each_class(objects: Objects) -> Objects:
+    """Return the first object of every class that there is, in the order of the classes: not the best ones."""
+    which = np.unique(objects.labels, return_index=True)[1]
+    behind = None if objects.behind is None else objects.behind[which]
+    return Objects(objects.images[which], objects.labels[which], behind)
+
+
+def take_samples(head: Heads, p: Tensor, objects: Objects) -> plots.Samples:
+    """Return pictures that a model gives back of `objects`, whose click probabilities are `p` (n, d_f)."""
+    random = torch.Generator().manual_seed(SAMPLE_SEED)
+    clicks = torch.stack([sample_clicks(p, random) for _ in range(plots.SAMPLES)], dim=1)
+    with torch.no_grad():
+        given_back = torch.stack([head(drawn.float()) for drawn in clicks.unbind(1)], dim=1).clamp(0, 1)
+    pixels = (255 * given_back).round().to(torch.uint8).unflatten(2, objects.pictures.shape[1:])
+    return plots.Samples(objects.pictures, objects.images, pixels.numpy(), clicks.sum(dim=2).long().numpy())
 
 
 def _trained(name: str, task: Task, options: Options) -> Trained:
@@ -219,7 +232,7 @@ def _trained(name: str, task: Task, options: Options) -> Trained:
 def beside_paper(name: str, row: PassiveRow, dark: float, figures: Row) -> Row:
     """Return a cell beside the paper's figure, whose sampling error is binomial; of SSIM it is as if its objects varied as much as ours."""
     table = PASSIVE[name]
-    found = {"table": name, "features": row.features, "dark": dark, "minutes": figures["cpu_seconds"] / 60} | figures
+    found = {"table": name, "features": row.features, "dark": dark} | figures
     if not row.values:
         return found
     paper = row.values[table.dark.index(dark)]
@@ -250,7 +263,8 @@ def passive_page(asked: Asked) -> Made:
             rows.append(beside_paper(name, row, dark, figures) | beside_direct(name, figures, dark, direct))
             if (row.features, dark) in SHOWN_CELLS and path.with_suffix(".npz").is_file():
                 title = f"d_f = {row.features}, dark {dark:g}\nSSIM {figures['value']:.3f}"
-                samples.append((title, read_samples(path.with_suffix(".npz"))))
+                with np.load(path.with_suffix(".npz"), allow_pickle=False) as archive:
+                    samples.append((title, plots.Samples(**archive)))
     pictures: dict[str, Draw] = {}
     if samples:
         pictures["-pictures"] = partial(plots.samples, name=name, cells=samples)
@@ -266,12 +280,11 @@ def speckle_rows(asked: Asked) -> Rows:
         return []
     rows = []
     for photons in SPECKLE_LEVELS:
-        path = asked.cache / f"mmf-mnist-direct-posterior-{photons:g}.json"
         made_with = {"way": "posterior", "photons": photons, "floor": FLOOR}
-        found = kept(path, made_with, partial(_speckle_figures, asked.data_dir, photons), collect=asked.collect)
+        make = partial(_speckle_figures, asked.data_dir, photons)
+        found = asked.kept(f"mmf-mnist-direct-posterior-{photons:g}", made_with, make)
         if found is not None:
             rows.append({key: value for key, value in found.items() if key != "made_with"} | {"table": "direct"})
-            asked.report(f"direct imaging of the speckle, {photons:g} photons: {found['value']:.2f} %")
     return rows
 
 
@@ -292,9 +305,8 @@ def beside_direct(name: str, figures: Row, dark: float, direct: Rows) -> Row:
         found |= against(figures["value"], there["value"], PRINTED, prefix="direct_")
         as_many = strings.at_clicks(figures["clicks"], dark)
         if as_many:
-            found |= {"clicks_there": as_many["value"]} | against(
-                figures["value"], as_many["value"], PRINTED, prefix="clicks_"
-            )
+            found["clicks_there"] = as_many["value"]
+            found |= against(figures["value"], as_many["value"], PRINTED, prefix="clicks_")
         return found
     return beside_curve(figures, direct, "photons", "direct_")
 
@@ -309,14 +321,14 @@ def field_page(asked: Asked) -> Made:
         if row.features > 32 or not asked.wants(row.features):  # those of the paper's figure
             continue
         options = recipe(FIELD, row)
-        path = asked.cache / f"{FIELD}-{row.features}.json"
-        found = kept(
-            path, {"options": plain_options(options)}, partial(_field_figures, asked, options), collect=asked.collect
-        )
-        if found is None:
-            asked.report(f"d_f = {row.features}: not trained yet (pans reproduce {FIELD} --rows {row.features})")
-            continue
-        rows.append(field_row(row, found, direct))
+
+        def figures(options: Options = options) -> Row:
+            task = load_task("mmf-mnist", asked.data_dir)
+            return measure(FIELD, task, train(task, load_profile(PROFILE), options))
+
+        found = asked.kept(f"{FIELD}-{row.features}", {"options": plain_options(options)}, figures)
+        if found is not None:
+            rows.append(field_row(row, found, direct))
     return Made(rows + direct)
 
 
@@ -327,8 +339,3 @@ def field_row(row: PassiveRow, found: Row, direct: Rows) -> Row:
         place = min(photons, SPECKLE_LEVELS[-1])  # more photons tell nothing more
         line |= beside_curve(found, direct, "photons", prefix, place)
     return line
-
-
-def _field_figures(asked: Asked, options: Options) -> Row:
-    task = load_task("mmf-mnist", asked.data_dir)
-    return measure(FIELD, task, train(task, load_profile(PROFILE), options))

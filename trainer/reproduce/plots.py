@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.trainer.evaluate.picture_samples import SAMPLES, Samples
 from pans.trainer.figures import new_figure, save_figure, use_files_alone
 
 from .page import FIRST_OBJECTS, Row, Rows, of_table
@@ -18,6 +18,7 @@ from .page import FIRST_OBJECTS, Row, Rows, of_table
 FRAME_TRIALS, PIPELINE_TRIALS = 5, 6
 SHAPES = {16: (4, 4), 32: (4, 8)}  # rows and columns of a frame of clicks
 CELL = 5  # points of a frame's cell, the gap between frames is one
+SAMPLES = 3  # pictures given back of an object
 CELLS = ("C0", "C1", "C2", "0.6")  # classes of cells in passing
 
 Image = NDArray[np.floating]
@@ -77,6 +78,16 @@ def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row) -> None:
 
 
 # ---- pictures given back ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """What was wanted and shown, uint8 (n, height, width), and what came back, uint8 (n, samples, height, width), of so many clicks."""
+
+    pictures: NDArray[np.uint8]
+    shown: NDArray[np.uint8]
+    given_back: NDArray[np.uint8]
+    clicks: NDArray[np.int64]  # (n, samples)
 
 
 def samples(path: Path, name: str, cells: list[tuple[str, Samples]]) -> None:

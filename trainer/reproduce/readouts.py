@@ -20,13 +20,19 @@ from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.bayes import log_joint
 from pans.trainer.baselines.common import detect, measure
 from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.evaluate.information import fisher, fisher_of_frames, posterior_information, word_information
+from pans.trainer.evaluate.information import (
+    fisher,
+    fisher_of_frames,
+    posterior_information,
+    word_information,
+    word_joint,
+)
 from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.tasks.registry import Task, load_task
 
 from . import plots
 from .curves import CLEAN, EXACT, curve_rows
-from .page import FIRST_OBJECTS, Asked, Draw, Made, Row, Rows, against, kept, sampling_error
+from .page import FIRST_OBJECTS, Asked, Draw, Made, Row, Rows, against, sampling_error
 from .trained import neighbours_agree
 
 PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5)  # of the page fig-2c
@@ -39,7 +45,6 @@ SHOWN = {1e6: 1, 1e3: 3, 1e2: 3, 1e1: 3}  # photons: frames drawn of each object
 MAPPED = (1e6, 1e2, 1e1)
 MAPPED_FRAMES = 600
 WAYS = ("camera frames", "clicks of ten patterns")
-_LEAST = 1e-9  # of a word's chance under a class
 
 F64 = NDArray[np.float64]
 
@@ -71,8 +76,7 @@ def information_page(asked: Asked) -> Made:
         if other is not None:
             errors = [sampling_error(one["value"], one["objects"]) for one in (row, other)]
             row |= against(row["value"], other["value"], *errors)
-    rows = frames + words
-    return Made(rows)
+    return Made(frames + words)
 
 
 def _information_of_frames(task: Task) -> Rows:
@@ -82,11 +86,8 @@ def _information_of_frames(task: Task) -> Rows:
     rows = []
     for photons, ratio in zip(PHOTONS, ratios):
         row: Row = {"table": "information", "way": WAYS[0], "photons": photons, "objects": FRAMES}
-        row |= {
-            "trace": ratio.trace,
-            "discriminant": ratio.discriminant,
-            "illumination": measurement.illumination(photons),
-        }
+        row |= {"trace": ratio.trace, "discriminant": ratio.discriminant}
+        row |= {"illumination": measurement.illumination(photons)}
         if photons <= POSTERIOR_MAX:
             lit = measurement.photoelectrons(measurement.test, photons)
             readouts = detect(lit, "counting", np.random.default_rng([0, 4]))
@@ -124,13 +125,11 @@ def maps_page(asked: Asked) -> Made:
     panels: Rows = []
     for photons in MAP_PHOTONS:
         for way, make in zip(WAYS, (_map_of_frames, _map_of_words)):
-            path = asked.cache / f"fig-2f-{'frames' if way == WAYS[0] else 'words'}-{photons:g}.json"
             made_with = {"objects": FRAMES, "photons": photons, "floor": FLOOR}
-            found = kept(path, made_with, partial(make, part, photons), collect=asked.collect)
-            if found is None:
-                asked.report(f"{way} at {photons:g} photons: not measured yet (pans reproduce fig-2f)")
-                continue
-            panels.append({"table": "maps", "way": way, "asked": photons, **found})
+            name = f"fig-2f-{'frames' if way == WAYS[0] else 'words'}-{photons:g}"
+            found = asked.kept(name, made_with, partial(make, part, photons))
+            if found is not None:
+                panels.append({"table": "maps", "way": way, "asked": photons, **found})
     for row in panels:
         other = next((each for each in panels if (each["way"], each["asked"]) == (WAYS[0], row["asked"])), row)
         if other is not row:
@@ -154,22 +153,10 @@ def _map_of_words(task: Task, photons: float) -> Row:
     law, (train, test) = ClickLaw(), shipped_light(task)
     eta = photons / float(test.sum(axis=1).mean())
     words = np.random.default_rng([0, 6]).random(test.shape) < click_probability(law, eta * test)
-    table = class_table(click_probability(law, eta * train), task.train.labels, len(task.classes))
-    decided = table[words @ (1 << np.arange(words.shape[1]))].argmax(axis=1)
+    known = word_joint(click_probability(law, eta * train), task.train.labels, len(task.classes))
+    decided = known[words @ (1 << np.arange(words.shape[1]))].argmax(axis=1)
     light = {"photons": eta * float(test.sum(axis=1).mean()), "illumination": eta * shipped_bundle().illumination()}
     return mapped(words.astype(np.float64), decided, task) | light
-
-
-def class_table(probability: F64, labels: NDArray[np.int64], n_classes: int) -> F64:
-    """Return log P(word, class), float64 (2**d_f, classes), of objects with click probabilities (n, d_f); bit i is pattern i."""
-    table = np.empty((1 << probability.shape[1], n_classes))
-    for label in range(n_classes):
-        mine = probability[labels == label]
-        chance = np.ones((len(mine), 1))
-        for column in mine.T[:, :, None]:
-            chance = np.concatenate([chance * (1 - column), chance * column], axis=1)
-        table[:, label] = chance.sum(axis=0) / len(labels)
-    return np.log(table + _LEAST)
 
 
 def mapped(readouts: F64, decided: NDArray[np.integer], task: Task, seed: int = 0) -> Row:
@@ -199,8 +186,7 @@ def frames_page(asked: Asked) -> Made:
     maps = {}
     for photons in MAPPED:
         made_with = {"objects": MAPPED_FRAMES, "photons": photons, "floor": FLOOR, "flat": True}
-        path = asked.cache / f"direct-frames-{photons:g}.json"
-        found = kept(path, made_with, partial(_map_of_frames, part, photons), collect=asked.collect)
+        found = asked.kept(f"direct-frames-{photons:g}", made_with, partial(_map_of_frames, part, photons))
         if found is not None:
             maps[photons] = found
     curves = curve_rows(replace(asked, collect=True), "fig-2e")
@@ -211,14 +197,10 @@ def frames_page(asked: Asked) -> Made:
             row |= {f"map_{key}": maps[photons][key] for key in ("neighbours", "value", "error_objects", "clicks")}
         for name, way in (("network", CLEAN), ("posterior", EXACT)):
             at = next((each for each in curves if (each["way"], each["level"]) == (way, photons)), {})
-            row |= {
-                f"{name}_{key}": at[key]
-                for key in ("value", "spread_trials", "error_objects", "first_200", "clicks")
-                if key in at
-            }
-        row["clicks"] = next(
-            (row[f"{of}_clicks"] for of in ("posterior", "network", "map") if f"{of}_clicks" in row), None
-        )
+            keys = ("value", "spread_trials", "error_objects", "first_200", "clicks")
+            row |= {f"{name}_{key}": at[key] for key in keys if key in at}
+        known = [f"{of}_clicks" for of in ("posterior", "network", "map") if f"{of}_clicks" in row]
+        row["clicks"] = row[known[0]] if known else None
         rows.append(row)
     pictures: dict[str, Draw] = {"": partial(plots.frames, classes=task.classes, shown=drawn_frames(task))}
     if maps:

@@ -24,7 +24,7 @@ from pans.trainer.train.loop import Trained, train
 
 from . import plots
 from .active import PROFILE
-from .page import Asked, Made, Row, Rows, kept
+from .page import Asked, Made, Row, Rows
 from .passive import light_of
 from .printed import recipe_facts
 
@@ -47,9 +47,7 @@ F64 = NDArray[np.float64]
 
 
 def frame(above: U8, cell: U8, below: U8, offset: int) -> U8:
-    """Return the window on three fields one below the other, (side, side), whose middle is `offset` rows below that of `cell`."""
-    if abs(offset) > SIDE_PX:
-        raise ValueError(f"offset is {offset} rows, allowed: -{SIDE_PX} to {SIDE_PX}")
+    """Return the window on three fields one below the other, (side, side), whose middle is `offset` rows (+-100) below that of `cell`."""
     start = SIDE_PX + offset
     return np.concatenate([above, cell, below])[start : start + SIDE_PX]
 
@@ -97,15 +95,10 @@ def _parts(part: Objects) -> tuple[U8, I64, U8]:
 
 def sequence_page(asked: Asked) -> Made:
     """Return one row per way to judge: single frames and whole passages. The pictures show a sequence of cells."""
-    made_with = {
-        "options": differing_options(OPTIONS),
-        "cells": [TRAINED, JUDGED, SHOWN],
-        "rows": [NEAR_PX, FAR_PX, STEP_PX],
-        "tables": 2,
-    }
-    found = kept(asked.cache / "sequence.json", made_with, partial(_measured, asked), collect=asked.collect)
+    made_with: Row = {"options": differing_options(OPTIONS), "cells": [TRAINED, JUDGED, SHOWN]}
+    made_with |= {"rows": [NEAR_PX, FAR_PX, STEP_PX], "tables": 2}
+    found = asked.kept("sequence", made_with, _measured)
     if found is None:
-        asked.report("sequence: not measured yet (pans reproduce sequence)")
         return Made([])
     strip = partial(plots.sequence, found=found, margin=SIDE_PX / (2 * STEP_PX))
     drawn = partial(
@@ -114,7 +107,7 @@ def sequence_page(asked: Asked) -> Made:
     return Made(found["rows"], {"": strip, "-patterns": drawn})
 
 
-def _measured(asked: Asked) -> Row:
+def _measured() -> Row:
     wanted = (("train", 4 * TRAINED), ("test", 4 * (JUDGED // NULL)))
     train_part, test_part = (Objects(*draw(0, part, count)) for part, count in wanted)
     whole = Task("cells", CLASSES, train_part, test_part, "0" * 64, "other cells of the generator")
@@ -132,13 +125,11 @@ def _of_frames(task: Task, trained: Trained) -> Rows:
     light, decided = light_of(task, task.test, trained), _log_outputs(trained).argmax(axis=1)
     p, labels = click_probability(light, trained.law), task.test.labels
     right = (word_probabilities(p).numpy() * (decided[None, :] == labels[:, None])).sum(axis=1)
-    parts = {
-        "one frame, cell in the middle": labels != NULL,
-        "one frame, cell out": labels == NULL,
-        "one frame, all": labels >= 0,
-    }
+    parts = {"cell in the middle": labels != NULL, "cell out": labels == NULL, "all": labels >= 0}
     clicks, photons = p.sum(dim=1).numpy(), light.sum(dim=1).numpy()
-    return [_figures(way, right[mine], clicks[mine], photons[mine], trained) for way, mine in parts.items()]
+    return [
+        _figures(f"one frame, {way}", right[mine], clicks[mine], photons[mine], trained) for way, mine in parts.items()
+    ]
 
 
 def _of_passages(task: Task, whole: Task, trained: Trained) -> Row:
@@ -153,7 +144,10 @@ def _of_passages(task: Task, whole: Task, trained: Trained) -> Row:
     light, words = _shots(task, np.stack(frames), trained, seed=2)
     sums = _log_outputs(trained)[words].reshape(len(cells), len(offsets), -1).sum(axis=1)
     right = (sums[:, :NULL].argmax(axis=1) == labels).astype(np.float64)
-    clicks, photons = (each.sum(axis=1).reshape(len(cells), -1).sum(axis=1) for each in (_bits(words), light))
+    clicks, photons = (
+        each.sum(axis=1).reshape(len(cells), -1).sum(axis=1)
+        for each in (words[:, None] >> np.arange(FEATURES) & 1, light)
+    )
     return _figures(
         f"a passage, evidence of {len(offsets)} frames added", right, clicks, photons, trained, len(offsets)
     )
@@ -169,9 +163,7 @@ def _sequence(task: Task, whole: Task, trained: Trained) -> Row:
     strip = np.concatenate(fields)
     starts = range(0, len(strip) - SIDE_PX + 1, STEP_PX)
     _, words = _shots(task, np.stack([strip[s : s + SIDE_PX] for s in starts]), trained, seed=3)
-    middles = np.array(
-        [(2 * place + 1) * SIDE_PX for place in range(len(order))]
-    )  # first row of the window on that cell
+    middles = np.array([(2 * place + 1) * SIDE_PX for place in range(len(order))])  # first row of a cell's own window
     nearest = np.abs(np.array(starts)[:, None] - middles).argmin(axis=1).tolist()
     return {
         "words": words.tolist(),
@@ -195,19 +187,10 @@ def _log_outputs(trained: Trained) -> F64:
     return torch.log_softmax(scores, dim=1).numpy()
 
 
-def _bits(words: I64) -> I64:
-    return np.asarray(words[:, None] >> np.arange(FEATURES) & 1)
-
-
 def _figures(way: str, right: F64, clicks: Any, photons: Any, trained: Trained, frames: int = 1) -> Row:
     with torch.no_grad():
         illumination = frames * float(trained.encoder.illumination())
     error = 100 * float(right.std(ddof=1)) / len(right) ** 0.5
-    found: Row = {
-        "table": "frames",
-        "way": way,
-        "value": 100 * float(right.mean()),
-        "error_objects": error,
-        "objects": len(right),
-    }
+    found: Row = {"table": "frames", "way": way, "value": 100 * float(right.mean())}
+    found |= {"error_objects": error, "objects": len(right)}
     return found | {"clicks": float(clicks.mean()), "photons": float(photons.mean()), "illumination": illumination}

@@ -13,13 +13,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate.accuracy import (
-    EXACT_OUTCOMES_MAX,
-    Light,
-    decision_shares,
-    light_of,
-    sampled_shares,
-)
+from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Light, decision_shares, light_of, sampled_shares
 from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.tasks.registry import Objects, load_task
 
@@ -117,12 +111,6 @@ def duels(points: Rows) -> Rows:
 # ---- light and dark counts ----
 
 
-def measure_setting(bundle: Bundle, test: Objects, sweep: str, setting: float) -> Row:
-    """Return the figures of `bundle` at that factor of the light (`eta`), or with that many dark counts per exposure (`dark`)."""
-    how: dict[str, Any] = {sweep: setting}
-    return {"setting": setting, **{part: judged(bundle, test.first(count), **how) for part, count in PARTS.items()}}
-
-
 def swept_page(asked: Asked) -> Made:
     """Return one row per number of patterns as trained, with the effect of the sweep, and one per setting."""
     sweep = "dark" if asked.name == "dark-counts" else "eta"
@@ -133,9 +121,8 @@ def swept_page(asked: Asked) -> Made:
         if made is not None:
             swept = [flat(found["all"], found["first_200"]) | {"setting": found["setting"]} for found in made["rows"]]
             base, of_row = shot_figures(row.figures), {"features": row.features}
-            trained.append(
-                {"table": "trained"} | of_row | base | (over_light if sweep == "eta" else over_dark)(base, swept)
-            )
+            effect = over_light(swept) if sweep == "eta" else over_dark(base, swept)
+            trained.append({"table": "trained"} | of_row | base | effect)
             for found in swept:
                 shown = any(math.isclose(found["setting"], setting) for setting in SHOWN)
                 rows.append({"table": "swept", "shown": shown} | of_row | found)
@@ -143,8 +130,13 @@ def swept_page(asked: Asked) -> Made:
 
 
 def _all_settings(row: TrainedRow, data_dir: str | None, sweep: str) -> Row:
-    test = load_task(SWEPT, data_dir).test
-    return {"rows": [measure_setting(row.bundle, test, sweep, setting) for setting in SETTINGS[sweep]]}
+    """The figures at every factor of the light (`eta`), or with that many dark counts per exposure (`dark`)."""
+    test, rows = load_task(SWEPT, data_dir).test, []
+    for setting in SETTINGS[sweep]:
+        how: dict[str, Any] = {sweep: setting}
+        parts = {part: judged(row.bundle, test.first(count), **how) for part, count in PARTS.items()}
+        rows.append({"setting": setting, **parts})
+    return {"rows": rows}
 
 
 def _at(swept: Rows, setting: float) -> float:
@@ -152,17 +144,13 @@ def _at(swept: Rows, setting: float) -> float:
     return float(min(swept, key=lambda row: abs(float(row["setting"]) - setting))["value"])
 
 
-def over_light(_base: Row, swept: Rows) -> Row:
+def over_light(swept: Rows) -> Row:
     """Return the best factor of the light, its gain over the trained light, and the range within `LEVEL` points of the best."""
     top = max(swept, key=lambda row: float(row["value"]))
     level = [row["setting"] for row in swept if row["value"] >= top["value"] - LEVEL]
     changes = {"at_third": _at(swept, 10**-0.5) - _at(swept, 1.0), "at_tenth": _at(swept, 0.1) - _at(swept, 1.0)}
-    return {
-        "best": top["setting"],
-        "gain": top["value"] - _at(swept, 1.0),
-        "low": level[0],
-        "high": level[-1],
-    } | changes
+    best = {"best": top["setting"], "gain": top["value"] - _at(swept, 1.0)}
+    return best | {"low": level[0], "high": level[-1]} | changes
 
 
 def over_dark(base: Row, swept: Rows) -> Row:
@@ -234,23 +222,16 @@ def neighbours_agree(points: NDArray[np.floating], labels: I64, count: int = NEI
 def single_shot_page(asked: Asked) -> Made:
     """Return one row per number of patterns, and one per first test image of every class."""
     rows, images, shown = [], [], []
-    facts = {
-        "trials": [SHOWN_TRIALS, SAMPLED_TRIALS],
-        "mapped": MAPPED,
-        "neighbours": NEIGHBOURS,
-        "uncertain": UNCERTAIN,
-    }
+    facts: Row = {"trials": [SHOWN_TRIALS, SAMPLED_TRIALS], "mapped": MAPPED, "neighbours": NEIGHBOURS}
+    facts |= {"uncertain": UNCERTAIN}
     for row in trained_rows(asked, SWEPT):
-        made = None
-        if row.features in SHOT_FEATURES:
-            made = measured_on(asked, row, facts, partial(_single_shots, row, asked.data_dir))
+        wanted = row.features in SHOT_FEATURES
+        made = measured_on(asked, row, facts, partial(_single_shots, row, asked.data_dir)) if wanted else None
         if made is not None:
             of_row = {"features": row.features}
-            uncertain = {"uncertain": 100 * made["differing"]["uncertain"]}
-            near = {f"near_{key}": 100 * value for key, value in made["near"].items()}
-            rows.append(
-                {"table": "varying"} | of_row | shot_figures(row.figures) | made["differing"] | near | uncertain
-            )
+            varying = {"table": "varying"} | of_row | shot_figures(row.figures) | made["differing"]
+            varying |= {f"near_{key}": 100 * value for key, value in made["near"].items()}
+            rows.append(varying | {"uncertain": 100 * made["differing"]["uncertain"]})
             for one in made["objects"]:
                 named = row.features == PIPELINE[1]  # the table names the images of the paper's example
                 images.append({"table": "images", "shown": named} | of_row | one | _decided(one, made["classes"]))
@@ -327,12 +308,8 @@ def differing(probability: F64, labels: I64) -> dict[str, float]:
     between = between + between.T
     uncertain = ((probability > UNCERTAIN[0]) & (probability < UNCERTAIN[1])).mean()
     others = float(between[~np.eye(len(sizes), dtype=bool)].mean())
-    return {
-        "uncertain": float(uncertain),
-        "object": float(own.mean()),
-        "class": float(np.mean(within)),
-        "others": others,
-    }
+    pairs = {"object": float(own.mean()), "class": float(np.mean(within)), "others": others}
+    return {"uncertain": float(uncertain)} | pairs
 
 
 def _decided(one: Row, classes: list[str]) -> Row:

@@ -22,7 +22,7 @@ from pans.trainer.options import AutomatonOptions, BaselineOptions, Options
 from pans.trainer.tasks.registry import Task, load_task
 
 from .active import PROFILE
-from .page import FIRST_OBJECTS, Asked, Row, Rows, check_cached_bundle, flat, kept, read_toml
+from .page import FIRST_OBJECTS, Asked, Row, Rows, check_cached_bundle, flat, read_toml
 
 WAYS: list[Row] = read_toml("ways.toml")["way"]
 
@@ -79,26 +79,23 @@ def measured_points(asked: Asked, page: str, seeds: int = 1) -> Rows:
             if features is not None and not asked.wants(features):
                 continue
             found = point_row(asked, point, seed)
-            if found is None:
-                asked.report(
-                    f"{page}: {point.task}, {point.way}, {point.level:g}, seed {seed}: not measured yet, or out of reach"
-                )
-            else:
+            if found is not None:
                 rows.append({"task": point.task, "way": point.way, "level": point.level} | found)
     return rows
 
 
 def point_row(asked: Asked, point: Point, seed: int) -> Row | None:
     """Return the flat figures of a point from one seed, from the cache or measured now; None where it is missing or out of reach."""
-    if (
-        point.kind == "baseline"
-    ):  # all levels of the same options at once: what is trained or drawn for them is the same
-        path = asked.cache / f"{replace(point, level=point.levels[0]).stem}-seed{seed}.json"
-        made_with = point.made_with(seed) | {"levels": point.levels}
-        found = kept(path, made_with, partial(_baseline, asked, point, seed), collect=asked.collect)
+    made_with = point.made_with(seed)
+    if point.kind == "baseline":  # all levels of the same options at once: they share what is trained or drawn
+        name, made_with = (
+            f"{replace(point, level=point.levels[0]).stem}-seed{seed}",
+            made_with | {"levels": point.levels},
+        )
+        found = asked.kept(name, made_with, partial(_baseline, asked, point, seed))
         return None if found is None else found["rows"].get(f"{point.level:g}")
     make = partial({"fixed": _fixed, "automaton": _automaton}[point.kind], asked, point, seed)
-    return kept(asked.cache / f"{point.stem}-seed{seed}.json", point.made_with(seed), make, collect=asked.collect)
+    return asked.kept(f"{point.stem}-seed{seed}", made_with, make)
 
 
 @functools.lru_cache(maxsize=1)  # the points of a task share it
@@ -108,9 +105,8 @@ def _task(name: str, data_dir: str | None) -> Task:
 
 def _baseline(asked: Asked, point: Point, seed: int) -> Row:
     options = BaselineOptions(**dict(point.options), seed=seed)
-    exposures = {"fsi": 1, "hadamard": 2}.get(
-        options.paradigm, 0
-    ) * options.features or 1  # one per mask, two per pair, one frame
+    per_feature = {"fsi": 1, "hadamard": 2}.get(options.paradigm, 0)  # one per mask, two per pair, one frame
+    exposures = per_feature * options.features or 1
     facts = {"exposures": exposures, "features": options.features}
     rows = baseline_rows(_task(point.task, asked.data_dir), options, point.levels, silent)
     return {"rows": {f"{row['photons_asked']:g}": flat(row, row["first_200"]) | facts for row in rows}}
@@ -137,14 +133,12 @@ def _automaton(asked: Asked, point: Point, seed: int) -> Row:
 def trained_automaton(asked: Asked, point: Point, seed: int) -> Path:
     """Return where the automaton of a point is, trained now unless one of the same recipe is there; the one it starts from comes first."""
     from pans.trainer.adaptive.train import train_automaton
+    from pans.trainer.adaptive.tune import Progress
     from pans.trainer.device import keep_freed_memory
     from pans.trainer.export.automaton import export_automaton
 
-    path, task, profile = (
-        asked.cache / f"{point.stem}-seed{seed}.pans",
-        _task(point.task, asked.data_dir),
-        load_profile(PROFILE),
-    )
+    path = asked.cache / f"{point.stem}-seed{seed}.pans"
+    task, profile = _task(point.task, asked.data_dir), load_profile(PROFILE)
     start = None if point.start is None else load_bundle(trained_automaton(asked, point.start, seed))
     options = AutomatonOptions(seed=point.training_seed(seed), **dict(point.options))
     if start is None:
@@ -158,15 +152,18 @@ def trained_automaton(asked: Asked, point: Point, seed: int) -> Path:
     check_cached_bundle(path)
     keep_freed_memory()
     checkpoint = path.with_suffix(".checkpoint")
+
+    def report(at: Progress) -> None:
+        if at.done % 8 == 0:
+            asked.report(f"{path.stem}: {at.stage}, {at.done} of {at.steps}")
+
     trained = train_automaton(
         task,
         profile,
         options,
         checkpoint=checkpoint,
         resume=checkpoint.is_file(),
-        report=lambda at: (
-            asked.report(f"{path.stem}: {at.stage}, {at.done} of {at.steps}") if at.done % 8 == 0 else None
-        ),
+        report=report,
         teacher=asked.cache / f"frontier-{task.name}-soft-targets.npz",  # of all seeds
         start=None if start is None else start[0],
     )

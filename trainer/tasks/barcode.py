@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .draw import PARTS, Labels, random_stream
+from .draw import Labels, random_stream
 
 N_BARS = 10
 CLASSES = ("without 1010", "with 1010")
@@ -50,11 +50,9 @@ def weights(prior: str = "uniform") -> NDArray[np.float64]:
     return 0.5 * share / share.sum() + 0.5 * (labels == 0) / (labels == 0).sum()
 
 
-def draw(seed: int, part: str, n: int, prior: str = "uniform") -> tuple[NDArray[np.uint8], Labels]:
+def draw(seed: int, part: str, n: int) -> tuple[NDArray[np.uint8], Labels]:
     """Return `n` strings drawn with replacement, uint8 (n, 1, 10) of 0 and 255, and int64 (n,) (OUR sampling)."""
-    if part not in PARTS:
-        raise ValueError(f"part {part!r}, allowed: {', '.join(PARTS)}")
     bars, labels = all_strings()
-    chosen = np.searchsorted(np.cumsum(weights(prior)), random_stream(seed, f"barcode-{prior}", part, 0).random(n))
+    chosen = np.searchsorted(np.cumsum(weights()), random_stream(seed, "barcode-uniform", part, 0).random(n))
     chosen = np.minimum(chosen, len(bars) - 1)
     return (bars[chosen] * np.uint8(255))[:, None, :], labels[chosen]

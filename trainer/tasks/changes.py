@@ -26,11 +26,10 @@ SHEAR = 0.08
 SHIFT = 0.018  # of the side
 DISPLACEMENT = 0.021  # of the side, standard deviation at the knots
 KNOTS = 5  # per side, of the random displacement
-CHUNK = 2000
+CHUNK = 2000  # images changed together
 
 Imaged = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 SHIFT_STREAM = 0x5417  # with the seed, so that no other draw is repeated
-VARIED_AT_ONCE = 2000  # images changed together
 
 
 def with_copies(objects: Objects, kept: int, copies: int, seed: int, imaged: Imaged | None = None) -> Objects:
@@ -77,9 +76,15 @@ def _distorted(images: NDArray[np.uint8], random: np.random.Generator, strength:
         for most in (TURN_RAD, STRETCH, STRETCH, SHEAR, 2 * SHIFT, 2 * SHIFT)  # the grid runs from -1 to 1
     )
     rows = (1 + along) * turn.cos(), shear - turn.sin(), x, turn.sin(), (1 + across) * turn.cos(), y
+    return _seen(images, rows, strength**2 * displacements(random, n, (height, width), DISPLACEMENT))
+
+
+def _seen(images: NDArray[np.uint8], rows: tuple[Tensor, ...], bent: Tensor | None) -> NDArray[np.uint8]:
+    """The images on an affine grid, its six numbers (n,) each, with displacements added."""
+    n, height, width = images.shape
     grid = affine_grid(torch.stack(rows, dim=1).unflatten(1, (2, 3)), [n, 1, height, width], align_corners=False)
-    grid = grid + strength**2 * displacements(random, n, (height, width), DISPLACEMENT)
     shown = torch.from_numpy(images.astype(np.float32)).unsqueeze(1)
+    grid = grid if bent is None else grid + bent
     moved = grid_sample(shown, grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
     return moved.round().clamp(0, 255).to(torch.uint8).numpy()
 
@@ -97,18 +102,11 @@ def shifted(objects: Objects, along_px: int, across_px: int, seed: int) -> Objec
     random = np.random.default_rng([SHIFT_STREAM, seed])
     along = random.integers(-along_px, along_px + 1, len(objects))
     across = random.integers(-across_px, across_px + 1, len(objects))
-    images = np.zeros_like(objects.images)
-    for image, source, x, y in zip(images, objects.images, along.tolist(), across.tolist()):
-        _move(source, image, x, y)
-    return Objects(images, objects.labels)
-
-
-def _move(source: NDArray[np.uint8], image: NDArray[np.uint8], x: int, y: int) -> None:
-    height, width = source.shape
-    if abs(x) < width and abs(y) < height:
-        image[max(0, y) : height + min(0, y), max(0, x) : width + min(0, x)] = source[
-            max(0, -y) : height - max(0, y), max(0, -x) : width - max(0, x)
-        ]
+    n, height, width = objects.images.shape
+    y, x = np.arange(height) - across[:, None], np.arange(width) - along[:, None]  # where a pixel was before
+    inside = ((y >= 0) & (y < height))[:, :, None] & ((x >= 0) & (x < width))[:, None, :]
+    which, y, x = np.arange(n)[:, None, None], y.clip(0, height - 1)[:, :, None], x.clip(0, width - 1)[:, None, :]
+    return Objects(objects.images[which, y, x] * inside, objects.labels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,10 +137,7 @@ class Variation:
 def varied(images: NDArray[np.uint8], variation: Variation, seed: list[int]) -> NDArray[np.uint8]:
     """Return every image (n, height, width) changed in its own way; the same for the same seed."""
     random = np.random.default_rng(seed)
-    parts = [
-        _varied(images[first : first + VARIED_AT_ONCE], variation, random)
-        for first in range(0, len(images), VARIED_AT_ONCE)
-    ]
+    parts = [_varied(images[first : first + CHUNK], variation, random) for first in range(0, len(images), CHUNK)]
     return np.concatenate(parts)
 
 
@@ -157,20 +152,9 @@ def _varied(images: NDArray[np.uint8], how: Variation, random: np.random.Generat
     mirrors = [torch.sign(drawn(1.0)) if on else torch.ones(n) for on in (how.mirror_x, how.mirror_y)]
     along, across = (mirror * torch.exp(size + more) for mirror, more in zip(mirrors, (stretch, -stretch)))
     tall = height / width  # a turn is one of pixels, not of the grid
-    rows = (
-        along * turn.cos(),
-        -along * tall * turn.sin(),
-        move_x,
-        across * turn.sin() / tall,
-        across * turn.cos(),
-        move_y,
-    )
-    grid = affine_grid(torch.stack(rows, dim=1).unflatten(1, (2, 3)), [n, 1, height, width], align_corners=False)
-    if how.bend:
-        grid = grid + displacements(random, n, (height, width), how.bend)
-    shown = torch.from_numpy(images.astype(np.float32)).unsqueeze(1)
-    moved = grid_sample(shown, grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
-    return moved.round().clamp(0, 255).to(torch.uint8).numpy()
+    first = along * turn.cos(), -along * tall * turn.sin(), move_x
+    second = across * turn.sin() / tall, across * turn.cos(), move_y
+    return _seen(images, (*first, *second), displacements(random, n, (height, width), how.bend) if how.bend else None)
 
 
 def enlarged(task: Task, variation: Variation, wanted: int, kept: int, seed: int) -> Task:

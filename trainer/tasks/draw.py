@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 CHUNK = 60  # objects drawn together; a multiple of 2, 3, 4, 5 and 6 classes, so that every chunk is balanced, and small
 # enough for its images to stay in the cache
-PARTS = ("train", "test")
 
 Floats = NDArray[np.floating[Any]]  # float32 throughout
 Labels = NDArray[np.int64]
@@ -36,24 +35,17 @@ def draw_objects(
     seed: int, name: str, part: str, n: int, n_classes: int, draw_chunk: DrawChunk
 ) -> tuple[NDArray[np.uint8], Labels]:
     """Return `n` labelled images, uint8 (n, height, width) and int64 (n,), classes in equal shares and random order."""
-    if n < 1 or part not in PARTS:
-        raise ValueError(f"{n} objects of part {part!r} of {name}, allowed: one or more, of {' or '.join(PARTS)}")
 
     def one(chunk: int) -> tuple[NDArray[np.uint8], Labels]:
         rng = random_stream(seed, name, part, chunk)
         labels = rng.permutation(np.arange(CHUNK, dtype=np.int64) % n_classes)
         return draw_chunk(rng, labels), labels
 
-    with ThreadPoolExecutor(
-        _n_threads()
-    ) as pool:  # numpy leaves the interpreter free; the streams do not depend on order
+    allowed = os.environ.get("OMP_NUM_THREADS", "")
+    threads = int(allowed) if allowed.isdigit() and int(allowed) > 0 else os.cpu_count() or 1
+    with ThreadPoolExecutor(threads) as pool:  # numpy leaves the interpreter free; the streams do not depend on order
         chunks = list(pool.map(one, range(-(-n // CHUNK))))
     return np.concatenate([images for images, _ in chunks])[:n], np.concatenate([labels for _, labels in chunks])[:n]
-
-
-def _n_threads() -> int:
-    allowed = os.environ.get("OMP_NUM_THREADS", "")
-    return int(allowed) if allowed.isdigit() and int(allowed) > 0 else os.cpu_count() or 1
 
 
 def uniform(rng: np.random.Generator, low: float, high: float, *shape: int) -> Floats:

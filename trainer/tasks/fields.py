@@ -8,7 +8,6 @@
 Both: place within +-2 px, any orientation, 2 to 8 field stars (3 to 12 % of the light), sky, seeing and noise; the mean intensity is drawn
 over a factor of 2.25 without regard to the class. The flat phase across the field is the paper's assumption (a compact, quasi-monochromatic
 source): real nebulae are incoherent, and for them the incoherent encoder on the square of these amplitudes is the physical one.
-The paper (appendix "Compact nebula classification"): synthetic, 64 x 64, 4000 training and 1000 test images per class.
 
 `fiber`: is the end face of an optical fibre clean or contaminated?
 
@@ -20,8 +19,7 @@ elliptical, with surface roughness and detector noise. On a contaminated end fac
 - scratch: a straight line (sigma 0.8 to 1.4 px, 16 to 40 px long) that takes 0.4 to 0.8 of the amplitude.
 
 The power at the tap varies by a factor of 2 without regard to the class. Defects also shadow 10 to 35 % of the light; that is taken out, as
-behind a levelled source, or brightness alone would tell. The paper (appendix "Fiber end-face inspection") calls it a toy model: 64 x 64,
-4000 training and 1000 test images.
+behind a levelled source, or brightness alone would tell. The paper calls it a toy model.
 
 `tissue`: is tissue perfused? Laser speckle blurs where blood flows.
 
@@ -33,8 +31,7 @@ share s of static light and the rest averaged over M independent patterns, I = s
 
 Both: uneven light and absorption (smooth, sigma 14 px, +-20 %), brightness over a factor of 2.5 in both classes alike. No pixel and no
 linear sum of intensities differs in mean: the classes differ only in their fluctuation. An exposure that averages over flow is no single
-coherent field: an intensity mask before a bucket detector is exact, so the incoherent encoder is the physical default. The paper
-(appendix "Tissue blood flow detection": synthetic, 64 x 64, 4000 training and 1000 test images per class) takes a coherent encoder.
+coherent field: an intensity mask before a bucket detector is exact, so the incoherent encoder is the physical default.
 
 `transient`: is there a small, fleeting object in a coherently lit scene?
 
@@ -42,7 +39,7 @@ The background is a bright field that varies slowly in space (sigma of the uneve
 one frame to the next: +-30 %), with fine noise (0.012 of full scale). An event is one compact object (sigma 2 to 3 px) anywhere inside
 the inner 40 x 40 pixels, which adds or removes a peak amplitude of 0.18 to 0.32 of full scale, in phase or in antiphase. It changes the
 power of a frame by 1 % (median), while the background fluctuates by 40 %. A coherent encoder can dim the slow background by interference;
-counting light cannot. The paper (appendix "Transient event detection"): synthetic, 64 x 64, 4000 training and 1000 test images.
+counting light cannot.
 """
 
 from __future__ import annotations
@@ -90,10 +87,7 @@ DEFECTS_MAX = 4
 PERFUSION = ("static", "perfused")
 GRAINS_PX = (3.0, 4.0, 5.0)
 PATTERNS_MAX = 12
-TISSUE_INTENSITY = (
-    0.065,
-    0.165,
-)  # of full scale, drawn log-uniformly: a speckle's bright grains reach five times the mean
+TISSUE_INTENSITY = (0.065, 0.165)  # of full scale, drawn log-uniformly: bright grains reach five times the mean
 EVENTS = ("background", "event")
 UNEVENNESS = 0.25
 UNEVEN_PX = 16.0

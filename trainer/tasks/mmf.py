@@ -19,24 +19,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.optics import FIBRE_SIDE_PX as SIDE_PX
-from pans.runtime.bundle.optics import MASK_SEED, phase_mask, scatter
+from pans.runtime.bundle.optics import scatter
 
 RELEASE_BATCH = 128
 
 
-def scattering_matrix(seed: int = MASK_SEED) -> NDArray[np.complex128]:
-    """Return the fibre as a unitary matrix U, complex128 (784, 784): field at the end = U @ amplitudes at the entrance."""
-    basis = np.eye(SIDE_PX * SIDE_PX).reshape(-1, SIDE_PX, SIDE_PX)
-    ends = np.fft.ifft2(np.fft.fft2(basis) * np.exp(1j * phase_mask(seed)))
-    return ends.reshape(len(basis), -1).T
-
-
-def release_intensity(
-    images: NDArray[np.uint8], batch: int = RELEASE_BATCH, seed: int = MASK_SEED
-) -> NDArray[np.float32]:
+def release_intensity(images: NDArray[np.uint8], batch: int = RELEASE_BATCH) -> NDArray[np.float32]:
     """Return speckle intensities min-max normalised over batches of `batch` images, float32 (n, 28, 28) in [0, 1]."""
-    intensity = np.abs(scatter(images, seed)) ** 2
+    intensity = np.abs(scatter(images)) ** 2
     for start in range(0, len(intensity), batch):
         part = intensity[start : start + batch]
         low, high = part.min(), part.max()

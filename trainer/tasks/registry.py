@@ -106,8 +106,6 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_see
     tasks, and says nothing to others. UsageError says what
     is missing or unfit, DamagedFileError which file is not the pinned one.
     """
-    if data_seed < 0:
-        raise UsageError(f"--data-seed is {data_seed}, allowed: 0 or more")
     if name_or_path in PUBLIC_SETS:
         return _load_public(name_or_path, data_folder(data_dir))
     if name_or_path in FIBRE_TASKS:
@@ -164,12 +162,12 @@ def draw_task(name: str, seed: int = 0, n_train: int | None = None, n_test: int 
     """Return a drawn task (see generators.py) with its recipe's or other numbers of objects.
 
     The same seed gives the same objects, object by object, whatever the numbers asked for. UsageError for an unknown name or a
-    negative seed, ValueError for no objects.
+    negative seed.
     """
     if name not in GENERATORS:
         raise UsageError(f"no generator for the task {name!r}", remedy=f"there are {', '.join(GENERATORS)}")
     if seed < 0:
-        raise UsageError(f"seed {seed} of the task {name}", remedy="0 or more")
+        raise UsageError(f"--data-seed is {seed}, allowed: 0 or more")
     recipe = GENERATORS[name]
     train = Objects(*recipe.draw(seed, "train", recipe.n_train if n_train is None else n_train))
     test = Objects(*recipe.draw(seed, "test", recipe.n_test if n_test is None else n_test))
@@ -213,11 +211,8 @@ def _load_npz(path: Path) -> Task:
     n_classes = int(max(train.labels.max(), test.labels.max())) + 1
     classes = tuple(str(name) for name in arrays.get("classes", np.arange(n_classes)).ravel())
     given = arrays["images" if "images" in arrays else "train_images"].dtype
-    source = (
-        ""
-        if given == np.uint8
-        else f"{given.name} images, full scale {_FULL_SCALES[given.name]:g}, rounded to 256 grey levels"
-    )
+    source = f"{given.name} images, full scale {_FULL_SCALES[given.name]:g}, rounded to 256 grey levels"
+    source = "" if given == np.uint8 else source
     return _checked(Task(path.stem, classes, train, test, file_sha256(path), split, source=source), path)
 
 
@@ -256,7 +251,7 @@ def _objects(where: Path, images: NDArray[Any], labels: NDArray[Any]) -> Objects
 def _split(where: Path, objects: Objects) -> tuple[Objects, Objects]:
     if len(objects) < 2 * HOLD_OUT_EVERY:
         raise UsageError(f"{where}: {len(objects)} objects, needed are {2 * HOLD_OUT_EVERY} or more")
-    held_out = _held_out(len(objects))
+    held_out = np.arange(len(objects)) % HOLD_OUT_EVERY == HOLD_OUT_EVERY - 1
     places = np.arange(len(objects))
     parts = [places[part][mixed_order(objects.labels[part])] for part in (~held_out, held_out)]
     train, test = (Objects(objects.images[part], objects.labels[part]) for part in parts)
@@ -275,10 +270,6 @@ def mixed_order(labels: NDArray[np.int64]) -> NDArray[np.int64]:
         members = np.flatnonzero(shuffled == label)
         place[members] = (np.arange(len(members)) + 0.5) / len(members)
     return order[np.argsort(place, kind="stable")]
-
-
-def _held_out(n: int) -> NDArray[np.bool_]:
-    return np.arange(n) % HOLD_OUT_EVERY == HOLD_OUT_EVERY - 1
 
 
 def _checked(task: Task, where: Path) -> Task:

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from pans.runtime.bundle.quantise import quantise_patterns
 from pans.runtime.errors import as_usage_error
-from pans.runtime.instrument.click_law import click_law
+from pans.runtime.instrument.click_law import ClickLaw, click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.detection import Law, click_probability, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination, CoherentField
@@ -37,7 +37,7 @@ from pans.trainer.model.estimators import cross_entropy
 from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.model.field_basis import discriminant_basis, in_pixels, turns
 from pans.trainer.model.heads import new_head
-from pans.trainer.options import EXACT_FEATURES_MAX, Options
+from pans.trainer.options import Options
 from pans.trainer.tasks.barcode import N_BARS, all_strings, weights
 from pans.trainer.tasks.registry import Task
 
@@ -144,12 +144,8 @@ def descend_bars(
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        price = min(
-            1.0,
-            max(
-                1e-4, price * math.exp(min(0.2, max(-0.2, BARS_PRICE_GAIN * (float(clicks.detach()) / clicks_max - 1))))
-            ),
-        )
+        excess = min(0.2, max(-0.2, BARS_PRICE_GAIN * (float(clicks.detach()) / clicks_max - 1)))
+        price = min(1.0, max(1e-4, price * math.exp(excess)))
     return best
 
 
@@ -157,10 +153,7 @@ def solve_patterns(options: Options, profile: Profile, prior: str = "uniform") -
     """Return what `options.restarts` searches and descents found, the best first, and the click law they were found for."""
     clicks_max = options.features if options.clicks is None else options.clicks
     top = min(LIGHT, top_limits(profile)[1])
-    law = click_law(profile, max(profile.exposure.min_us, exposure_us_of(profile, top)))
-    if options.dark is not None:
-        law = replace(law, dark_per_exposure=options.dark)
-    found = []
+    law, found = _law(profile, exposure_us_of(profile, top), options), []
     for start in range(options.restarts):
         lit = search_bars(options.features, clicks_max, options.seed + start, prior)
         patterns = torch.where(torch.from_numpy(lit), top, GLOW).double()
@@ -169,6 +162,12 @@ def solve_patterns(options: Options, profile: Profile, prior: str = "uniform") -
     if found[0].accuracy < 0:
         raise ValueError(f"no patterns were found within {clicks_max:g} clicks: allow more, or more restarts")
     return found, law
+
+
+def _law(profile: Profile, exposure_us: float, options: Options) -> ClickLaw:
+    """The click law of an exposure, of the shortest where it is shorter, with the dark counts that are asked for."""
+    law = click_law(profile, max(profile.exposure.min_us, exposure_us))
+    return law if options.dark is None else replace(law, dark_per_exposure=options.dark)
 
 
 def solve(options: Options, profile: Profile) -> Trained:
@@ -198,21 +197,15 @@ def solve(options: Options, profile: Profile) -> Trained:
 def search(task: Task, profile: Profile, options: Options, size: int) -> Trained:
     """Return the best of `options.restarts` encoders of `size` fields, with a head fitted to its click words.
 
-    `epochs` are passes over all turned objects in batches of `batch`, `front_rate` the peak rate of Adam, `light` the mean
-    photoelectrons per detector at the start. ValueError where the task has not two classes or the words cannot be enumerated.
+    The task has two classes, and square images. `epochs` are passes over all turned objects in batches of `batch`, `front_rate` the peak
+    rate of Adam, `light` the mean photoelectrons per detector at the start, `clicks` the budget.
     """
-    if len(task.classes) != 2 or options.clicks is None or options.features > EXACT_FEATURES_MAX:
-        raise ValueError(
-            f"{task.name}: {len(task.classes)} classes, {options.features} patterns, clicks {options.clicks}; "
-            f"allowed: two classes, at most {EXACT_FEATURES_MAX} patterns and a budget of clicks"
-        )
+    assert options.clicks is not None
     x, labels = encoder_input(task, task.train, profile, options), torch.from_numpy(task.train.labels)
     fields = discriminant_basis(x, labels, task.image_shape, size, turned=True)[:, size:]
     n_fit = len(x) - max(1, len(x) // VALIDATION_PART)
     views = [x @ fields[turn] for turn in turns(task.image_shape)]
-    law = click_law(profile, profile.exposure.min_us)
-    if options.dark is not None:
-        law = replace(law, dark_per_exposure=options.dark)
+    law = _law(profile, 0.0, options)
     shown, target = torch.cat([view[:n_fit] for view in views]), labels[:n_fit].repeat(len(views))
     weights = descend(shown, target, law, options)
     wrong = judge(weights, views[0][n_fit:], labels[n_fit:], law, options.clicks)

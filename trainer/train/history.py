@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -149,32 +149,17 @@ def _shown(weight: NDArray[np.float32], encoder: str) -> NDArray[np.float32]:
     return np.asarray(np.sqrt((weight**2).sum(axis=0)), np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class EpochFigures:
-    """The state after one epoch, one draw of clicks (K = 1); accuracies in %. The light is the mean over the epoch's batches."""
-
-    loss: float
-    training: float
-    held_out: float
-    held_out_first_200: float
-    clicks: float
-    photons: float
-    illumination: float
-    peak: float  # brightest pixel over the mean of all pixels of all patterns
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """All epochs, the patterns (d_f, pixels) after some of them, and the finished model."""
+    """Columns of figures over all epochs, the patterns (d_f, pixels) after some of them, and the finished model.
 
-    epochs: list[EpochFigures]
+    Columns are the state after each epoch by one draw of clicks (K = 1), five digits each: accuracies in %, the light in the mean over
+    the epoch's batches, and `peak`, the brightest pixel over the mean of all pixels of all patterns.
+    """
+
+    columns: dict[str, list[float]]
     patterns: dict[int, NDArray[np.float32]]
     trained: Trained
-
-    def columns(self) -> dict[str, list[float]]:
-        """Return the figures of all epochs, one list per quantity, five digits each."""
-        rows = [asdict(epoch) for epoch in self.epochs]
-        return {key: [float(f"{row[key]:.5g}") for row in rows] for key in rows[0]}
 
 
 def follow(
@@ -183,43 +168,31 @@ def follow(
     options: Options,
     *,
     patterns_after: tuple[int, ...] = (),
-    report: Callable[[EpochReport], None] = lambda _: None,
 ) -> Course:
-    """Train one run of active illumination by `options` and judge it after every epoch; the result is that of `train`.
-
-    ValueError for passive encoders.
-    """
-    if options.encoder != "active":
-        raise ValueError(f"a training with the encoder {options.encoder!r} cannot be followed, allowed: 'active'")
+    """Train one run of active illumination by `options` and judge it after every epoch; the result is that of `train`."""
     data = TrainingData(task, profile, options)
     run = Run(data, profile, options, 0)
     assert isinstance(run.encoder, ActiveIllumination)
     held_out, labels = encoder_input(task, task.test, profile, options), torch.from_numpy(task.test.labels)
     n = min(TRAINING_OBJECTS, data.n_fit)
     random = torch.Generator().manual_seed(options.seed)
-    epochs: list[EpochFigures] = []
+    columns: dict[str, list[float]] = {}
     patterns: dict[int, NDArray[np.float32]] = {}
     while run.epoch < options.epochs:
         trained = run.one_epoch()
-        report(trained)
         of_training = _right(run, data.shown[:n], data.labels[:n], random)
         of_held_out = _right(run, held_out, labels, random)
         intensity = (run.encoder.weight.detach() ** 2).cpu().numpy()
-        epochs.append(
-            EpochFigures(
-                loss=trained.loss,
-                training=100 * float(of_training.mean()),
-                held_out=100 * float(of_held_out.mean()),
-                held_out_first_200=100 * float(of_held_out[:FIRST].mean()),
-                clicks=trained.clicks,
-                photons=trained.photons,
-                illumination=trained.illumination,
-                peak=float(intensity.max() / intensity.mean()),
-            )
-        )
+        figures = {"loss": trained.loss, "training": 100 * float(of_training.mean())}
+        figures |= {"held_out": 100 * float(of_held_out.mean())}
+        figures |= {"held_out_first_200": 100 * float(of_held_out[:FIRST].mean())}
+        figures |= {key: getattr(trained, key) for key in ("clicks", "photons", "illumination")}
+        figures |= {"peak": float(intensity.max() / intensity.mean())}
+        for key, value in figures.items():
+            columns.setdefault(key, []).append(float(f"{value:.5g}"))
         if run.epoch in patterns_after:
             patterns[run.epoch] = intensity
-    return Course(epochs, patterns, run.finish((run.validation_loss(),)))
+    return Course(columns, patterns, run.finish((run.validation_loss(),)))
 
 
 def _right(run: Run, shown: Tensor, labels: Tensor, random: torch.Generator) -> Tensor:

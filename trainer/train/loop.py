@@ -47,9 +47,8 @@ VALIDATION_SAMPLES = 8  # of the clicks, where the words cannot be enumerated
 DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
 DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
 DUAL_RATE_MAX = 0.06
-FINE_LEVELS = (
-    1 << 16
-)  # of patterns through optics, from the start: dark pixels leak a part of the top level, which is then trained too
+# of patterns through optics, from the start: dark pixels leak a part of the top level, which is then trained too
+FINE_LEVELS = 1 << 16
 FINAL_DRAWS = 1 << 40  # of optics: those of validation and of the head's fit come after those of all epochs
 HEAD_DRAWS = 4  # optics through which the head sees every object when it is fitted
 
@@ -215,9 +214,8 @@ class Run:
         self.epoch = 0
         steps = options.epochs * math.ceil(data.n_fit / options.batch)
         self.dual_rate = min(DUAL_RATE_MAX, max(DUAL_RATE, DUAL_TRAVEL / steps))
-        self.weights = dict.fromkeys(
-            ("photons", "clicks", "illumination"), 1e-3
-        )  # of the budgets; they follow the excess
+        # of the budgets; they follow the excess
+        self.weights = dict.fromkeys(("photons", "clicks", "illumination"), 1e-3)
         self.optimiser = self._new_optimiser()
 
     # ---- the loop ----
@@ -234,11 +232,13 @@ class Run:
         order = torch.randperm(data.n_fit, generator=self.random)
         batches = [part for part in order.split(options.batch) if len(part) > 1]
         sums = torch.zeros(4, dtype=torch.float64)
-        shown, lifted = data.drawn(self.restart * options.epochs + self.epoch, self._black(self.epoch))
+        shown, lifted = data.drawn(
+            self.restart * options.epochs + self.epoch, black_at(options, self.epoch, data.floor)
+        )
         self.head.train()
         for i, batch in enumerate(batches):
             now = self.epoch + i / len(batches)
-            light = self.encoder(shown[batch], self._black(now) if data.optics is None else lifted)
+            light = self.encoder(shown[batch], black_at(options, now, data.floor) if data.optics is None else lifted)
             photons = light.sum(dim=1).mean()
             slope, clamp = slope_and_clamp(options, now)
             p = self._linked(readings.chances(light.clamp(max=clamp), law, slope), traps)
@@ -260,9 +260,6 @@ class Run:
         stage = stage_at(options, self.epoch)
         self.epoch += 1
         return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
-
-    def _black(self, now: float) -> float:
-        return black_at(self.options, now, self.data.floor)
 
     def _several_shots(self, p: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
         """The loss of mean clicks of 2 to `shots` shots, straight-through: the more shots, the smaller its bias."""

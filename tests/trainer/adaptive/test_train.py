@@ -126,18 +126,6 @@ def test_dwell_is_in_whole_steps_of_the_profile(task, steps):
     assert arrays.photons_per_level >= low * (1 - 1e-9)
 
 
-def test_export_writes_a_bundle_that_is_read_back(task, trained, tmp_path):
-    path = tmp_path / "bars.pans"
-    exported = export_automaton(path, trained, task, IDEAL, name="bars", provenance={})
-    bundle, digest = load_bundle(path)
-    assert digest == exported.sha256
-    assert bundle.expected["accuracy"] == exported.measured.accuracy_mean
-    assert bundle.automaton.n_slots == 6
-    assert exported.first_200.objects == 200
-    with pytest.raises(UsageError):
-        export_automaton(path, trained, task, IDEAL, name="bars", provenance={})
-
-
 def test_export_refuses_an_automaton_that_is_not_the_models(task, trained, tmp_path):
     arrays = trained.arrays
     swapped = replace(arrays, successors=arrays.successors[:, ::-1].copy())

@@ -11,13 +11,8 @@ import math
 import numpy as np
 
 from pans.trainer.baselines.common import run_trials
-from pans.trainer.baselines.end_to_end import (
-    FsiOptions,
-    masks_measured,
-    noisy,
-    principal_masks,
-    train_masks,
-)
+from pans.trainer.baselines.end_to_end import masks_measured, noisy, principal_masks, train_masks
+from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Objects, Task
 
 
@@ -57,7 +52,7 @@ def test_principal_masks_are_parts_of_the_axes_of_the_images() -> None:
 def test_masks_hold_the_photon_budget_and_reach_what_counts_allow() -> None:
     """Best is one mask per pixel: right if the bright pixel (2.4) counts more than the dim one (0.6), half right on a tie."""
     task = pixels_task()
-    model = train_masks(task, FsiOptions(2, 3.0, seed=0, epochs=6))
+    model = train_masks(task, BaselineOptions("fsi", "deep", features=2, epochs=6), 3.0)
     measurement, decide = masks_measured(model, task, "source")
     with torch.no_grad():
         masks = model.masks().numpy()

@@ -7,12 +7,11 @@ import signal
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from trainings import bars_task, short_fits  # noqa: E402, F401 - a fixture
+from trainings import bars_task, kept_task, short_fits  # noqa: E402, F401 - a fixture
 
 from pans.runtime.bundle.model import load_bundle  # noqa: E402
 from pans.runtime.cli import main  # noqa: E402
@@ -27,9 +26,7 @@ AUTOMATON = ["--encoder", "automaton", "--photons", "3", "--exposures", "3", "--
 def test_a_terminated_training_says_so_and_goes_on(
     module: str, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    task = bars_task()
-    parts = {"train_images": task.train.images, "train_labels": task.train.labels}
-    np.savez(tmp_path / "bars.npz", **parts, test_images=task.test.images, test_labels=task.test.labels)
+    kept_task(tmp_path / "bars.npz", bars_task())
     before, out = signal.getsignal(signal.SIGTERM), tmp_path / "bars.pans"
     command = ["train", str(tmp_path / "bars.npz"), *words, "--as-is", "-o", str(out), "--json"]
 

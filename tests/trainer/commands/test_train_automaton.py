@@ -2,12 +2,11 @@
 
 import json
 
-import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="needs the train extra")
 
-from trainings import bars_task
+from trainings import bars_task, kept_task
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
@@ -17,11 +16,7 @@ SHORT = ["--encoder", "automaton", "--exposures", "4", "--states", "8", "--epoch
 
 @pytest.fixture
 def images(tmp_path):
-    task = bars_task()
-    path = tmp_path / "bars.npz"
-    parts = {"train_images": task.train.images, "train_labels": task.train.labels}
-    np.savez(path, **parts, test_images=task.test.images, test_labels=task.test.labels)
-    return str(path)
+    return str(kept_task(tmp_path / "bars.npz", bars_task()))
 
 
 def test_trains_exports_and_reports(images, tmp_path, capsys):

@@ -1,6 +1,4 @@
-"""The map of clicks, the pictures of a training and of a bundle, and samples of pictures given back."""
-
-# ruff: noqa: E402  (what follows needs torch)
+"""The map of clicks, and the pictures of a training and of a bundle."""
 
 from __future__ import annotations
 
@@ -10,17 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 pytest.importorskip("sklearn")
 
 from trainings import short_fits  # noqa: F401  a fixture
 
 from pans.runtime.cli import main
-from pans.trainer.evaluate.picture_samples import PARTS, first_of_each_class, keep_samples, read_samples, take_samples
 from pans.trainer.evaluate.pictures import tsne
-from pans.trainer.model.heads import MlpHead
-from pans.trainer.tasks.registry import Objects
 
 RNG = np.random.default_rng(4)
 
@@ -61,29 +56,3 @@ def test_a_training_leaves_its_history(tmp_path, capsys):
     drawn = json.loads(capsys.readouterr().out)["pictures"]
     assert {path.name for path in map(Path, drawn)} == {"patterns.png", "confusion.png"}  # too few objects for a map
     assert all(Path(path).read_bytes().startswith(b"\x89PNG") for path in drawn)
-
-
-D_F = 5
-SIDE = 6
-
-
-def objects() -> Objects:
-    rng = np.random.default_rng(3)
-    shown, behind = (rng.integers(0, 256, (9, SIDE, SIDE), dtype=np.uint8) for _ in range(2))
-    return Objects(shown, np.array([2, 0, 2, 1, 0, 1, 1, 0, 2]), behind)
-
-
-def test_samples_are_single_shots_of_the_first_object_of_every_class_and_read_as_they_were_kept(tmp_path):
-    chosen, every = first_of_each_class(objects()), objects()
-    assert chosen.labels.tolist() == [0, 1, 2]
-    assert np.array_equal(chosen.images, every.images[[1, 3, 0]])
-    assert np.array_equal(chosen.pictures, every.behind[[1, 3, 0]])
-    head = MlpHead(D_F, 7, SIDE * SIDE, torch.Generator().manual_seed(0)).eval()
-    p = torch.full((3, D_F), 0.5, dtype=torch.float64)
-    samples, again = (take_samples(head, p, chosen) for _ in range(2))
-    keep_samples(tmp_path / "a.npz", samples)
-    for other in (again, read_samples(tmp_path / "a.npz")):
-        for part in PARTS:
-            np.testing.assert_array_equal(getattr(other, part), getattr(samples, part), strict=True)
-    assert len({picture.tobytes() for picture in samples.given_back.reshape(-1, SIDE * SIDE)}) > 2
-    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]

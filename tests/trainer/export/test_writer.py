@@ -51,30 +51,17 @@ def written(path, head, mean, d_f):
     return export(path, head, mean, Shown(124, levels, 0.01), about)
 
 
-def test_folded_layer_is_normalisation_then_layer():
-    weight, bias, gain, shift = RNG.normal(size=(7, 5)), RNG.normal(size=7), RNG.normal(size=5), RNG.normal(size=5)
-    mean = np.array([0.3, 0.5, 1e-4, 0.999, 0.7])
-    folded, folded_bias, dead = fold_normalisation(weight, bias, gain, shift, mean)
-    clicks = RNG.uniform(size=(20, 5))
-    wanted = ((clicks - mean) / np.sqrt(mean * (1 - mean) + EPSILON) * gain + shift) @ weight.T + bias
-    assert clicks @ folded.T + folded_bias == pytest.approx(wanted, rel=1e-12)
-    assert dead == ()
-
-
-@pytest.mark.parametrize("value", [0.0, 1.0, 1e-12, 1 - 1e-12])
-def test_dead_and_saturated_channels_are_dropped_not_blown_up(value):
+@pytest.mark.parametrize("value", [0.5, 1e-4, 0.999, 0.0, 1.0, 1e-12, 1 - 1e-12])
+def test_a_folded_layer_is_normalisation_then_layer_without_dead_and_saturated_channels(value):
     weight, bias, gain, shift = RNG.normal(size=(7, 3)), RNG.normal(size=7), np.full(3, 1e3), RNG.normal(size=3)
     mean = np.array([0.4, value, 0.6])
     folded, folded_bias, dead = fold_normalisation(weight, bias, gain, shift, mean)
-    assert dead == (1,)
-    assert np.all(folded[:, 1] == 0)
-    live = [0, 2]
+    assert dead == (() if 1e-5 < value < 1 - 1e-5 else (1,))
+    assert np.all(folded[:, list(dead)] == 0)
     clicks = RNG.integers(0, 2, (20, 3)).astype(float)
-    normal = (clicks[:, live] - mean[live]) / np.sqrt(mean[live] * (1 - mean[live]) + EPSILON) * gain[live] + shift[
-        live
-    ]
-    wanted = normal @ weight[:, live].T + weight[:, 1] * shift[1] + bias
-    assert clicks @ folded.T + folded_bias == pytest.approx(wanted, rel=1e-10)
+    normal = (clicks - mean) / np.sqrt(mean * (1 - mean) + EPSILON) * gain
+    normal[:, list(dead)] = 0
+    assert clicks @ folded.T + folded_bias == pytest.approx((normal + shift) @ weight.T + bias, rel=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -90,6 +77,9 @@ def test_written_bundle_decides_as_the_model_on_all_words(tmp_path, mean):
     words = (np.arange(64)[:, None] >> np.arange(6)) & 1
     wanted = reference_scores(head, mean, words.astype(np.float32))
     assert again.table == pytest.approx(wanted, abs=1e-5 * max(1, np.abs(wanted).max()))
+    for backend in ("int8", "int8-onnx"):
+        found = make_decider(again, backend=backend).scores_batch(words, 1)
+        assert np.abs(found - wanted).max() < 0.02 * max(1, np.abs(wanted).max())
 
 
 def test_patterns_in_another_order_are_held_against_the_model(tmp_path):
@@ -121,10 +111,8 @@ def test_another_model_is_noticed(tmp_path):
 
 
 def test_a_wrong_fold_never_leaves_the_export(tmp_path, monkeypatch):
-    def wrong(weight, bias, gain, shift, click_mean):
-        return fold_normalisation(weight, bias, gain, shift, click_mean * 1.001)
-
-    monkeypatch.setattr(onnx_heads, "fold_normalisation", wrong)
+    fold = fold_normalisation
+    monkeypatch.setattr(onnx_heads, "fold_normalisation", lambda *layer: fold(*layer[:4], layer[4] * 1.001))
     with pytest.raises(PansError, match="differs from the trained model"):
         written(tmp_path / "small.pans", trained_head(6), np.full(6, 0.4), 6)
     assert not (tmp_path / "small.pans").exists()
@@ -216,27 +204,10 @@ def test_fixed_patterns_are_trained_through_optics_too(tmp_path):
     bundle = export_trained(tmp_path / "fixed.pans", trained, task, IDEAL, name="fixed", provenance={}).bundle
     told = bundle.provenance["tolerates"]
     assert told["within"]["tables"] == 16
-    assert (
-        told["within"]["accuracy"] > 0.25 + 5 * told["within"]["accuracy_se_objects"]
-    )  # of four classes, in six epochs
+    # of four classes, in six epochs
+    assert told["within"]["accuracy"] > 0.25 + 5 * told["within"]["accuracy_se_objects"]
     curves = misalignment_curves(bundle, HeldOut(task, task.test.first(50), IDEAL), HIDDEN)
     assert curves["black"][0]["value"] == 0.0
     assert np.diff([point["photons_mean"] for point in curves["black"]]).min() > 0  # dark pixels bring light
     with pytest.raises(UsageError, match="coherent encoder shows no patterns"):
         check_options(replace(options, encoder="coherent", optics="psf=0.5"), IDEAL)
-
-
-def test_the_trainer_puts_both_into_the_bundle(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    torch = pytest.importorskip("torch")
-    from pans.runtime.bundle.model import Shown, load_bundle
-    from pans.trainer.export.writer import Description, export
-    from pans.trainer.model.heads import MlpHead
-
-    head = MlpHead(4, 8, 3, torch.Generator().manual_seed(1)).eval()
-    about = Description("a", "t", ("x", "y", "z"), (2, 3), {})
-    export(tmp_path / "a.pans", head, np.full(4, 0.4), Shown(2, np.ones((4, 6), np.uint16), 0.1), about)
-    bundle, _ = load_bundle(tmp_path / "a.pans")
-    counts = np.array([[r >> i & 1 for i in range(4)] for r in range(16)])
-    for backend in ("int8", "int8-onnx"):
-        found = make_decider(bundle, backend=backend).scores_batch(counts, 1)
-        assert np.abs(found - make_decider(bundle, backend="float64").scores_batch(counts, 1)).max() < 0.05

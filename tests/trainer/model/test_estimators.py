@@ -74,7 +74,7 @@ def test_exact_loss_of_pictures_is_the_sum_over_words():
     p = click_probability(light, READ_NOISE)
     errors = (head.scores.unsqueeze(0) - pictures.unsqueeze(1)).square().mean(dim=2)
     wanted = (word_probabilities(p) * errors).sum(dim=1).mean()
-    assert float(exact(p, pictures, head, squared_error, None)) == pytest.approx(float(wanted))
+    assert float(exact(p, pictures, head, squared_error, None, CLICKS)) == pytest.approx(float(wanted))
 
 
 def test_similarity_loss_weighs_ssim_of_what_is_shown_against_the_error_of_the_scores():

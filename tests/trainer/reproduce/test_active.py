@@ -9,11 +9,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
+from trainings import columns_task
+
 from pans.trainer.options import Options
 from pans.trainer.reproduce import active
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
 from pans.trainer.reproduce.printed import ACTIVE, ActiveRow
-from pans.trainer.tasks.registry import Objects, Task
 
 ROW = ActiveRow(3, 1.5, 9.0, (40.0,) * 4, (1.0,) * 4, (40.0,) * 4, (1.0,) * 4)
 
@@ -21,26 +22,19 @@ ROW = ActiveRow(3, 1.5, 9.0, (40.0,) * 4, (1.0,) * 4, (40.0,) * 4, (1.0,) * 4)
 @pytest.fixture
 def bars(monkeypatch):
     """A table of one row with a second seed: bright columns name the class."""
-    rng = np.random.default_rng(0)
-    labels = rng.integers(0, 3, 500)
-    images = rng.integers(0, 60, (500, 4, 4), dtype=np.uint8)
-    images[np.arange(500), :, labels] = 255
-    parts = [Objects(images[at], labels[at]) for at in (slice(280), slice(280, 500))]
-    task = Task("mnist", ("a", "b", "c"), *parts, "0" * 64, "")
+    task = columns_task(280, 220, 3, 4, "mnist")
     small = Options(features=3, clicks=1.5, epochs=6, hidden=8, batch=50, front_rate=5e-2, head_rate=2e-2, shots=2)
-    monkeypatch.setattr(active, "load_task", lambda *_: task)
-    monkeypatch.setattr(active, "TRIALS", 3)
-    monkeypatch.setattr(active, "TRIALS_OF_ALL", 3)
-    monkeypatch.setattr(active, "recipe", lambda *_: small)
-    monkeypatch.setattr(active, "ACTIVE", {"mnist": (ROW,)})
-    monkeypatch.setattr(active, "OTHER_SEEDS", {("mnist", 3): (1000,)})
+    changes = {"load_task": lambda *_: task, "recipe": lambda *_: small, "TRIALS": 3, "TRIALS_OF_ALL": 3}
+    changes |= {"ACTIVE": {"mnist": (ROW,)}, "OTHER_SEEDS": {("mnist", 3): (1000,)}}
+    for name, value in changes.items():
+        monkeypatch.setattr(active, name, value)
 
 
 def figures_of(accuracy, clicks, photons=20.0):
     one = {"accuracy_mean": accuracy, "accuracy_std": 0.01, "accuracy_se_objects": 0.02, "clicks_mean": clicks}
     one |= {"photons_mean": photons, "illumination": 80.0, "objects": 200, "trials": 0}
     of_part = {str(shots): one for shots in (1, 2, 3, 5)}
-    return {"first_200": of_part, "all": of_part, "cpu_seconds": 60.0, "options": {"seed": 1000}}
+    return {"first_200": of_part, "all": of_part, "options": {"seed": 1000}}
 
 
 def test_a_row_stands_beside_the_papers_direct_imaging_and_another_seed():
@@ -56,9 +50,8 @@ def test_a_row_stands_beside_the_papers_direct_imaging_and_another_seed():
     assert direct["direct"] == pytest.approx(active.direct_at("mnist", 20.0))
     assert (direct["verdict"], direct["trainings"]) == ("below", 2)
     assert [row["value"] for row in of_table(rows, "seeds")] == pytest.approx([61.0] * 4)
-    assert (
-        len(active.row_beside("mnist", ACTIVE["mnist"][0], [figures_of(0.6, 2.1)])) == 5
-    )  # no other seed, no rows of it
+    alone = active.row_beside("mnist", ACTIVE["mnist"][0], [figures_of(0.6, 2.1)])
+    assert len(alone) == 5  # no other seed, no rows of it
 
 
 def test_direct_imaging_is_interpolated_and_never_extrapolated():
@@ -83,7 +76,7 @@ def test_a_row_is_trained_measured_and_resumed(bars, tmp_path):
     assert found["first_200"]["1"]["objects"] == 200
     assert found["all"]["5"]["shots"] == 5
     assert active.finished_row(tmp_path, "mnist", ROW) == json.loads(json.dumps(found))
-    assert {path.name for path in tmp_path.iterdir()} == {"mnist-3.json", "mnist-3.pans", "mnist-3.seconds"}
+    assert {path.name for path in tmp_path.iterdir()} == {"mnist-3.json", "mnist-3.pans"}
 
 
 def test_a_page_trains_every_row_from_its_seeds_and_collects_them_again(bars, tmp_path):

@@ -11,6 +11,7 @@ pytest.importorskip("torch", reason="needs the train extra")
 from pans.runtime.errors import UsageError
 from pans.trainer.reproduce.page import (
     NAMES,
+    Asked,
     Column,
     Made,
     Page,
@@ -20,7 +21,6 @@ from pans.trainer.reproduce.page import (
     check_cached_bundle,
     generated,
     is_page_file,
-    kept,
     page_of,
     read_rows,
     rewrite_page,
@@ -78,19 +78,9 @@ def test_a_new_page_has_a_title_its_command_tables_and_pictures_and_nothing_else
     assert (tmp_path / "file.md").read_text() == f"# A page\n\n{begin}\n\n{TEXT}\n{end}\n"
     assert {path.name for path in tmp_path.iterdir()} == {"name.json", "file.md", "name-x.png"}
     found = json.loads((tmp_path / "name.json").read_text())
-    assert found["tables"]["a"]["columns"] == [
-        "features",
-        "value",
-        "verdict",
-        "clicks",
-    ]  # what no table shows is left out
-    assert read_rows(tmp_path, "name")[0] == {
-        "table": "a",
-        "features": 3,
-        "value": 50.0,
-        "verdict": "above",
-        "clicks": None,
-    }
+    shown = ["features", "value", "verdict", "clicks"]  # what no table shows is left out
+    assert found["tables"]["a"]["columns"] == shown
+    assert read_rows(tmp_path, "name")[0] == {"table": "a"} | dict(zip(shown, (3, 50.0, "above", None)))
     assert generated(tmp_path, PAGE) == f"{begin}\n\n{TEXT}\n{end}"
 
 
@@ -143,13 +133,15 @@ def test_a_part_is_made_once_and_again_when_asked_for_otherwise(tmp_path):
         calls.append(1)
         return {"value": (1, 2)}
 
-    path = tmp_path / "part.json"
-    assert kept(path, {"n": 1}, make, collect=True) is None
-    first = kept(path, {"n": 1}, make, collect=False)
+    said = []
+    asked, collecting = (Asked("page", tmp_path, collect=collect, report=said.append) for collect in (False, True))
+    assert collecting.kept("part", {"n": 1}, make) is None
+    assert said == ["page: part is not measured yet"]
+    first = asked.kept("part", {"n": 1}, make)
     assert first["value"] == [1, 2]  # as JSON gives it back, from the start
-    assert kept(path, {"n": 1}, make, collect=True) == first
-    assert kept(path, {"n": 2}, make, collect=True) is None
-    kept(path, {"n": 2}, make, collect=False)
+    assert collecting.kept("part", {"n": 1}, make) == first
+    assert collecting.kept("part", {"n": 2}, make) is None
+    asked.kept("part", {"n": 2}, make)
     assert len(calls) == 2
 
 

@@ -8,8 +8,11 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
+from trainings import columns_task
+
 from pans.runtime.cli import main
 from pans.runtime.instrument.profile import load_profile
+from pans.trainer.model.heads import MlpHead
 from pans.trainer.options import Options
 from pans.trainer.reproduce import passive
 from pans.trainer.reproduce.page import Asked, page_of, write_page
@@ -121,32 +124,16 @@ def test_a_row_of_the_field_is_compared_at_what_it_detects_and_at_what_must_reac
     found = {"value": 70.0, "error_objects": 0.4, "photons": 100.0, "reaching": 5000.0}
     row = passive.field_row(PASSIVE["mmf-mnist"].rows[0], found, CURVE)
     assert (row["direct_there"], row["direct_verdict"]) == (pytest.approx(65), "above")
-    assert (row["optics_there"], row["optics_verdict"]) == (
-        pytest.approx(90),
-        "below",
-    )  # no more than the curve's last level
+    # no more than the curve's last level
+    assert (row["optics_there"], row["optics_verdict"]) == (pytest.approx(90), "below")
     assert "direct_there" not in passive.field_row(PASSIVE["mmf-mnist"].rows[0], found | {"photons": 5.0}, CURVE)
 
 
 def test_digits_behind_a_fibre_are_measured_as_a_field_and_by_a_camera(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
-    rng = np.random.default_rng(2)
-    labels = rng.integers(0, 2, 400)
-    images = rng.integers(0, 40, (400, 8, 8), dtype=np.uint8)
-    images[np.arange(400), :, 4 * labels] = 255
-    parts = [Objects(images[at], labels[at]) for at in (slice(240), slice(240, 400))]
-    task = Task("mmf-mnist", ("a", "b"), *parts, "0" * 64, "", light="field")
-    small = Options(
-        4,
-        alpha=0.0,
-        encoder="coherent",
-        complex_field=True,
-        conserving=True,
-        input_photons=100.0,
-        epochs=3,
-        hidden=8,
-        batch=40,
-    )
+    task = dataclasses.replace(columns_task(240, 160, 2, 8, "mmf-mnist"), light="field")
+    passive_light = {"encoder": "coherent", "complex_field": True, "conserving": True, "input_photons": 100.0}
+    small = Options(4, alpha=0.0, **passive_light, epochs=3, hidden=8, batch=40)
     monkeypatch.setattr(passive, "load_task", lambda *_: task)
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     monkeypatch.setattr(passive, "SPECKLE_LEVELS", (1.0, 1000.0))
@@ -157,3 +144,16 @@ def test_digits_behind_a_fibre_are_measured_as_a_field_and_by_a_camera(tmp_path,
     assert few["value"] < many["value"]
     write_page(tmp_path, page_of(passive.FIELD), made)
     assert (tmp_path / f"{passive.FIELD}.png").stat().st_size > 5000
+
+
+def test_samples_are_single_shots_of_the_first_object_of_every_class():
+    rng = np.random.default_rng(3)
+    shown, behind = (rng.integers(0, 256, (9, 6, 6), dtype=np.uint8) for _ in range(2))
+    chosen = passive.first_of_each_class(Objects(shown, np.array([2, 0, 2, 1, 0, 1, 1, 0, 2]), behind))
+    assert chosen.labels.tolist() == [0, 1, 2]
+    assert np.array_equal(chosen.images, shown[[1, 3, 0]])
+    assert np.array_equal(chosen.pictures, behind[[1, 3, 0]])
+    head = MlpHead(5, 7, 36, torch.Generator().manual_seed(0)).eval()
+    first, again = (passive.take_samples(head, torch.full((3, 5), 0.5).double(), chosen) for _ in range(2))
+    assert np.array_equal(first.given_back, again.given_back)
+    assert len({picture.tobytes() for picture in first.given_back.reshape(-1, 36)}) > 2

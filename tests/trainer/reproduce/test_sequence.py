@@ -18,8 +18,6 @@ def test_a_window_moves_down_from_field_to_field():
     moved = sequence.frame(*fields, 30)
     assert ((moved == 2).sum(axis=0) == 70).all()
     assert (moved[-30:] == 3).all()
-    with pytest.raises(ValueError, match="101 rows, allowed"):
-        sequence.frame(*fields, 101)
 
 
 def test_frames_in_passing_have_the_cells_class_or_are_empty():

@@ -108,7 +108,7 @@ def test_shots_and_fig_3_stand_on_the_figures_of_the_table(asked, cache, tmp_pat
 def test_light_and_dark_counts_are_measured_once(asked, monkeypatch, tmp_path, name):
     question, said = asked
     assert trained.swept_page(question(name, collect=True)).rows == []
-    assert f"{name}: fashion-mnist, d_f = 4 is not measured yet" in said
+    assert f"{name}: {name}-fashion-mnist-4 is not measured yet" in said
     made = trained.swept_page(question(name))
     monkeypatch.setattr(trained, "judged", None)
     assert trained.swept_page(question(name, collect=True)).rows == made.rows
@@ -126,7 +126,7 @@ def test_light_and_dark_counts_are_measured_once(asked, monkeypatch, tmp_path, n
 
 def test_what_light_and_dark_counts_change_is_read_off_the_curve():
     etas = [{"setting": eta, "value": 80 - 5 * abs(np.log10(eta / 10))} for eta in trained.SETTINGS["eta"]]
-    found = trained.over_light({}, etas)
+    found = trained.over_light(etas)
     assert (found["best"], found["gain"], found["at_tenth"]) == pytest.approx((10.0, 5.0, -5.0))
     assert (found["low"], found["high"]) == pytest.approx((10**0.75, 10**1.25))
     darks = [{"setting": dark, "value": 80 - 10 * dark} for dark in trained.SETTINGS["dark"]]

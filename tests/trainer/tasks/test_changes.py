@@ -57,15 +57,12 @@ def test_an_image_of_something_is_made_again_from_its_distorted_copy() -> None:
     np.testing.assert_array_equal(more.pictures[6:], behind.images)
 
 
-def objects_shifts(n: int) -> Objects:
-    images = np.zeros((n, 9, 11), np.uint8)
-    images[:, 4, 5] = 200
-    return Objects(images, np.arange(n))
-
-
 def test_shifts_are_uniform_and_reproducible() -> None:
-    moved = shifted(objects_shifts(4000), 3, 1, 5)
-    np.testing.assert_array_equal(moved.images, shifted(objects_shifts(4000), 3, 1, 5).images)
+    images = np.zeros((4000, 9, 11), np.uint8)
+    images[:, 4, 5] = 200
+    spots = Objects(images, np.arange(4000))
+    moved = shifted(spots, 3, 1, 5)
+    np.testing.assert_array_equal(moved.images, shifted(spots, 3, 1, 5).images)
     _, y, x = np.nonzero(moved.images)
     assert len(y) == 4000
     for found, most in ((x - 5, 3), (y - 4, 1)):

@@ -34,8 +34,9 @@ def own_npz(path, n=20, **more):
         lambda data: gzip.compress(b"\1" + data[1:]),
         lambda data: gzip.compress(data)[:-9],
         lambda data: b"not gzip",
+        lambda data: gzip.compress(data + bytes(64 << 20)),
     ],
-    ids=["short", "long", "other magic", "cut", "not gzip"],
+    ids=["short", "long", "other magic", "cut", "not gzip", "bomb"],
 )
 def test_a_damaged_idx_file_is_refused(tmp_path, damage):
     path = tmp_path / "a.gz"
@@ -44,24 +45,12 @@ def test_a_damaged_idx_file_is_refused(tmp_path, damage):
         read_idx(path, (5, 2, 3))
 
 
-def test_a_gzip_bomb_is_not_unpacked(tmp_path):
-    path = tmp_path / "bomb.gz"
-    with gzip.open(path, "wb") as file:
-        for _ in range(64):
-            file.write(bytes(1 << 20))
-    with pytest.raises(DamagedFileError):
-        read_idx(path, (5,))
-
-
-def test_an_altered_file_is_named_with_both_hashes(tmp_path):
+@pytest.mark.parametrize(("n_bytes", "match"), [(4, "0" * 64), (5, "4 bytes, the pinned file has 5")])
+def test_an_altered_file_is_named_with_its_size_or_hash(tmp_path, n_bytes, match):
     path = tmp_path / "a.bin"
     path.write_bytes(b"abcd")
-    pinned = PinnedFile("a.bin", 4, "0" * 64, (4,))
-    with pytest.raises(DamagedFileError, match="0" * 64) as caught:
-        check_pinned(path, pinned)
-    assert file_sha256(path) in str(caught.value)
-    with pytest.raises(DamagedFileError, match="5"):
-        check_pinned(path, PinnedFile("a.bin", 5, "0" * 64, (5,)))
+    with pytest.raises(DamagedFileError, match=match):
+        check_pinned(path, PinnedFile("a.bin", n_bytes, "0" * 64, (4,)))
 
 
 def test_fetch_keeps_only_what_is_pinned(tmp_path):
@@ -113,15 +102,9 @@ def test_any_stretch_of_an_own_file_holds_all_classes(tmp_path):
 
 
 def test_own_file_with_a_test_part(tmp_path):
-    images = RNG.integers(0, 256, (9, 2, 2), dtype=np.uint8)
-    labels = np.arange(9) % 2
-    parts = {
-        "train_images": images[:6],
-        "train_labels": labels[:6],
-        "test_images": images[6:],
-        "test_labels": labels[6:],
-    }
-    np.savez(tmp_path / "own.npz", **parts)
+    images, labels = RNG.integers(0, 256, (9, 2, 2), dtype=np.uint8), np.arange(9) % 2
+    train = {"train_images": images[:6], "train_labels": labels[:6]}
+    np.savez(tmp_path / "own.npz", **train, test_images=images[6:], test_labels=labels[6:])
     task = load_task(str(tmp_path / "own.npz"))
     assert np.array_equal(task.test.images, images[6:])
     assert task.classes == ("0", "1")
@@ -216,12 +199,6 @@ def test_folders_that_cannot_be_meant(tmp_path, what, said):
     with pytest.raises(UsageError, match=said) as caught:
         load_task(str(tmp_path))
     assert caught.value.remedy
-
-
-def test_a_drawn_task_follows_its_data_seed():
-    first, second = (load_task("barcode", data_seed=seed) for seed in (0, 5))
-    assert first.sha256 != second.sha256
-    assert "seed 5" in second.source
 
 
 def test_unknown_task_and_missing_folder_have_a_remedy(tmp_path, monkeypatch):

@@ -12,14 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 from bundles import made_bundle
+from trainings import bars_task, short_fits  # noqa: F401 - a fixture
 
-from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.click_law import click_probability, object_transmission
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate.accuracy import evaluate_exactly, light_of
+from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.dose import training_readings
 from pans.trainer.evaluate.held_out import as_trained, trained_bleaching
 from pans.trainer.model.detection import click_probability as torch_probability
@@ -29,7 +29,6 @@ from pans.trainer.model.heads import MlpHead
 from pans.trainer.options import Options, check_options
 from pans.trainer.tasks.registry import Objects, load_task
 from pans.trainer.train import head_fit
-from pans.trainer.train.checkpoint import read_checkpoint
 from pans.trainer.train.data import encoder_input
 from pans.trainer.train.head_fit import descend, exact_losses, joint_distribution
 from pans.trainer.train.loop import train
@@ -38,21 +37,23 @@ PROFILE = load_profile("oled-qcmos")
 SMALL = Options(features=4, alpha=1e-3, epochs=10, hidden=32, batch=64, front_rate=3e-2, head_rate=1e-2)
 
 
-def bars(n=600, seed=0):
-    """Four classes on 6 x 6 pixels: the bright bar stands in one of four columns, over noise."""
-    rng = np.random.default_rng(seed)
-    labels = rng.integers(0, 4, n)
-    images = rng.integers(0, 50, (n, 6, 6), dtype=np.uint8)
-    images[np.arange(n), :, labels + 1] = rng.integers(150, 256, (n, 6), dtype=np.uint8)
-    return images, labels
+def bars_file(path, n=600, seed=0):
+    """The bars as a file without a test part, which is split where it is read."""
+    part = bars_task(3 * n // 2, seed).train
+    np.savez(path, images=part.images, labels=part.labels)
+    return str(path)
 
 
 @pytest.fixture(scope="module")
 def task(tmp_path_factory):
-    path = tmp_path_factory.mktemp("bars") / "bars.npz"
-    images, labels = bars()
-    np.savez(path, images=images, labels=labels)
-    return load_task(str(path))
+    return load_task(bars_file(tmp_path_factory.mktemp("bars") / "bars.npz"))
+
+
+def same(one, other):
+    """Whether two trainings ended at the same patterns and head."""
+    heads = zip(one.head.state_dict().values(), other.head.state_dict().values())
+    patterns = np.array_equal(one.quantised.pattern_levels, other.quantised.pattern_levels)
+    return patterns and all(torch.equal(a, b) for a, b in heads)
 
 
 def test_head_fits_a_joint_distribution_to_its_entropy(monkeypatch):
@@ -73,7 +74,8 @@ def test_head_fits_a_joint_distribution_to_its_entropy(monkeypatch):
 
 
 @pytest.mark.parametrize("estimator", ["ste", "identity", "exact", "local", "disarm", "loo"])
-def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
+def test_bars_are_learned_and_repeat_with_the_seed(task, estimator, monkeypatch):
+    monkeypatch.setattr(head_fit, "STEPS", 300)
     options = replace(SMALL, estimator=estimator)
     reports = []
     trained = train(task, PROFILE, options, report=reports.append)
@@ -87,24 +89,33 @@ def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
     assert trained.quantised.pattern_levels.max() < PROFILE.projector.levels
     assert [report.epoch for report in reports] == list(range(1, 11))
     assert reports[-1].loss < reports[0].loss
-    again = train(task, PROFILE, options)
-    assert np.array_equal(again.quantised.pattern_levels, trained.quantised.pattern_levels)
-    assert all(torch.equal(a, b) for a, b in zip(again.head.state_dict().values(), trained.head.state_dict().values()))
+    assert same(train(task, PROFILE, options), trained)
 
 
+FREE = replace(SMALL, epochs=40, alpha=0.0, batch=32)
+
+
+@pytest.fixture(scope="module")
+def free(task):
+    """The last report of a training without a budget."""
+    reports = []
+    train(task, PROFILE, FREE, report=reports.append)
+    return reports[-1]
+
+
+@pytest.mark.usefixtures("short_fits")
 @pytest.mark.parametrize(
     ("name", "target", "low", "high"),
     [("clicks", 1.1, 0.8, 1.4), ("photons", 2.2, 1.4, 3.0), ("illumination", 8.0, 6.0, 10.0)],
 )
-def test_budgets_pull_towards_their_target(task, name, target, low, high):
-    free, held = [], []
-    options = replace(SMALL, epochs=40, alpha=0.0, batch=32)
-    train(task, PROFILE, options, report=free.append)
-    train(task, PROFILE, replace(options, **{name: target}), report=held.append)
-    assert getattr(free[-1], name) > 1.3 * getattr(held[-1], name)
+def test_budgets_pull_towards_their_target(task, free, name, target, low, high):
+    held = []
+    train(task, PROFILE, replace(FREE, **{name: target}), report=held.append)
+    assert getattr(free, name) > 1.3 * getattr(held[-1], name)
     assert low < getattr(held[-1], name) < high
 
 
+@pytest.mark.usefixtures("short_fits")
 def test_restarts_keep_the_best(task):
     options = replace(SMALL, epochs=3)
     single = [train(task, PROFILE, replace(options, seed=seed)) for seed in (0, 1, 2)]
@@ -114,6 +125,7 @@ def test_restarts_keep_the_best(task):
     assert np.array_equal(best.quantised.pattern_levels, single[int(np.argmin(losses))].quantised.pattern_levels)
 
 
+@pytest.mark.usefixtures("short_fits")
 def test_the_best_start_goes_on_and_an_interruption_changes_nothing(task, tmp_path):
     options = replace(SMALL, epochs=6, starts=3, warm=0.34, polish=0.5, shots=3)
     reports = []
@@ -130,29 +142,14 @@ def test_the_best_start_goes_on_and_an_interruption_changes_nothing(task, tmp_pa
 
         with pytest.raises(KeyboardInterrupt):
             train(task, PROFILE, options, checkpoint=checkpoint, resume=checkpoint.is_file(), report=interrupt)
-    resumed = train(task, PROFILE, options, checkpoint=checkpoint, resume=True)
-    assert np.array_equal(resumed.quantised.pattern_levels, whole.quantised.pattern_levels)
-    assert all(torch.equal(a, b) for a, b in zip(resumed.head.state_dict().values(), whole.head.state_dict().values()))
+    assert same(train(task, PROFILE, options, checkpoint=checkpoint, resume=True), whole)
 
 
 class Hostile:
     """What would run code when it is unpickled."""
 
-    def __init__(self, path):
-        self.path = path
-
     def __reduce__(self):
-        return os.mkdir, (str(self.path),)
-
-
-def test_a_checkpoint_holds_plain_values_and_never_runs_code(task, tmp_path):
-    options = replace(SMALL, epochs=1)
-    train(task, PROFILE, options, checkpoint=tmp_path / "state")
-    assert torch.load(tmp_path / "state", weights_only=True)["identity"]["features"] == "4"
-    torch.save({"identity": Hostile(tmp_path / "made")}, tmp_path / "state")
-    with pytest.raises(DamagedFileError, match="not a checkpoint"):
-        read_checkpoint(tmp_path / "state", options, task.sha256)
-    assert os.listdir(tmp_path) == ["state"]  # nothing stays beside it
+        return os.mkdir, ("made",)
 
 
 @pytest.mark.parametrize(("encoder", "given"), [("coherent", 40.0), ("incoherent", 60.0)])
@@ -168,32 +165,26 @@ def test_passive_encoders_learn_bars_without_creating_light(task, encoder, given
     assert reports[-1].photons <= given * 1.05
     shown = encoder_input(task, task.test, PROFILE, trained.options)
     with torch.no_grad():
-        p = sample_clicks(
-            torch_probability(trained.encoder(shown).double(), trained.law), torch.Generator().manual_seed(0)
-        )
+        chances = torch_probability(trained.encoder(shown).double(), trained.law)
+        p = sample_clicks(chances, torch.Generator().manual_seed(0))
         right = (trained.head(p.float()).argmax(dim=1).numpy() == task.test.labels).mean()
     assert right > 0.5  # by chance 0.25
 
 
-def test_pictures_can_be_given_back(task):
-    pictures = replace(task, target="image")
-    options = replace(SMALL, estimator="local", encoder="coherent", epochs=8, alpha=0.0)
-    reports = []
-    trained = train(pictures, PROFILE, options, report=reports.append)
-    assert reports[-1].loss < reports[0].loss
-    assert trained.head(torch.zeros(1, 4)).shape == (1, 36)
-
-
-def test_a_checkpoint_of_another_training_or_no_checkpoint_is_refused(task, tmp_path):
+@pytest.mark.usefixtures("short_fits")
+def test_a_checkpoint_of_another_training_or_none_is_refused_and_never_runs_code(task, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     checkpoint = tmp_path / "state"
     with pytest.raises(UsageError, match="not there"):
         train(task, PROFILE, SMALL, checkpoint=checkpoint, resume=True)
     train(task, PROFILE, Options(features=2, epochs=1, hidden=4), checkpoint=checkpoint)
     with pytest.raises(UsageError, match="features 2 \\(now 3\\)"):
         train(task, PROFILE, Options(features=3, epochs=1, hidden=4), checkpoint=checkpoint, resume=True)
-    checkpoint.write_bytes(b"damaged")
-    with pytest.raises(DamagedFileError, match="not a checkpoint"):
-        train(task, PROFILE, SMALL, checkpoint=checkpoint, resume=True)
+    for damage in (lambda: checkpoint.write_bytes(b"damaged"), lambda: torch.save({"identity": Hostile()}, checkpoint)):
+        damage()
+        with pytest.raises(DamagedFileError, match="not a checkpoint"):
+            train(task, PROFILE, SMALL, checkpoint=checkpoint, resume=True)
+    assert os.listdir(tmp_path) == ["state"]  # nothing stays beside it
 
 
 @pytest.mark.parametrize(
@@ -222,9 +213,9 @@ def test_impossible_options_are_refused(changed, said):
         check_options(replace(SMALL, **changed), PROFILE)
 
 
+@pytest.mark.usefixtures("short_fits")
 def test_train_and_evaluate_commands_agree(tmp_path, capsys):
-    images, labels = bars(400)
-    np.savez(tmp_path / "bars.npz", images=images, labels=labels)
+    bars_file(tmp_path / "bars.npz", 400)
     out = str(tmp_path / "bars.pans")
     shape = ["--features", "4", "--epochs", "6", "--hidden", "16"]
     assert main(["train", str(tmp_path / "bars.npz"), *shape, "-o", out, "--json"]) == 0
@@ -238,28 +229,17 @@ def test_train_and_evaluate_commands_agree(tmp_path, capsys):
     assert found["accuracy_mean"] == pytest.approx(said["accuracy_mean"])
     keys = "accuracy_mean accuracy_std clicks_mean photons_mean illumination objects trials"
     assert set(keys.split()) <= set(found)
-    bundle, _ = load_bundle(out)
-    test = load_task(str(tmp_path / "bars.npz")).test
-    assert evaluate_exactly(bundle, light_of(bundle, PROFILE, test.images), test.labels).accuracy_mean == pytest.approx(
-        found["accuracy_mean"]
-    )
-    images, labels = bars(100, seed=1)
-    np.savez(tmp_path / "others.npz", images=images, labels=labels)
-    other = ["evaluate", out, "--task", str(tmp_path / "others.npz"), "--trials", "3", "--shots", "2", "--json"]
-    assert main(other) == 0
+    others = bars_file(tmp_path / "others.npz", 100, seed=1)
+    assert main(["evaluate", out, "--task", others, "--trials", "3", "--shots", "2", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["objects"], found["trials"], found["shots"]) == (100, 3, 2)  # none of these were trained on
 
 
-def test_a_device_that_is_not_there_is_refused_by_name(task, tmp_path, capsys, monkeypatch):
+def test_a_device_that_is_not_there_is_refused_by_name(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    images, labels = bars(60)
-    np.savez(tmp_path / "bars.npz", images=images, labels=labels)
-    words = ["train", str(tmp_path / "bars.npz"), "--features", "4", "-o", str(tmp_path / "x.pans"), "--device", "cuda"]
+    words = ["train", "barcode", "--features", "4", "-o", str(tmp_path / "x.pans"), "--device", "cuda"]
     assert main(words) == 2
-    said = capsys.readouterr().err
-    assert "no CUDA device" in said
-    assert "--device cpu" in said
+    assert "no CUDA device" in capsys.readouterr().err
     assert not (tmp_path / "x.pans").exists()
 
 
