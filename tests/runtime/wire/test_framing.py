@@ -158,6 +158,9 @@ def test_frames_around_the_limits() -> None:
     for n_cuts in (0, 1, 40):
         frames = compare([*cut(whole, rng, n_cuts), b"\3", b"\0" + longest])
         assert [len(frame.payload) for frame in frames] == [MAX_PAYLOAD_BYTES] * 3
+    assert (
+        compare([cobs_encode(bytes(range(1, n + 1))) + b"\0" for n in (10, 11, 12, 13)]) == []
+    )  # short, or a wrong CRC
 
 
 def test_a_stream_longer_than_the_buffer() -> None:

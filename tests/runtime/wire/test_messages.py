@@ -175,30 +175,14 @@ def test_welcome_carries_facts_and_names_another_schema() -> None:
     assert wire.decode_welcome(stranger) == wire.Welcome(0xDEADBEEF, 2, {})
 
 
-def traffic() -> list[bytes]:
-    return [encoded for encoded, _, _ in GOLDEN] * 3
-
-
-def test_every_flipped_byte_is_detected_and_costs_one_frame() -> None:
-    before, victim, after = traffic()[0], traffic()[6], traffic()[1]
-    for position in range(len(victim)):
-        for bit in range(8):
-            damaged = bytearray(victim)
-            damaged[position] ^= 1 << bit
-            frames = FrameDecoder().feed(before + bytes(damaged) + after)
-            payloads = [frame.payload for frame in frames]
-            assert payloads[0] == one(before).payload
-            # a flipped delimiter also costs the frame behind it, and no frame is ever invented
-            assert payloads in ([payloads[0]], [payloads[0], one(after).payload])
-
-
-def test_an_endless_frame_is_bounded_and_the_next_one_read() -> None:
-    decoder = FrameDecoder()
-    for _ in range(100):
-        assert decoder.feed(b"\x01" * 10_000) == []
-    assert decoder.counters.oversized_frames == 1
-    assert decoder.feed(b"\0" + traffic()[0]) == [one(traffic()[0])]
-    assert decoder.counters.bytes_discarded == 1_000_000
+def test_every_flipped_bit_is_detected_and_costs_one_frame() -> None:
+    before, victim, after = (GOLDEN[place][0] for place in (0, 6, 1))
+    for bit in range(8 * len(victim)):
+        damaged = bytearray(victim)
+        damaged[bit // 8] ^= 1 << bit % 8
+        frames = FrameDecoder().feed(before + bytes(damaged) + after)
+        # a flipped delimiter also costs the frame behind it, and no frame is ever invented
+        assert frames in ([one(before)], [one(before), one(after)])
 
 
 def test_a_payload_that_is_too_large_is_not_sent() -> None:
