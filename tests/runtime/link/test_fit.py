@@ -1,4 +1,4 @@
-"""An upload: what the device then holds, with and without the extension, and a device that knows no automata."""
+"""An upload: what the device then holds, with and without the extension; devices and scenes that do not fit."""
 
 from __future__ import annotations
 
@@ -15,12 +15,20 @@ from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import load_scene
-from pans.runtime.bundle.model import Bundle
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.core.plan import build_plan
-from pans.runtime.errors import DeviceError
+from pans.runtime.errors import DeviceError, UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.connection import Connection
-from pans.runtime.link.fit import check_automaton, check_device, upload_commands
+from pans.runtime.link.fit import (
+    TEXT_MAX_BYTES,
+    check_automaton,
+    check_device,
+    check_scene,
+    scene_facts,
+    upload_commands,
+)
 from pans.runtime.wire.commands import Extension, announcement
 from pans.runtime.wire.messages import Opcode
 
@@ -90,3 +98,43 @@ def test_a_device_that_cannot_run_the_automaton_is_refused_with_the_numbers(fact
 
 def test_a_device_without_states_can_be_driven_by_the_host() -> None:
     check_automaton(announcement(Extension(0, 4)), build_plan(PROFILE, BUNDLE, drive="host"))
+
+
+# ---- scenes ----
+
+FASHION = load_bundle(SHIPPED / "fashion10.pans")[0]
+
+
+def test_what_belongs_together_is_taken() -> None:
+    for facts in (
+        {},
+        scene_facts(None, ()),
+        scene_facts((28, 28), ()),
+        scene_facts(None, FASHION.classes),
+        scene_facts((28, 28), FASHION.classes),
+        scene_facts((28, 28), [str(number) for number in range(10)]),  # as many without names
+    ):
+        check_scene(facts, FASHION)
+
+
+@pytest.mark.parametrize(
+    ("shape", "classes", "words"),
+    [
+        ((14, 14), FASHION.classes, "14 x 14 pixels"),
+        ((28, 28), ("cat", "dog"), "cat, dog"),
+        ((28, 28), ("0", "1"), "0, 1"),
+        ((28, 28), FASHION.classes[::-1], "Ankle boot, Bag, Sneaker"),
+        ((784, 1), (), "784 x 1 pixels and the classes unknown"),
+    ],
+)
+def test_what_does_not_is_refused(shape: tuple[int, int], classes: tuple[str, ...], words: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        check_scene({"scene": "s", **scene_facts(shape, classes)}, FASHION)
+    assert words in caught.value.message
+    assert "the bundle has 28 x 28 pixels and the classes T-shirt/top, Trouser" in caught.value.message
+
+
+def test_names_of_any_length_fit_into_a_welcome() -> None:
+    for classes in (["é" * 300] * 3, [str(i) for i in range(10_000)], ["a\nb", "\ud800"]):
+        assert all(len(str(fact).encode()) <= 256 for fact in scene_facts((1, 2), classes).values())
+    assert TEXT_MAX_BYTES < 256

@@ -1,7 +1,8 @@
-"""The registration file: what it keeps, what is refused, and `info` and `verify` on it."""
+"""The registration file: what it keeps and refuses, `info` and `verify` on it, and a run with it, whose replay is the same."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from datetime import timedelta
 from pathlib import Path
@@ -10,11 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
 from pans.runtime.imaging import Imaging
 from pans.runtime.instrument.calibration import now_utc, sealed
-from pans.runtime.instrument.profile import load_profile
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.record import read_recording
+from pans.runtime.registration.correct import corrected
 from pans.runtime.registration.estimate import Estimate
 from pans.runtime.registration.file import (
     check_usable,
@@ -28,11 +33,12 @@ PROFILE = load_profile("dmd-spad")
 TABLE = Imaging(right_px=1.0, down_px=-0.5, rotation_deg=2.0, scale=1.01, psf_px=0.6, black=0.002, gain=0.9)
 
 
-def values(**changes: Any) -> dict[str, Any]:
-    found = Estimate(vector_of(TABLE, (0.1, 0.0, 0.0, 0.0, 0.0), 0.004), np.eye(DARK + 1) * 1e-4, 0.0, 9.0, 9, 100, 200)
+def values(table: Imaging = TABLE, bent: float = 0.1, profile: Profile = PROFILE, **changes: Any) -> dict[str, Any]:
+    vector = vector_of(table, (bent, 0.0, 0.0, 0.0, 0.0), 0.004)
+    found = Estimate(vector, np.eye(DARK + 1) * 1e-4, 0.0, 9.0, 9, 100, 200)
     return {
         "made_utc": now_utc().isoformat(timespec="seconds"),
-        "profile": {"name": PROFILE.name, "sha256": PROFILE.sha256},
+        "profile": {"name": profile.name, "sha256": profile.sha256},
         "device": {},
         **registration_values(found, (28, 28)),
         **changes,
@@ -110,3 +116,42 @@ def test_a_run_refuses_what_is_of_another_table(tmp_path: Path) -> None:
         check_usable(found, PROFILE, (28, 28), now + timedelta(hours=25))
     with pytest.raises(ConfigError, match=r"1\.0 h in the future"):
         check_usable(found, PROFILE, (28, 28), now - timedelta(hours=1))
+
+
+# ---- in a run ----
+
+URL = "sim:oled-qcmos?pace=fast&seed=3&optics=shift=1,1"
+
+
+def registered(folder: Path, **changes: Any) -> Path:
+    shifted = Imaging(right_px=1.0, down_px=1.0, psf_px=0.002)
+    save_registration(folder / "table.json", values(shifted, 0.0, load_profile("oled-qcmos"), **changes))
+    return folder / "table.json"
+
+
+def test_a_run_shows_the_corrected_patterns_and_its_replay_is_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table, out = registered(tmp_path), tmp_path / "out"
+    words = ["run", "fashion10", "--device", URL, "--registration", str(table), "--out", str(out), "--no-realtime"]
+    assert main([*words, "--decisions", "20", "--json"]) == 0
+    captured = capsys.readouterr()
+    summary = json.loads(captured.out.splitlines()[-1])
+    assert "patterns corrected for the table" in captured.err
+    recording = read_recording(out / "run.pansrec")
+    kept = recording.header["config"]["registration"]
+    shown, _ = corrected(load_bundle(SHIPPED / "fashion10.pans")[0], load_registration(table).imaging())
+    assert kept["sha256"] == summary["registration"]["sha256"] == hashlib.sha256(table.read_bytes()).hexdigest()
+    assert kept["levels_sha256"] == hashlib.sha256(shown.pattern_levels.astype("<u2").tobytes()).hexdigest()
+    assert summary["illumination"] == pytest.approx(shown.illumination())
+    assert summary["registration"]["error_after"] < 0.2 * summary["registration"]["error_before"]
+    assert main(["replay", str(out / "run.pansrec"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["identical"] is True
+
+
+def test_a_run_refuses_a_registration_of_another_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = registered(tmp_path, device={"serial": "another"})
+    call = ["run", "fashion10", "--device", URL, "--registration", str(table), "--decisions", "1", "--no-realtime"]
+    assert main([*call, "--out", str(tmp_path / "out")]) == 2
+    assert "made on the device another" in capsys.readouterr().err
+    assert not list((tmp_path / "out").glob("*.pansrec"))
