@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import pytest
 
@@ -24,12 +25,20 @@ def deliver(session: HostSession, data: bytes, now_ns: int = 0) -> list[bool]:
     return [session.on_frame(frame, now_ns) for frame in FrameDecoder().feed(data)]
 
 
-def opened() -> HostSession:
+def opened(commands: int = 0, opcode: Opcode = Opcode.STOP, **options: bool) -> HostSession:
+    """A session in which so many commands have been sent, or wait for room."""
     session = HostSession(NONCE)
     session.start(0)
     session.take_output()
     deliver(session, wire.encode_welcome({"tick_hz": 1}, NONCE))
+    for _ in range(commands):
+        session.submit(opcode, **options)
+    session.poll(0)
     return session
+
+
+def acknowledge(session: HostSession, last_id: int, *refusal: Any, now_ns: int = 0) -> list[bool]:
+    return deliver(session, wire.encode_ack(Ack(last_id, *(refusal or (0, 0, ""))), NONCE), now_ns)
 
 
 def ids(frames: list[wire.Frame]) -> list[int]:
@@ -89,32 +98,23 @@ def test_frames_of_another_session_are_counted_and_dropped() -> None:
 
 
 def test_commands_go_out_in_order_and_at_most_eight_wait() -> None:
-    session = opened()
-    for _ in range(12):
-        session.submit(Opcode.STOP)
-    session.poll(0)
+    session = opened(12)
     assert ids(sent(session)) == [1, 2, 3, 4, 5, 6, 7, 8]
-    deliver(session, wire.encode_ack(Ack(3, 0, 0, ""), NONCE))
-    session.poll(1 * MS)
-    assert ids(sent(session)) == [9, 10, 11]
-    assert session.in_flight
-    deliver(session, wire.encode_ack(Ack(11, 0, 0, ""), NONCE))
-    session.poll(2 * MS)
-    assert ids(sent(session)) == [12]
-    deliver(session, wire.encode_ack(Ack(12, 0, 0, ""), NONCE))
+    for last_id, then in ((3, [9, 10, 11]), (11, [12]), (12, [])):
+        assert session.in_flight
+        acknowledge(session, last_id)
+        session.poll(MS)
+        assert ids(sent(session)) == then
     assert session.in_flight == 0
 
 
 def test_unacknowledged_commands_repeat_at_a_slowing_pace_and_then_give_up() -> None:
-    session = opened()
-    session.submit(Opcode.STOP)
-    session.submit(Opcode.RESET)
+    session = opened(2)
     repeats = []
     with pytest.raises(LinkError, match="command 1 was not acknowledged within 10000 ms"):
         for now_ms in range(0, 20_000, 10):
             session.poll(now_ms * MS)
-            frames = ids(sent(session))
-            if frames:
+            if frames := ids(sent(session)):
                 assert frames == [1, 2]
                 repeats.append(now_ms)
     gaps = [later - earlier for earlier, later in itertools.pairwise(repeats)]
@@ -124,38 +124,27 @@ def test_unacknowledged_commands_repeat_at_a_slowing_pace_and_then_give_up() -> 
 
 
 def test_an_acknowledgement_restarts_the_clock_of_the_next_command() -> None:
-    session = opened()
-    session.submit(Opcode.STOP)
-    session.submit(Opcode.STOP)
-    session.poll(0)
+    session = opened(2)
     session.take_output()
-    deliver(session, wire.encode_ack(Ack(1, 0, 0, ""), NONCE), 9_000 * MS)
-    session.poll(9_200 * MS)
-    assert sent(session) == []
-    session.poll(9_250 * MS)
-    assert ids(sent(session)) == [2]
+    acknowledge(session, 1, now_ns=9_000 * MS)
+    for now_ms, repeated in ((9_200, []), (9_250, [2])):
+        session.poll(now_ms * MS)
+        assert ids(sent(session)) == repeated
 
 
 def test_an_acknowledgement_of_a_command_that_was_never_sent_is_counted_and_ignored() -> None:
-    session = opened()
-    for _ in range(10):
-        session.submit(Opcode.STOP)
-    session.poll(0)  # 9 and 10 wait for room
-    session.take_output()
+    session = opened(10)  # 9 and 10 wait for room
     for last_id in (9, 10, 11):
-        deliver(session, wire.encode_ack(Ack(last_id, 0, 0, ""), NONCE))
+        acknowledge(session, last_id)
     assert (session.counters.implausible, session.in_flight, session.answered) == (3, 10, 0)
-    deliver(session, wire.encode_ack(Ack(8, 0, 0, ""), NONCE))
+    acknowledge(session, 8)
     assert (session.counters.implausible, session.in_flight, session.answered) == (3, 2, 8)
 
 
 def test_stop_follows_the_commands_that_the_device_may_lack() -> None:
-    session = opened()
-    for _ in range(11):
-        session.submit(Opcode.RESET)
-    session.poll(0)
+    session = opened(11, Opcode.RESET)
     session.take_output()
-    deliver(session, wire.encode_ack(Ack(2, 0, 0, ""), NONCE))
+    acknowledge(session, 2)
     frames = FrameDecoder().feed(session.stop_frames())
     assert ids(frames) == list(range(3, 13))  # unacknowledged, then waiting, then STOP
     assert [wire.decode_command(frame.payload).opcode for frame in frames] == 9 * [Opcode.RESET] + [Opcode.STOP]
@@ -164,12 +153,26 @@ def test_stop_follows_the_commands_that_the_device_may_lack() -> None:
 
 
 def test_a_refusal_is_raised_once_with_the_devices_words() -> None:
-    session = opened()
-    session.submit(Opcode.LOAD_PLAN)
-    session.poll(0)
+    session = opened(1, Opcode.LOAD_PLAN)
     with pytest.raises(DeviceError, match=r"command 1 \(OUT_OF_RANGE\): slot 9"):
-        deliver(session, wire.encode_ack(Ack(1, 1, wire.AckStatus.OUT_OF_RANGE, "slot 9"), NONCE))
-    assert deliver(session, wire.encode_ack(Ack(1, 1, wire.AckStatus.OUT_OF_RANGE, "slot 9"), NONCE)) == [False]
+        acknowledge(session, 1, 1, wire.AckStatus.OUT_OF_RANGE, "slot 9")
+    assert acknowledge(session, 1, 1, wire.AckStatus.OUT_OF_RANGE, "slot 9") == [False]
+
+
+def test_a_command_that_may_be_refused_is_reported_and_the_session_goes_on() -> None:
+    session = opened(2, Opcode.GATE, may_be_refused=True)
+    acknowledge(session, 2, 2, wire.AckStatus.TOO_LATE, "gone", 0b11)
+    found = [(refusal.command_id, refusal.status) for refusal in session.refusals]
+    assert found == [(1, session_module.UNKNOWN_STATUS), (2, wire.AckStatus.TOO_LATE)]
+    assert session.in_flight == 0
+
+
+def test_a_lost_command_is_repeated_at_once_but_not_for_every_answer() -> None:
+    session = opened(3)
+    session.take_output()
+    for now_ns, repeated in ((MS, [1, 2, 3]), (2 * MS, []), (MS + session_module.FAST_RETRY_NS, [1, 2, 3])):
+        acknowledge(session, 0, now_ns=now_ns)
+        assert ids(sent(session)) == repeated, now_ns
 
 
 def test_stream_and_status_frames_are_handed_on_the_rest_is_digested() -> None:
@@ -190,47 +193,13 @@ def test_malformed_and_unknown_messages_are_counted() -> None:
     assert (session.counters.malformed, session.counters.unknown_type) == (1, 1)
 
 
-def test_an_answer_with_another_echo_is_no_probe() -> None:
+def test_a_probe_counts_once_and_by_its_own_echo() -> None:
     session = opened()
     session.probe(2)
-    deliver(session, wire.encode_pong(wire.Pong(1, 3, 3, 4), NONCE), 55)
-    assert (session.counters.implausible, len(session.pongs)) == (1, 0)
-    deliver(session, wire.encode_pong(wire.Pong(1, 2, 3, 4), NONCE), 56)
-    assert len(session.pongs) == 1
-
-
-def test_a_lost_command_is_repeated_at_once_but_not_for_every_answer() -> None:
-    session = opened()
-    for _ in range(3):
-        session.submit(Opcode.STOP)
-    session.poll(0)
-    assert ids(sent(session)) == [1, 2, 3]
-    nothing_done = wire.encode_ack(Ack(0, 0, 0, ""), NONCE)
-    for now_ns, repeated in ((MS, [1, 2, 3]), (2 * MS, []), (MS + session_module.FAST_RETRY_NS, [1, 2, 3])):
-        deliver(session, nothing_done, now_ns)
-        assert ids(sent(session)) == repeated, now_ns
-
-
-def test_a_probe_counts_once() -> None:
-    session = opened()
-    session.probe(2)
-    answer = wire.encode_pong(wire.Pong(1, 2, 3, 4), NONCE)
-    deliver(session, answer, 55)
-    deliver(session, answer, 60_000)
-    deliver(session, wire.encode_pong(wire.Pong(9, 2, 3, 4), NONCE), 70_000)
+    for pong, now_ns in (((1, 3), 54), ((1, 2), 55), ((1, 2), 60_000), ((9, 2), 70_000)):
+        deliver(session, wire.encode_pong(wire.Pong(*pong, 3, 4), NONCE), now_ns)
     assert [arrival_ns for _, arrival_ns in session.pongs] == [55]
-    assert session.counters.stale_probes == 2
-
-
-def test_a_command_that_may_be_refused_is_reported_and_the_session_goes_on() -> None:
-    session = opened()
-    first = session.submit(Opcode.GATE, b"", may_be_refused=True)
-    second = session.submit(Opcode.GATE, b"", may_be_refused=True)
-    session.poll(0)
-    deliver(session, wire.encode_ack(Ack(2, 2, wire.AckStatus.TOO_LATE, "gone", 0b11), NONCE))
-    assert [refusal.command_id for refusal in session.refusals] == [first, second]
-    assert [refusal.status for refusal in session.refusals] == [session_module.UNKNOWN_STATUS, wire.AckStatus.TOO_LATE]
-    assert session.in_flight == 0
+    assert (session.counters.implausible, session.counters.stale_probes) == (1, 2)
 
 
 def test_a_device_that_restarts_within_the_session_is_told() -> None:
@@ -242,10 +211,10 @@ def test_a_device_that_restarts_within_the_session_is_told() -> None:
 
 
 def test_a_full_queue_of_commands_is_refused_not_dropped() -> None:
-    session = opened()
-    for _ in range(session_module.MAX_WAITING):
+    session = opened(session_module.COMMAND_WINDOW)
+    while session.has_room:
         session.submit(Opcode.STOP)
-    assert not session.has_room
+    assert session.in_flight == session_module.COMMAND_WINDOW + session_module.MAX_WAITING
     with pytest.raises(LinkError, match="256 commands wait"):
         session.submit(Opcode.STOP)
 
