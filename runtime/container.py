@@ -12,7 +12,7 @@ import re
 import stat
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -235,28 +235,21 @@ def file_prologue(magic: bytes, version: int) -> tuple[bytes, int]:
     return start + _CRC.pack(chain), chain
 
 
-def check_prologue(data: bytes, magic: bytes, versions: Collection[int], where: str) -> tuple[int, int]:
-    """Return the version and the checksum that seeds the first block; DamagedFileError for a foreign, cut, altered or newer file."""
+def check_prologue(data: bytes, magic: bytes, version: int, where: str) -> int:
+    """Return the checksum that seeds the first block; DamagedFileError for a foreign, cut, altered or newer file."""
     if data[: len(magic)] != magic[: len(data)]:
         what, taker = other_kind(data)
-        found = f"it is {what}" if what else f"it starts with {data[:8]!a}, expected {magic!a}"
-        raise DamagedFileError(f"{where}: not a recording: {found}", remedy=taker)
+        kind = f"it is {what}" if what else f"it starts with {data[:8]!a}, expected {magic!a}"
+        raise DamagedFileError(f"{where}: not a recording: {kind}", remedy=taker)
     if len(data) < FILE_PROLOGUE.size:
         raise DamagedFileError(f"{where}: cut after {len(data)} bytes, nothing of it can be read")
     _, found, crc = FILE_PROLOGUE.unpack_from(data)
     if zlib.crc32(data[: FILE_PROLOGUE.size - 4]) != crc:
         raise DamagedFileError(f"{where}: altered within its first {FILE_PROLOGUE.size} bytes")
-    if found not in versions:
+    if found != version:
         remedy = "use the pans-runtime that wrote it"
-        allowed = ", ".join(str(version) for version in sorted(versions))
-        raise DamagedFileError(f"{where}: format version {found}, allowed: {allowed}", remedy=remedy)
-    return found, crc
-
-
-def block_bytes(kind: int, index: int, chain: int, payload: bytes) -> tuple[bytes, int]:
-    """Return a block's bytes and the next chain value; each CRC is seeded with the one before it, so order is covered."""
-    head, tail, payload_crc = block_ends(kind, index, chain, payload)
-    return b"".join([head, payload, tail]), payload_crc
+        raise DamagedFileError(f"{where}: format version {found}, allowed: {version}", remedy=remedy)
+    return int(crc)
 
 
 def block_ends(kind: int, index: int, chain: int, payload: bytes | memoryview) -> tuple[bytes, bytes, int]:

@@ -100,7 +100,7 @@ def _begin(path: Path) -> tuple[dict[str, Any], str]:
     """Return a recording's header and the name of the bundle inside, {} and "" if they cannot be read."""
     header: dict[str, Any] = {}
     with suppress(PansError, OSError), open_regular(path) as file:
-        _, chain = check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, (FORMAT_VERSION,), str(path))
+        chain = check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, FORMAT_VERSION, str(path))
         for number in range(2):
             block = read_block(file, number, chain, LIMITS, str(path))
             if block is not None and block.kind == Kind.HEADER:

@@ -53,10 +53,6 @@ def expand_timings(runs: NDArray[np.void]) -> NDArray[np.void]:
     """Return the rows, TIMING_DTYPE, that `runs`, TIMING_RUN_DTYPE (n,), stand for."""
     counts = runs["count"].astype(np.int64)
     rows: NDArray[np.void] = np.empty(int(counts.sum()), TIMING_DTYPE)
-    if len(rows) == len(runs):
-        for name in TIMING_DTYPE.names or ():
-            rows[name] = runs[name]
-        return rows
     for name in TIMING_DTYPE.names or ():
         rows[name] = np.repeat(runs[name], counts)
     rows["index"] += (np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)).astype(np.uint64)

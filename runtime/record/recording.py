@@ -228,7 +228,7 @@ def _start(file: Any, where: str) -> int:
     start = file.read(FILE_PROLOGUE.size)
     if not start.startswith(MAGIC):
         start += file.read(KIND_BYTES)  # to say what it is
-    return check_prologue(start, MAGIC, (FORMAT_VERSION,), where)[1]
+    return check_prologue(start, MAGIC, FORMAT_VERSION, where)
 
 
 def _blocks(file: Any, chain: int, where: str) -> Iterator[Block]:

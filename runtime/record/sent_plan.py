@@ -82,30 +82,29 @@ class Sent:
                 raise MalformedMessage(f"state {state} was shown as {shown} (pattern, dwell, steps), it is {known}")
         return plan
 
-    def take(self, session: int, command: CommandMessage) -> None:
-        """Take one command; MalformedMessage when it cannot be read, or a state was shown in two ways."""
+
+def sent_to_device(recording: Recording) -> Sent:
+    """Return what was sent to the device (repetitions left out).
+
+    MalformedMessage when a command cannot be read, a state was shown in two ways, or the device was never armed.
+    """
+    sent = Sent()
+    for session, command in _sent_commands(recording):
         if command.opcode == Opcode.LOAD_PLAN:
             chunk = unpack_command(PlanChunk, command.body)
-            self.chunks[chunk.first_slot] = chunk
+            sent.chunks[chunk.first_slot] = chunk
         elif command.opcode in (Opcode.LOAD_STATES, Opcode.LOAD_COUNT_STATES):
             states = unpack_states(command.opcode, command.body)
-            self.states[states.first_state] = states
+            sent.states[states.first_state] = states
         elif command.opcode == Opcode.READ_COUNTS:
-            self.read.append(unpack_command(ReadCounts, command.body))
+            sent.read.append(unpack_command(ReadCounts, command.body))
         elif command.opcode == Opcode.SHOW:
             show = unpack_command(Show, command.body)
             seen = (show.pattern, show.dwell, show.dwell_steps)
-            if self.shown.setdefault(show.state, seen) != seen:
+            if sent.shown.setdefault(show.state, seen) != seen:
                 raise MalformedMessage(f"state {show.state} was shown in two ways")
         elif command.opcode == Opcode.ARM:
-            self.arms[session] = unpack_command(Arm, command.body)
-
-
-def sent_to_device(recording: Recording) -> Sent:
-    """Return what was sent to the device (repetitions left out); MalformedMessage if it was never armed."""
-    sent = Sent()
-    for session, command in _sent_commands(recording):
-        sent.take(session, command)
+            sent.arms[session] = unpack_command(Arm, command.body)
     if not sent.arms:
         raise MalformedMessage("the device was never armed")
     return sent

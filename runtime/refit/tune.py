@@ -307,9 +307,7 @@ class Trial(NamedTuple):
 
     loss: F64  # (objects,)
     right: F64  # (objects,)
-    light: dict[
-        str, float | None
-    ]  # means per decision: clicks, photons (None: the instrument does not know), illumination
+    light: dict[str, float | None]  # means per decision: clicks, photons (None: unknown), illumination
     cost: Cost  # clicks stand for photons where the instrument does not know them
     simulated: bool
 

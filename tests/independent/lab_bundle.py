@@ -1,14 +1,11 @@
-"""Bundles and the chain of layers in their heads, read as a lab would from docs/reference/formats.md alone.
-
-Owns the file's layout and checksums, and as much of ONNX as that page names. Imports nothing of the package.
-"""
+"""Bundles and the chain of layers in their heads, read as a lab would from docs/reference/formats.md alone."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import struct
-from collections.abc import Iterator
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -102,84 +99,48 @@ def read_bundle(data: bytes) -> Bundle:
 # ---- as much of ONNX as a chain of layers needs; field numbers are those of onnx.proto ----
 
 
-def fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Yield (field number, value) of one protobuf message: integers, or bytes for all else."""
+def varint(data: bytes, at: int) -> tuple[int, int]:
+    """Return a protobuf integer and the place behind it."""
+    value = shift = 0
+    while data[at] >= 0x80:
+        value, shift, at = value | (data[at] & 0x7F) << shift, shift + 7, at + 1
+    return value | data[at] << shift, at + 1
+
+
+def fields(data: bytes) -> dict[int, list[Any]]:
+    """Return the values of one protobuf message by field number: integers, or bytes for all else."""
+    found: dict[int, list[Any]] = defaultdict(list)
     at = 0
-
-    def varint() -> int:
-        nonlocal at
-        value = shift = 0
-        while True:
-            byte = data[at]
-            at += 1
-            value |= (byte & 0x7F) << shift
-            shift += 7
-            if byte < 0x80:
-                return value
-
     while at < len(data):
-        key = varint()
-        number, kind = key >> 3, key & 7
-        demand(kind in (0, 1, 2, 5), "protobuf wire type")
-        if kind == 0:
-            yield number, varint()
-            continue
-        size = varint() if kind == 2 else {1: 8, 5: 4}[kind]
-        demand(at + size <= len(data), "protobuf length")
-        yield number, data[at : at + size]
-        at += size
+        key, at = varint(data, at)
+        value: Any
+        if key & 7 == 0:
+            value, at = varint(data, at)
+        else:
+            size, at = varint(data, at) if key & 7 == 2 else ({1: 8, 5: 4}[key & 7], at)
+            demand(at + size <= len(data), "protobuf length")
+            value, at = data[at : at + size], at + size
+        found[key >> 3].append(value)
+    return found
 
 
 def chain_of_layers(model: bytes) -> list[Layer]:
-    """Return the layers of an ONNX model that is a chain of Gemm, or MatMul and Add, with Relu between."""
-    graph = next(value for number, value in fields(model) if number == 7)
-    assert isinstance(graph, bytes)
-    inside = [(number, value) for number, value in fields(graph) if isinstance(value, bytes)]
-    tensors = dict(_tensor(value) for number, value in inside if number == 5)
-    current = next(_text(value, 1) for number, value in inside if number == 11)
-    result = next(_text(value, 1) for number, value in inside if number == 12)
-    layers: list[Layer] = []
-    for value in (value for number, value in inside if number == 1):
-        inputs, outputs, operator, transposed = _node(value)
-        demand(current in inputs, f"{operator} does not go on from {current}")
-        constants = [tensors[name] for name in inputs if name != current]
+    """Return the layers of an ONNX model that is a chain of Gemm and Relu."""
+    graph = fields(fields(model)[7][0])
+    tensors = {}
+    for tensor in map(fields, graph[5]):
+        values = np.frombuffer((tensor[9] or tensor[4])[0], "<f4")
+        tensors[tensor[8][0]] = values.reshape(tensor[1])
+    current, layers = fields(graph[11][0])[1][0], list[Layer]()
+    for node in map(fields, graph[1]):
+        operator = node[4][0].decode()
+        demand(operator in ("Gemm", "Relu") and node[1][0] == current, f"{operator} does not continue the chain")
         if operator == "Relu":
             layers[-1] = layers[-1]._replace(relu=True)
-        elif operator == "Add":
-            layers[-1] = layers[-1]._replace(bias=constants[0].reshape(-1))
-        elif operator in ("Gemm", "MatMul"):
-            weights = constants[0].T if transposed else constants[0]
-            bias = constants[1].reshape(-1) if len(constants) > 1 else np.zeros(weights.shape[1], np.float32)
-            layers.append(Layer(weights, bias, False))
         else:
-            raise Damaged(f"operator {operator} is none of a chain of layers")
-        current = outputs[0]
-    demand(current == result and bool(layers), "the chain does not end at the output")
+            weights, bias = (tensors[name] for name in node[1][1:])
+            transposed = any(one[1] == [b"transB"] and one[3] == [1] for one in map(fields, node[5]))
+            layers.append(Layer(weights.T if transposed else weights, bias.reshape(-1), False))
+        current = node[2][0]
+    demand(current == fields(graph[12][0])[1][0] and bool(layers), "the chain does not end at the output")
     return layers
-
-
-def _text(data: bytes, wanted: int) -> str:
-    return next(value.decode() for number, value in fields(data) if number == wanted and isinstance(value, bytes))
-
-
-def _node(data: bytes) -> tuple[list[str], list[str], str, bool]:
-    inputs, outputs, operator, transposed = [], [], "", False
-    for number, value in fields(data):
-        assert isinstance(value, bytes)
-        if number == 1:
-            inputs.append(value.decode())
-        elif number == 2:
-            outputs.append(value.decode())
-        elif number == 4:
-            operator = value.decode()
-        elif number == 5 and _text(value, 1) == "transB":
-            transposed = any(inner == (3, 1) for inner in fields(value))
-    return inputs, outputs, operator, transposed
-
-
-def _tensor(data: bytes) -> tuple[str, NDArray[np.float32]]:
-    shape = [value for number, value in fields(data) if number == 1]
-    blobs = {number: value for number, value in fields(data) if number in (4, 9)}
-    floats = blobs.get(9, blobs.get(4, b""))
-    assert isinstance(floats, bytes)
-    return _text(data, 8), np.frombuffer(floats, "<f4").reshape([int(size) for size in shape])

@@ -1,7 +1,4 @@
-"""Frames of the instrument protocol, as a lab would write them from docs/reference/protocol.md alone (sections 1 and 2).
-
-Owns COBS, the checksum and the cutting of a byte stream; never looks into a payload. Imports nothing of the package.
-"""
+"""Frames of the instrument protocol, as a lab would write them from docs/reference/protocol.md alone (sections 1 and 2)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """What the independent firmware measures: uploaded patterns times the objects of a scene, and clicks.
 
 From docs/reference: protocol.md ("Patterns and light"), profiles.md (`peak_photoelectrons_hz`, the click law without read noise) and
-simulator.md (scene files). Imports nothing of the package.
+simulator.md (scene files).
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
     python lab_port.py --listen tcp --scene scene.npz --levels 124 --peak-hz 60000 [--mode parallel --channels 10]
 
 The first line on stdout is the device URL for `pans run`; on SIGTERM the last one is the device's books as JSON.
-Imports nothing of the package.
 """
 
 from __future__ import annotations

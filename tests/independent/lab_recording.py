@@ -1,7 +1,4 @@
-"""Recordings, read as a lab would from docs/reference/formats.md alone: the chain of blocks, messages, commands, the decision log.
-
-Owns the file's layout and checksums; what messages mean is lab_decisions.py's. Imports nothing of the package.
-"""
+"""Recordings, read as a lab would from docs/reference/formats.md alone: the chain of blocks, messages, commands, the decision log."""
 
 from __future__ import annotations
 
@@ -28,6 +25,7 @@ RUN = np.dtype(
         *(("truth", "<i2"), ("continues", "<u2")),
     ]
 )
+ENTRIES = {MESSAGES: "messages", ANSWERS: "answers", COMMANDS: "commands"}
 NO_NUMBER = 0xFFFF
 STEPS = {"tick": "tick_step", "exposure_index": "exposure_step", "shot": "shot_step"}
 
@@ -95,12 +93,8 @@ def _take(recording: Recording, kind: int, payload: bytes) -> None:
     elif kind == BUNDLE:
         demand(not recording.bundle, "a second bundle")
         recording.bundle = payload
-    elif kind == MESSAGES:
-        recording.messages += _entries(payload)
-    elif kind == ANSWERS:
-        recording.answers += _entries(payload)
-    elif kind == COMMANDS:
-        recording.commands += _entries(payload)
+    elif kind in ENTRIES:
+        getattr(recording, ENTRIES[kind]).extend(_entries(payload))
     elif kind == CLOCK:
         recording.clock += struct.iter_unpack("<qQq", payload)
     elif kind == TIMINGS:

@@ -24,7 +24,7 @@ from pans.firmware_sim.scene.scene_file import open_scene
 from pans.firmware_sim.testing import small_automaton_bundle, small_setup
 from pans.runtime.bundle.model import BackEnd, Bundle, load_bundle, make_bundle, write_bundle
 from pans.runtime.bundle.optics import Analyser
-from pans.runtime.container import block_bytes, canonical_json, file_prologue
+from pans.runtime.container import block_ends, canonical_json, file_prologue
 from pans.runtime.core.plan import build_plan
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DamagedFileError, PlanError, UsageError
@@ -232,8 +232,8 @@ def sealed(blocks: list[tuple[int, bytes]]) -> bytes:
         elif kind == Kind.END:
             facts = {"blocks": index, "decisions": decisions, "decisions_sha256": log.hexdigest()}
             payload = _with(payload, facts)
-        block, chain = block_bytes(kind, index, chain, payload)
-        pieces.append(block)
+        head, tail, chain = block_ends(kind, index, chain, payload)
+        pieces += [head, payload, tail]
     return b"".join(pieces)
 
 
