@@ -54,10 +54,8 @@ def __getattr__(name: str) -> object:
     except ModuleNotFoundError as error:
         if name != "evaluate":
             raise
-        raise UsageError(
-            f"pans.evaluate needs the package {error.name}, which is not installed",
-            remedy="pip install 'pans-runtime[train]'",
-        ) from error
+        what = f"pans.evaluate needs the package {error.name}, which is not installed"
+        raise UsageError(what, remedy="pip install 'pans-runtime[train]'") from error
     return globals()[name]
 
 

@@ -65,10 +65,8 @@ def phase_mask(seed: int = MASK_SEED) -> NDArray[np.float64]:
 def scatter(images: NDArray[np.uint8], seed: int = MASK_SEED) -> NDArray[np.complex64]:
     """Return the field at the end of the fibre, complex64 (n, 28, 28), of images uint8 (n, 28, 28); sum |E|^2 is kept."""
     if images.dtype != np.uint8 or images.ndim != 3 or images.shape[1:] != (FIBRE_SIDE_PX, FIBRE_SIDE_PX):
-        raise UsageError(
-            f"images for the fibre are {images.dtype} {images.shape}",
-            remedy=f"allowed: uint8 (n, {FIBRE_SIDE_PX}, {FIBRE_SIDE_PX})",
-        )
+        what = f"images for the fibre are {images.dtype} {images.shape}"
+        raise UsageError(what, remedy=f"allowed: uint8 (n, {FIBRE_SIDE_PX}, {FIBRE_SIDE_PX})")
     turn = np.exp(1j * phase_mask(seed))
     out = np.empty(images.shape, np.complex64)
     for start in range(0, len(images), _SCATTERED_AT_ONCE):

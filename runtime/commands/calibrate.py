@@ -82,10 +82,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     with as_usage_error():
         found = fit_light(joined_counts(counts_of(core, first, profile)), model).level
     if found.value <= 0 or not math.isfinite(found.value):
-        raise UsageError(
-            "no exposure with light clicked" if found.value <= 0 else "every exposure with light clicked",
-            remedy="check the light path: a clear field must stand before the detector, neither dark nor blinding",
-        )
+        what = "no exposure with light clicked" if found.value <= 0 else "every exposure with light clicked"
+        remedy = "check the light path: a clear field must stand before the detector, neither dark nor blinding"
+        raise UsageError(what, remedy=remedy)
     second = design_run(profile, TELLING, found.value, (1 - FIRST_STAGE_SHARE) * args.seconds, args.seed + 1)
     core, facts, more = _measure(args.device, profile, second)
     doubts += more

@@ -140,7 +140,5 @@ def _walked(automaton: Automaton, words: NDArray[np.int64]) -> tuple[NDArray[np.
 def demand_one_shot(shots: int) -> None:
     """Raise UsageError for several shots per decision."""
     if shots != 1:
-        raise UsageError(
-            f"an automaton decides on one walk, not on {shots} shots: what it shows depends on its own clicks",
-            remedy="use --shots 1; --trials gives several walks per object, each a decision",
-        )
+        what = f"an automaton decides on one walk, not on {shots} shots: what it shows depends on its own clicks"
+        raise UsageError(what, remedy="use --shots 1; --trials gives several walks per object, each a decision")

@@ -53,10 +53,8 @@ def make_decider(
     golden vectors.
     """
     if backend not in BACKENDS and backend not in offered_backends():
-        raise UsageError(
-            f"back end {backend!r}, allowed: {', '.join(backend_names())}",
-            remedy="install the package that offers it, if it is none of ours",
-        )
+        what = f"back end {backend!r}, allowed: {', '.join(backend_names())}"
+        raise UsageError(what, remedy="install the package that offers it, if it is none of ours")
     if shots < 1:
         raise UsageError(f"shots is {shots}, allowed: 1 or more")
     if bundle.automaton is not None and backend in BACKENDS:
@@ -64,10 +62,8 @@ def make_decider(
     if dose is not None:
         raise UsageError(f"a walk's dose, but {bundle.name} has no automaton", remedy="leave it out")
     if confidence:
-        raise UsageError(
-            f"confidence is {confidence:g}, but {bundle.name} shows all its patterns before it decides",
-            remedy="leave it out, or use the bundle of an automaton and its own back end",
-        )
+        what = f"confidence is {confidence:g}, but {bundle.name} shows all its patterns before it decides"
+        raise UsageError(what, remedy="leave it out, or use the bundle of an automaton and its own back end")
     if bundle.picture_shape is not None:
         if backend not in ("auto", PictureDecider.name):
             raise UsageError(f"back end {backend!r}: pictures come from the head alone", remedy="use the back end onnx")
@@ -113,10 +109,8 @@ def _choose(bundle: Bundle, shots: int) -> Decider:
         table.choice = {"chosen": table.name, "why": "one look-up per decision"}
         return table
     if bundle.head_onnx is None:
-        raise UsageError(
-            f"{bundle.name} has only a table of single shots, which cannot answer {shots} shots",
-            remedy="use --shots 1, or a bundle with an ONNX head",
-        )
+        what = f"{bundle.name} has only a table of single shots, which cannot answer {shots} shots"
+        raise UsageError(what, remedy="use --shots 1, or a bundle with an ONNX head")
     onnx = OnnxDecider(bundle)
     candidates: list[Any] = [onnx]
     with suppress(UsageError):  # a head that is no plain chain of layers: onnxruntime runs it
@@ -164,10 +158,8 @@ class OfferedDecider:
         for member, value in wanted.items():
             found = getattr(self._theirs, member, None)
             if found != value:
-                raise UsageError(
-                    f"{self._whose}: its {member} is {found!r}, must be {value!r}",
-                    remedy="take the name of the entry point, and the numbers of patterns and classes of the bundle",
-                )
+                remedy = "take the name of the entry point, and the numbers of patterns and classes of the bundle"
+                raise UsageError(f"{self._whose}: its {member} is {found!r}, must be {value!r}", remedy=remedy)
         tried = np.random.default_rng(CLICKS_SEED)
         for row in tried.integers(0, shots * self.largest + 1, size=(TRIED, self.n_features)):
             self.decide(row, shots)
@@ -177,15 +169,11 @@ class OfferedDecider:
         try:
             label, probability = self._theirs.decide(counts, shots * self.largest)
         except Exception as error:
-            raise UsageError(
-                f"{self._whose} fails on the clicks {counts.tolist()}: {type(error).__name__}: {error}",
-                remedy="test it on these clicks, or run with another --backend",
-            ) from error
+            what = f"{self._whose} fails on the clicks {counts.tolist()}: {type(error).__name__}: {error}"
+            raise UsageError(what, remedy="test it on these clicks, or run with another --backend") from error
         if not (0 <= label < self.n_classes and 0.0 <= probability <= 1.0):
-            raise UsageError(
-                f"{self._whose} answers {(label, probability)} to the clicks {counts.tolist()}",
-                remedy=f"allowed: a label in 0..{self.n_classes - 1} and a probability in 0..1",
-            )
+            what = f"{self._whose} answers {(label, probability)} to the clicks {counts.tolist()}"
+            raise UsageError(what, remedy=f"allowed: a label in 0..{self.n_classes - 1} and a probability in 0..1")
         return Verdict(int(label), float(probability))
 
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:

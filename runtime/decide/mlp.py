@@ -119,10 +119,8 @@ def bundle_layers(bundle: Bundle) -> tuple[Layer, ...]:
     if bundle.head_onnx is not None:
         chain = read_layers(bundle.head_onnx, bundle.n_features, bundle.n_classes)
     if chain is None or not all(np.isfinite(layer.weights).all() and np.isfinite(layer.bias).all() for layer in chain):
-        raise UsageError(
-            f"{bundle.name} has no head that is a plain chain of layers (Gemm or MatMul and Add, Relu)",
-            remedy="use the back end onnx, or the table",
-        )
+        what = f"{bundle.name} has no head that is a plain chain of layers (Gemm or MatMul and Add, Relu)"
+        raise UsageError(what, remedy="use the back end onnx, or the table")
     return chain
 
 

@@ -160,7 +160,6 @@ def demand_golden(name: str, found: NDArray[np.float32], golden: NDArray[np.floa
     """Raise DamagedFileError when a back end's scores differ from the golden ones of the bundle."""
     difference = golden_violation(found, golden, decides=bundle.picture_shape is None)
     if difference:
-        raise DamagedFileError(
-            f"{bundle.name}: the back end {name} contradicts the golden vectors of the bundle: {difference}",
-            remedy="export the bundle again, or check the onnxruntime installation of this machine",
-        )
+        what = f"{bundle.name}: the back end {name} contradicts the golden vectors of the bundle: {difference}"
+        remedy = "export the bundle again, or check the onnxruntime installation of this machine"
+        raise DamagedFileError(what, remedy=remedy)
