@@ -105,19 +105,14 @@ def stream_rows(bundle: Bundle, quick: bool) -> list[Row]:
     n_visits = 1_000 if quick else 20_000
     frames = list(streams.visits(plan, n_visits))
     wanted, exposures = streams.decided_one_by_one(plan, decider, frames), n_visits * plan.slots_per_cycle
-    core, reads, found = (
-        StreamCore(plan, decider, 1, 0, streams.SESSION),
-        streams.reads_of(b"".join(frames)),
-        list[Rows](),
-    )
+    core, reads = StreamCore(plan, decider, 1, 0, streams.SESSION), streams.reads_of(b"".join(frames))
+    found = list[Rows]()
     streams.decided_in_stream(core, reads, found)
     spent = cpu_time(lambda: streams.decided_in_stream(core, reads), 5)
     bulk = _rates(spent, exposures, len(wanted)) | {"changed_percent": streams.percent_changed(found, wanted)}
     name = f"sequential, {bundle.name}, {decider.name}"
-    return [
-        {"name": f"wire to decisions, {name}", **bulk},
-        {"name": f"replay, {name}", **_replay_row(bundle, plan, decider, frames, wanted)},
-    ]
+    replayed = _replay_row(bundle, plan, decider, frames, wanted)
+    return [{"name": f"wire to decisions, {name}", **bulk}, {"name": f"replay, {name}", **replayed}]
 
 
 def _rates(spent: Any, exposures: int, decisions: int) -> Row:

@@ -6,7 +6,6 @@ Bytes as a device sends them come out, and the decisions of a core that takes it
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,30 +65,18 @@ def made_automaton() -> Bundle:
     )
 
 
-def sequential_plan(bundle: Bundle, decider: Decider) -> Plan:
-    """Return one dark slot and all patterns, or the longest walk, in each cycle; one cycle per object."""
+def sequential_plan(bundle: Bundle, decider: Decider, *, host: bool = False) -> Plan:
+    """Return one dark slot and all patterns, or the longest walk, in each cycle; one cycle per object.
+
+    With `host` the host drives the walk: there is no dark slot, and a block for each exposure.
+    """
     automaton: Automaton | None = getattr(decider, "automaton", None)
     lit = np.arange(bundle.n_features) if automaton is None else np.full(automaton.n_slots, ADAPTIVE_PATTERN)
-    pattern = np.concatenate([[DARK_PATTERN], lit]).astype(np.uint16)
+    pattern = (lit if host else np.concatenate([[DARK_PATTERN], lit])).astype(np.uint16)
     shot = np.where(pattern == DARK_PATTERN, NO_SHOT, 0).astype(np.uint16)
-    n, drive = len(pattern), "" if automaton is None else "device"
-    times = (90, TICKS, TICKS * n, 1, 1, n, 90 * 1e6 / TICK_HZ)
+    n, drive = len(pattern), "" if automaton is None else "host" if host else "device"
+    times = (90, TICKS, TICKS * n, 1, 1, 1 if host else n, 90 * 1e6 / TICK_HZ)
     return Plan("sequential", len(bundle.pattern_levels), np.arange(n) * TICKS, pattern, shot, *times, automaton, drive)
-
-
-def host_driven(plan: Plan) -> Plan:
-    """Return the plan of the same walk, without its dark slot, driven by the host: a block for each exposure."""
-    lit = plan.slot_pattern != DARK_PATTERN
-    n = int(lit.sum())
-    return replace(
-        plan,
-        slot_offset_ticks=np.arange(n) * TICKS,
-        slot_pattern=plan.slot_pattern[lit],
-        slot_shot=plan.slot_shot[lit],
-        cycle_ticks=TICKS * n,
-        block_exposures=1,
-        drive="host",
-    )
 
 
 def visits(plan: Plan, n_visits: int) -> Iterator[bytes]:

@@ -72,7 +72,7 @@ def bench_link(options: BenchOptions) -> list[Row]:
             return [{"name": "command to click block, decided and recorded", "skipped": device}]
         bundle = streams.made_automaton()
         decider = make_decider(bundle)
-        plan, n = streams.host_driven(streams.sequential_plan(bundle, decider)), 1000 if options.quick else 10_000
+        plan, n = streams.sequential_plan(bundle, decider, host=True), 1000 if options.quick else 10_000
         return [trip_row(Trips(kind, plan, decider, device, n)) for kind in KINDS]
 
 
@@ -89,7 +89,7 @@ def built_device(folder: Path) -> Path | str:
 def block_row(bundle: Bundle, quick: bool) -> Row:
     """Return the row of a walk driven by the host, a mark and a block for each exposure."""
     decider = make_decider(bundle)
-    plan = streams.host_driven(streams.sequential_plan(bundle, decider))
+    plan = streams.sequential_plan(bundle, decider, host=True)
     frames = list(streams.visits(plan, 100 if quick else 600))
     core, name = StreamCore(plan, decider, 1, 0, streams.SESSION), f"work per block of one exposure, {bundle.name}"
     return _work_row(name, core, frames, len(frames), streams.decided_one_by_one(plan, decider, frames))
@@ -122,8 +122,8 @@ def flow_row(bundle: Bundle, quick: bool) -> Row:
     reads = [b"".join(blocks[first : first + FLOW_READ_BLOCKS]) for first in range(0, n, FLOW_READ_BLOCKS)]
     core, plain, decoder = _flow_core(bundle, plan), _flow_core(bundle, plan), FrameDecoder()
     plain.begin(0, 0)
-    wanted = np.array([one for data in reads for frame in decoder.feed(data) for one in plain.step(frame).decisions],
-                      DECISION_DTYPE)  # fmt: skip
+    decided = (one for data in reads for frame in decoder.feed(data) for one in plain.step(frame).decisions)
+    wanted = np.array([*decided], DECISION_DTYPE)
     turn = Kernel(core.steps(streams.SESSION), FrameDecoder())
 
     def compiled() -> Rows:

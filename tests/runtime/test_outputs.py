@@ -35,24 +35,15 @@ def test_an_existing_file_stays_unless_forced(old: Path) -> None:
     assert listing(old.parent) == ["old"]
 
 
-@pytest.mark.parametrize("way", ["itself", "symlink", "hard link", "link to its folder", "dots"])
-def test_an_output_is_never_an_input_by_whatever_name(old: Path, way: str) -> None:
-    path = old.with_name("other")
-    match way:
-        case "itself":
-            path = old
-        case "symlink":
-            path.symlink_to(old)
-        case "hard link":
-            os.link(old, path)
-        case "link to its folder":
-            path.symlink_to(old.parent)
-            path = path / "old"
-        case "dots":
-            path = old.parent / "." / ".." / old.parent.name / "old"
-    with pytest.raises(UsageError, match="is the input"):
-        check_outputs([path], inputs=[None, old, old.with_name("none")], force=True)
-    assert file_identity(path) == file_identity(old)
+def test_an_output_is_never_an_input_by_whatever_name(old: Path) -> None:
+    folder = old.parent
+    (folder / "symlink").symlink_to(old)
+    (folder / "folder").symlink_to(folder)
+    os.link(old, folder / "hard link")
+    for name in ("old", "symlink", "hard link", "folder/old", f"./../{folder.name}/old"):
+        with pytest.raises(UsageError, match="is the input"):
+            check_outputs([folder / name], inputs=[None, old, folder / "none"], force=True)
+        assert file_identity(folder / name) == file_identity(old)
 
 
 def test_two_outputs_in_one_file_are_refused_even_before_it_exists(tmp_path: Path) -> None:
@@ -66,10 +57,9 @@ def test_links_are_not_written_through(old: Path) -> None:
     link.symlink_to(old)
     dangling.symlink_to(old.with_name("nothing"))
     for path in (link, dangling):
-        with pytest.raises(UsageError, match="exists already"):
-            check_outputs([path])
-        with pytest.raises(UsageError, match="exists already"):
-            write_file(path, b"new")
+        for refused in (lambda path: check_outputs([path]), lambda path: write_file(path, b"new")):
+            with pytest.raises(UsageError, match="exists already"):
+                refused(path)
     write_file(link, b"new", force=True)
     assert (old.read_bytes(), link.read_bytes(), link.is_symlink()) == (b"precious", b"new", False)
 

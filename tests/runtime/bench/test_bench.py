@@ -50,12 +50,10 @@ def test_rows_of_walks_have_their_checks() -> None:
 
 
 def test_a_decision_that_differs_is_reported() -> None:
-    wanted = np.zeros(4, DECISION_DTYPE)
-    found = wanted.copy()
+    wanted, found = np.zeros((2, 4), DECISION_DTYPE)
     found["label"][1] = 1
-    assert streams.percent_changed([found], wanted) == 25.0
-    assert streams.percent_changed([wanted[:2], wanted[2:]], wanted) == 0.0
-    assert streams.percent_changed([wanted[:3]], wanted) == 100.0
+    parts = [found], [wanted[:2], wanted[2:]], [wanted[:3]]
+    assert [streams.percent_changed(part, wanted) for part in parts] == [25.0, 0.0, 100.0]
 
 
 def test_streams_have_the_frames_and_zeros_they_promise() -> None:
@@ -99,7 +97,7 @@ def test_round_trips_are_decided_as_by_the_plain_core(
     monkeypatch.setattr(turn, "ROUNDS", 1)
     bundle = streams.made_automaton()
     decider = make_decider(bundle)
-    plan = streams.host_driven(streams.sequential_plan(bundle, decider))
+    plan = streams.sequential_plan(bundle, decider, host=True)
     row = turn.trip_row(turn.Trips(kind, plan, decider, device, 300))
     assert (row["changed_percent"], row["command_bytes"]) == (0.0, 38)
     assert row["calls"] >= 270

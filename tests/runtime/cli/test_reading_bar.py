@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import fixed_run
 
-from pans.runtime import SHIPPED
 from pans.runtime.cli import main
 from pans.runtime.cli import reading_bar as module
 from pans.runtime.cli.reading_bar import ReadingBar
@@ -19,19 +19,17 @@ class Terminal(io.StringIO):
         return True
 
 
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
-    """Let standard error be a terminal; in a test itself, since pytest puts its own back after the fixtures."""
+def terminal(monkeypatch: pytest.MonkeyPatch) -> tuple[Terminal, ReadingBar, list[float]]:
+    """Let standard error be a terminal, in a test itself, since pytest puts its own back after the fixtures; a bar, and its clock."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "100")
-    shown = Terminal()
-    monkeypatch.setattr(sys, "stderr", shown)
-    return shown
+    monkeypatch.setattr(sys, "stderr", shown := Terminal())
+    now_s = [100.0]
+    return shown, ReadingBar(lambda: now_s[0]), now_s
 
 
 def test_a_short_pass_shows_nothing_and_a_long_one_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
-    screen = terminal(monkeypatch)
-    now_s = [100.0]
-    bar = ReadingBar(lambda: now_s[0])
+    screen, bar, now_s = terminal(monkeypatch)
     bar.passed("/lab/short.pansrec", 1, 5, 10)
     bar.passed("/lab/short.pansrec", 1, 10, 10)
     bar.passed("/lab/[long].pansrec", 2, 1_000_000, 4_000_000)
@@ -44,9 +42,7 @@ def test_a_short_pass_shows_nothing_and_a_long_one_a_bar(monkeypatch: pytest.Mon
 
 
 def test_of_two_passes_one_is_shown_until_nothing_is_heard_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    screen = terminal(monkeypatch)
-    now_s = [100.0]
-    bar = ReadingBar(lambda: now_s[0])
+    screen, bar, now_s = terminal(monkeypatch)
     for number in (1, 2):
         bar.passed(f"/lab/{number}.pansrec", number, 1, 9)
     for later_s, number in ((1.5, 2), (0.3, 1), (0.3, 2)):
@@ -63,10 +59,8 @@ def test_of_two_passes_one_is_shown_until_nothing_is_heard_of_it(monkeypatch: py
 def test_a_replay_shows_how_far_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    screen = terminal(monkeypatch)
-    path = tmp_path / "run.pansrec"
-    words = ["run", str(SHIPPED / "fashion10.pans"), "--device", "sim:oled-qcmos?pace=fast", "--decisions", "3"]
-    assert main([*words, "--record", str(path), "--quiet"]) == 0
+    screen, path = terminal(monkeypatch)[0], tmp_path / "run.pansrec"
+    assert main([*fixed_run(3), "--record", str(path), "--quiet"]) == 0
     monkeypatch.setattr(module, "SHOWN_AFTER_S", 0.0)
     monkeypatch.setattr(module, "DRAWN_EVERY_S", 0.0)
     assert main(["replay", str(path), "--quiet"]) == 0
