@@ -131,9 +131,8 @@ def reachable_automaton(
     number = np.zeros(n_nodes, np.int64)
     number[kept] = np.arange(len(kept))
     shown = kept[kept < n_states]
-    return Automaton(
-        np.asarray(pattern)[shown], np.asarray(dwell)[shown], dwell_steps, number[states[shown]], nodes[kept], counts
-    )
+    of_states = np.asarray(pattern)[shown], np.asarray(dwell)[shown], dwell_steps, number[states[shown]]
+    return Automaton(*of_states, nodes[kept], counts)
 
 
 def stopped(automaton: Automaton, confidence: float) -> Automaton:
@@ -146,14 +145,9 @@ def stopped(automaton: Automaton, confidence: float) -> Automaton:
     sure[0] = False
     leads_to = np.arange(n_nodes)
     leads_to[:n_states][sure] = n_nodes + np.arange(np.count_nonzero(sure))
-    return reachable_automaton(
-        automaton.pattern,
-        automaton.dwell,
-        automaton.dwell_steps,
-        leads_to[automaton.successors],
-        np.concatenate([automaton.posteriors, automaton.posteriors[:n_states][sure]]),
-        automaton.counts,
-    )
+    shown = automaton.pattern, automaton.dwell, automaton.dwell_steps
+    posteriors = np.concatenate([automaton.posteriors, automaton.posteriors[:n_states][sure]])
+    return reachable_automaton(*shown, leads_to[automaton.successors], posteriors, automaton.counts)
 
 
 def walk_nodes(automaton: Automaton, words: NDArray[Any]) -> NDArray[np.uint32]:
@@ -185,9 +179,8 @@ def words_to(automaton: Automaton, nodes: NDArray[Any]) -> NDArray[np.float32]:
         row, here = row[moving], here[moving]
         state, outcome = np.divmod(edge[here], outcomes)
         slot = automaton.depth[state].astype(np.int64)
-        bits[row, slot] = (
-            outcome[:, None] if automaton.counts else outcome[:, None] >> np.arange(automaton.channels) & 1
-        )
+        clicks = outcome[:, None] >> np.arange(automaton.channels) & 1
+        bits[row, slot] = outcome[:, None] if automaton.counts else clicks
         here = state
     return bits.reshape(len(nodes), automaton.n_bits)
 
@@ -213,9 +206,8 @@ def walk_difference(automaton: Automaton, words: NDArray[Any], walks: NDArray[An
         return ""
     row = int(differs.argmax())
     slot = int((found[row] != walks[row]).argmax())
-    return (
-        f"golden walk {row} is at node {walks[row, slot]} after {slot} exposures, the automaton at {found[row, slot]}"
-    )
+    there = f"golden walk {row} is at node {walks[row, slot]} after {slot} exposures"
+    return f"{there}, the automaton at {found[row, slot]}"
 
 
 def greatest_light(automaton: Automaton, light: NDArray[np.float64]) -> float:
@@ -312,15 +304,10 @@ def _numbered(kept: list[NDArray[np.int64]], automaton: Automaton) -> Automaton:
     for start, rows in zip(starts[1:], kept):
         edge = rows[:, 1:]
         successors.append(np.where(edge >= 0, edge + start, total - 1 - edge))
-    shown = np.concatenate([rows[:, 0] for rows in kept])
-    return reachable_automaton(
-        automaton.pattern[shown],
-        automaton.dwell[shown],
-        automaton.dwell_steps,
-        np.concatenate(successors),
-        np.concatenate([automaton.posteriors[shown], automaton.posteriors]),
-        automaton.counts,
-    )
+    entries = np.concatenate([rows[:, 0] for rows in kept])
+    shown = automaton.pattern[entries], automaton.dwell[entries], automaton.dwell_steps
+    posteriors = np.concatenate([automaton.posteriors[entries], automaton.posteriors])
+    return reachable_automaton(*shown, np.concatenate(successors), posteriors, automaton.counts)
 
 
 def _read_only(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -372,10 +359,8 @@ def _check_order(successors: NDArray[Any], n_states: int, n_nodes: int) -> None:
     demand(high < n_nodes, f"a successor is {high}, allowed: 0 to {n_nodes - 1} (states, then leaves)")
     lowest = successors.min(axis=1)
     state = int((lowest <= np.arange(n_states)).argmax())
-    demand(
-        bool(lowest[state] > state),
-        f"state {state} has the successors {successors[state].tolist()}, allowed: above {state}",
-    )
+    found = f"state {state} has the successors {successors[state].tolist()}"
+    demand(bool(lowest[state] > state), f"{found}, allowed: above {state}")
 
 
 def _check_posteriors(posteriors: NDArray[np.float32]) -> None:

@@ -156,7 +156,9 @@ class _Walks:
             chances = count_chances(self._law, photoelectrons[:, :, 0])
         else:
             chances = word_chances(*both_chances(self._law, photoelectrons))
-        _pass_on(self.chance[0], states, self._automaton.successors, chances)
+        for outcome, chance in enumerate(chances):
+            after = self._automaton.successors[states, outcome]
+            _pass_on(self.chance[0], self.chance[0], states, after, np.ascontiguousarray(chance))
         return reached, (reached * np.tensordot(self._clicks, chances, 1)).sum(axis=1)
 
 
@@ -180,7 +182,10 @@ class _AfterpulsedWalks:
         """See `_Walks`."""
         reached = self.chance[:, :, states]
         click, miss = both_chances(self._law, photoelectrons[:, :, 0])
-        _pass_afterpulses_on(self.chance, states, self._automaton.successors, click, miss, self._afterpulse)
+        for before, stays in enumerate((1.0, 1.0 - self._afterpulse)):
+            for outcome, chance in enumerate((miss * stays, click + miss * (1.0 - stays))):
+                after = self._automaton.successors[states, outcome]
+                _pass_on(self.chance[before], self.chance[outcome], states, after, chance)
         return reached.sum(axis=0), (reached.sum(axis=0) * click + reached[1] * miss * self._afterpulse).sum(axis=1)
 
 
@@ -222,28 +227,11 @@ class _RememberedWalks:
 
 
 @njit(cache=True, nogil=True)
-def _pass_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], chances: F64) -> None:
-    """Add what leaves each of `states` (m,) to its successors: alpha (n, nodes), chances (outcomes, n, m)."""
-    for i in range(alpha.shape[0]):
+def _pass_on(source: F64, target: F64, states: NDArray[np.int64], after: NDArray[np.uint32], chance: F64) -> None:
+    """Add what leaves `states` (m,) of `source` (n, nodes) by one outcome, of `chance` (n, m), to the nodes `after` (m,) of `target`."""
+    for i in range(source.shape[0]):
         for k in range(states.size):
-            reached = alpha[i, states[k]]
-            for outcome in range(chances.shape[0]):
-                alpha[i, successors[states[k], outcome]] += reached * chances[outcome, i, k]
-
-
-@njit(cache=True, nogil=True)
-def _pass_afterpulses_on(
-    alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], click: F64, miss: F64, afterpulse: float
-) -> None:
-    """As `_pass_on`: alpha (2, n, nodes), whose second part came by a click, which `afterpulse` adds to the next; chances (n, m)."""
-    for before in range(2):
-        stays = 1.0 - afterpulse * before
-        for i in range(alpha.shape[1]):
-            for k in range(states.size):
-                state = states[k]
-                reached = alpha[before, i, state]
-                alpha[0, i, successors[state, 0]] += reached * miss[i, k] * stays
-                alpha[1, i, successors[state, 1]] += reached * (click[i, k] + miss[i, k] * (1.0 - stays))
+            target[i, after[k]] += source[i, states[k]] * chance[i, k]
 
 
 @njit(cache=True, nogil=True)
