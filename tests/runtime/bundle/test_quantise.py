@@ -21,38 +21,32 @@ def test_no_object_changes_by_more_than_the_bound(levels, top):
     assert found.error_bound == pytest.approx(worst, rel=1e-12)
 
 
-def test_the_brightest_pixel_is_the_top_level_and_none_moves_by_more_than_half_a_level():
+def test_the_brightest_pixel_is_the_top_level_none_moves_by_more_than_half_a_level_and_brighter_ones_are_clipped():
     patterns = RNG.uniform(0, 2, (3, 30))
     found = quantise_patterns(patterns, 124)
     assert (found.pattern_levels.max(), found.pattern_levels.dtype) == (123, np.uint16)
     assert np.abs(found.patterns() - patterns).max() <= found.photons_per_level / 2 * (1 + 1e-12)
-
-
-def test_brighter_pixels_are_clipped_to_the_top():
     found = quantise_patterns(np.array([[0.2, 3.0]]), 11, 1.0)
     assert found.pattern_levels.tolist() == [[2, 10]]
     assert found.error_bound == pytest.approx([2.0])
 
 
 def test_quantising_refuses_what_is_not_light() -> None:
-    for bad in (np.array([[1.0, -1e-9]]), np.array([[np.nan, 1.0]]), np.array([[np.inf, 1.0]])):
-        with pytest.raises(ValueError, match="allowed: finite photons"):
-            quantise_patterns(bad, 4)
-    with pytest.raises(ValueError, match="no pattern has any light"):
-        quantise_patterns(np.zeros((2, 2)), 4)
-    for bad in (np.ones((2, 2), dtype=int), np.ones(3)):
-        with pytest.raises(ValueError, match="floats"):
+    for bad, words in (
+        *((np.array([[1.0, value]]), "allowed: finite photons") for value in (-1e-9, np.nan, np.inf)),
+        (np.zeros((2, 2)), "no pattern has any light"),
+        *((shape, "floats") for shape in (np.ones((2, 2), dtype=int), np.ones(3))),
+    ):
+        with pytest.raises(ValueError, match=words):
             quantise_patterns(bad, 4)
 
 
 def test_quantising_rounds_to_the_nearest_level() -> None:
     found = quantise_patterns(np.array([[0.0, 0.1, 0.26, 0.74, 1.5]], dtype=np.float32), 4)
     assert found.pattern_levels.tolist() == [[0, 0, 1, 1, 3]]
-    assert found.photons_per_level == 0.5
-    assert found.error_max == pytest.approx(0.24, abs=1e-6)
-    assert found.pixels_lost == 1
-    assert found.illumination == pytest.approx(2.5)
-    assert found.illumination_wanted == pytest.approx(2.6)
+    assert (found.photons_per_level, found.pixels_lost) == (0.5, 1)
+    errors = found.error_max, found.illumination, found.illumination_wanted
+    assert errors == pytest.approx((0.24, 2.5, 2.6), abs=1e-6)
     full = quantise_patterns(np.array([[0.0, 1e-30, 5e-324 + 1e-25]]), 65536)
     assert full.pattern_levels[0, 2] == 65535
 

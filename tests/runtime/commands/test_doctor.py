@@ -41,11 +41,7 @@ def test_what_is_needed_and_missing_is_an_alert(
         yield
 
     findings = examine((check_broken, check_odd, doctor.check_python))
-    assert [(finding.check, finding.ok) for finding in findings] == [
-        ("broken", False),
-        ("odd", False),
-        ("python", True),
-    ]
+    assert {finding.check: finding.ok for finding in findings} == {"broken": False, "odd": False, "python": True}
     assert all(finding.remedy for finding in findings if not finding.ok)
     monkeypatch.setattr("pans.runtime.commands.doctor.examine", lambda: findings)
     assert main(["doctor"]) == 1
@@ -67,10 +63,8 @@ def test_devices_lists_ports_by_their_lasting_names(
     port.vid, port.pid, port.serial_number, port.description = 0x1209, 1, "A1", "an instrument"
     gone = ListPortInfo(str(tmp_path / "ttyS9"))
     monkeypatch.setattr(list_ports, "comports", lambda: [port, gone])
-    assert [(state.url, state.state) for state in serial_ports()] == [
-        ("serial:1209:0001:A1", "free"),
-        (f"serial:{gone.device}", "not there"),
-    ]
+    wanted = {"serial:1209:0001:A1": "free", f"serial:{gone.device}": "not there"}
+    assert {state.url: state.state for state in serial_ports()} == wanted
     assert main(["devices", "--no-usb", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
     assert listed["devices"][0]["vid_pid_serial"] == "1209:0001:A1"
@@ -101,10 +95,9 @@ def test_a_trace_has_both_directions_and_times(tmp_path: Path) -> None:
     link.close()
     with pytest.raises(LinkError):
         link.read(0.1)
-    lines = path.read_text().splitlines()
-    assert lines[0].startswith("0.000000000 # sim:ideal")
-    assert lines[1] == "0.000000000 > 01 02 00"
-    assert lines[2] == "0.250000000 # opened again"
+    first, *lines = path.read_text().splitlines()
+    assert first.startswith("0.000000000 # sim:ideal")
+    assert lines[:2] == ["0.000000000 > 01 02 00", "0.250000000 # opened again"]
     with pytest.raises(UsageError, match="cannot be written"):
         TracedLink(open_sim("sim:ideal?scene=uniform&pace=fast"), tmp_path / "none" / "trace.txt")
 

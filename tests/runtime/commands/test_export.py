@@ -5,13 +5,16 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 from commands import fixed_run, json_of
+from heads import onnx_chain, random_layers
 
+from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
+from pans.runtime.instrument.profile import load_profile
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.sent_plan import recorded_plan
@@ -21,49 +24,28 @@ from pans.runtime.record.sent_plan import recorded_plan
 def run_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of one detector after another, and of all at once with dark slots."""
     folder = tmp_path_factory.mktemp("run")
-    if request.param == "oled-qcmos":
-        words = [*fixed_run(200), "--out", str(folder)]
-    else:
-        bundle = folder / "small.pans"
-        make_parallel(bundle)
-        device = "sim:wdm-snspd?pace=fast&scene=fashion200"
-        words = ["run", str(bundle), "--device", device, "--decisions", "150", "--shots", "4", "--out", str(folder)]
-    assert main(words) in (0, 1)
+    words = [*fixed_run(200)]
+    if request.param == "wdm-snspd":
+        make_parallel(folder / "small.pans")
+        words = ["run", str(folder / "small.pans"), "--device", "sim:wdm-snspd?pace=fast&scene=fashion200"]
+        words += ["--decisions", "150", "--shots", "4"]
+    assert main([*words, "--out", str(folder)]) in (0, 1)
     return folder / "run.pansrec"
 
 
 def make_parallel(path: Path) -> None:
-    from bundles import made_bundle
-
-    from pans.runtime.bundle.model import write_bundle
-    from pans.runtime.instrument.profile import load_profile
-
     profile, rng = load_profile("wdm-snspd"), np.random.default_rng(0)
-    top = profile.projector.peak_photoelectrons_hz * profile.exposure.max_us * 1e-6
-    levels = profile.projector.levels
+    top, levels = profile.projector.peak_photoelectrons_hz * profile.exposure.max_us * 1e-6, profile.projector.levels
     patterns = rng.integers(0, levels, (5, 784)) * (rng.random((5, 784)) < 0.05)
     patterns[0, 0] = levels - 1
-    pytest.importorskip("onnx")
-    from heads import onnx_chain, random_layers
-
-    made = made_bundle(
-        name="small",
-        classes=tuple("0123456789"),
-        image_shape=(28, 28),
-        levels=levels,
-        pattern_levels=patterns,
-        photons_per_level=top / (levels - 1),
-        head_onnx=onnx_chain(random_layers([5, 8, 10])),
-    )
+    shown = {"levels": levels, "pattern_levels": patterns, "photons_per_level": top / (levels - 1)}
+    head = onnx_chain(random_layers([5, 8, 10]))
+    made = made_bundle(classes=tuple("0123456789"), image_shape=(28, 28), head_onnx=head, **shown)
     write_bundle(made, path)
 
 
-def exported(path: Path, form: str, out: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    return json_of(capsys, "export", path, "--format", form, "-o", out)
-
-
 def test_csv_holds_every_click_and_decision(run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = exported(run_of, "csv", tmp_path / "csv", capsys)
+    found = json_of(capsys, "export", run_of, "--format", "csv", "-o", tmp_path / "csv")
     recording = read_recording(run_of)
     decisions = recording.decisions()
     with open(tmp_path / "csv" / "decisions.csv", newline="") as file:

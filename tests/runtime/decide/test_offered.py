@@ -33,10 +33,7 @@ def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Offer:
     def write(body: str) -> None:
         module = f"lab{abs(hash(body))}"
         (tmp_path / f"{module}.py").write_text(body if "\n" in body else LAB.replace("BODY", body))
-        points = [
-            EntryPoint("lab", f"{module}:Lab", backends.GROUP),
-            EntryPoint("table", f"{module}:Lab", backends.GROUP),
-        ]
+        points = [EntryPoint(name, f"{module}:Lab", backends.GROUP) for name in ("lab", "table")]
         monkeypatch.setattr(backends, "entry_points", lambda group: points)
 
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -47,16 +44,12 @@ def lab() -> Decider:
     return make_decider(BUNDLE, backend="lab")
 
 
-def test_it_is_found_by_its_entry_point(offer: Offer) -> None:
+def test_it_is_found_by_its_entry_point_and_need_not_know_of_many_objects(offer: Offer) -> None:
     offer("(9, 0.75) if counts.sum() == 0 else (int(counts[0]), 0.5)")
     assert lab().decide(np.zeros(10, np.int64), 1) == (9, 0.75)
     assert make_decider(BUNDLE, backend="table").name == "table"  # ours cannot be replaced
     with pytest.raises(UsageError, match=r"'none', allowed: auto, .*, lab"):
         make_decider(BUNDLE, backend="none")
-
-
-def test_it_need_not_know_of_many_objects(offer: Offer) -> None:
-    offer("(9, 0.75) if counts.sum() == 0 else (int(counts[0]), 0.5)")
     counts = np.array([[0] * 10, [1] + [0] * 9])
     assert lab().decide_batch(counts, 1).tolist() == [9, 1]
     found = verdicts_of(lab(), counts, 1)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 
-from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.quantisation_cost import quantisation_cost
 
 RNG = np.random.default_rng(3)
@@ -16,16 +17,8 @@ TABLE = np.array([[0.1, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 0.1]], np.float32)  
 
 
 def bundle_of(step: float) -> Bundle:
-    levels = np.rint(PATTERNS / step).astype(np.uint16)
-    return make_bundle(
-        name="two",
-        task="custom",
-        classes=["low", "high"],
-        image_shape=(2, 2),
-        optics=Shown(64, levels, step),
-        back_end=BackEnd(table=TABLE),
-        provenance={},
-    )
+    shown = {"levels": 64, "pattern_levels": np.rint(PATTERNS / step).astype(np.uint16), "photons_per_level": step}
+    return made_bundle(classes=["low", "high"], image_shape=(2, 2), table=TABLE, **shown)
 
 
 def exact(patterns: np.ndarray) -> float:
@@ -55,14 +48,11 @@ def test_patterns_that_are_on_the_levels_cost_nothing() -> None:
     assert (cost.accuracy_given, cost.difference_se) == (cost.accuracy_shown, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("images", "labels", "said"),
-    [
+def test_what_does_not_fit_is_refused() -> None:
+    for images, labels, said in (
         (IMAGES[:, :1], LABELS, "allowed with these patterns"),
         (IMAGES, LABELS + 1, "labels must be 0 to 1"),
         (IMAGES[:0], LABELS[:0], "labels must be"),
-    ],
-)
-def test_what_does_not_fit_is_refused(images: np.ndarray, labels: np.ndarray, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        quantisation_cost(PATTERNS, bundle_of(0.1), images, labels, 0.0)
+    ):
+        with pytest.raises(ValueError, match=said):
+            quantisation_cost(PATTERNS, bundle_of(0.1), images, labels, 0.0)
