@@ -61,19 +61,8 @@ def automaton_bundle(automaton: Automaton, photons: float = 1.0, **facts: Any) -
     n_patterns = int(automaton.pattern.max()) + automaton.channels
     masks = np.random.default_rng(5).integers(0, 2, (n_patterns, 6))
     masks[np.arange(n_patterns), np.arange(n_patterns) % 6] = 1  # none is dark
-    toy: dict[str, Any] = {
-        "name": "toy",
-        "task": "test",
-        "classes": [f"c{i}" for i in range(automaton.n_classes)],
-        "image_shape": (2, 3),
-        "provenance": {},
-        "levels": 2,
-        "pattern_levels": masks,
-        "photons_per_level": photons,
-    }
-    given = toy | facts
-    shown = Shown(**{name: given.pop(name) for name in Shown.__slots__})
-    return make_bundle(optics=shown, automaton=automaton, **given)
+    shown = {"image_shape": (2, 3), "pattern_levels": masks, "photons_per_level": photons}
+    return made_bundle(n_classes=automaton.n_classes, **{"automaton": automaton} | shown | facts)
 
 
 def resealed(data: bytes, change: Any) -> bytes:

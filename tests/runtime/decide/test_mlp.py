@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import naive_decide as naive
 import numpy as np
 import pytest
 from heads import head_bundle, onnx_chain, random_layers
+from models import parsed
 
 from pans.runtime.bundle.layers import Int8Head, Layer, quantise_head, read_layers, reference_scores
 from pans.runtime.bundle.model import bundle_bytes, parse_bundle
@@ -88,33 +90,25 @@ def test_ties_and_scores_that_are_not_finite() -> None:
 def test_layers_are_read_from_onnx(style: str, float_data: bool) -> None:
     layers = random_layers([4, 9, 3])
     found = read_layers(onnx_chain(layers, style, float_data), 4, 3)
-    assert found is not None
-    for wanted, layer in zip(layers, found):
-        assert (layer.weights == wanted.weights).all()
-        assert (layer.bias == wanted.bias).all()
+    for wanted, layer in zip(layers, found or (), strict=True):
+        assert np.array_equal(layer.weights, wanted.weights)
+        assert np.array_equal(layer.bias, wanted.bias)
         assert layer.relu == wanted.relu
 
 
 def test_what_is_no_plain_chain_is_left_to_onnxruntime() -> None:
-    helper = pytest.importorskip("onnx.helper")
-    from onnx import TensorProto, numpy_helper
-
-    weights = numpy_helper.from_array(np.ones((2, 2), np.float32), "w")
-    nodes = [helper.make_node("MatMul", ["means", "w"], ["sums"]), helper.make_node("Sigmoid", ["sums"], ["scores"])]
-    ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 2]) for name in ("means", "scores")]
-    model = helper.make_model(helper.make_graph(nodes, "head", ends[:1], ends[1:], [weights])).SerializeToString()
-    assert read_layers(model, 2, 2) is None
+    pytest.importorskip("onnx")
+    model = parsed("sums = MatMul(means, w) scores = Sigmoid(sums)", 2, w=np.ones((2, 2), np.float32))
+    assert read_layers(model.SerializeToString(), 2, 2) is None
     assert read_layers(b"\xff\xff", 2, 2) is None
     assert read_layers(onnx_chain(random_layers([4, 3])), 4, 2) is None
 
 
-def test_a_head_that_contradicts_its_golden_vectors_is_refused() -> None:
-    bundle = head_bundle(random_layers([4, 8, 3]))
+@pytest.mark.parametrize("kind", [SparseDecider, ReferenceDecider])
+def test_a_head_that_contradicts_its_golden_vectors_is_refused(kind: Any) -> None:
     other = head_bundle(random_layers([4, 8, 3], seed=9))
-    changed = replace(bundle, head_onnx=other.head_onnx)
-    for kind in (SparseDecider, ReferenceDecider):
-        with pytest.raises(DamagedFileError, match="golden"):
-            kind(changed)
+    with pytest.raises(DamagedFileError, match="golden"):
+        kind(replace(head_bundle(random_layers([4, 8, 3])), head_onnx=other.head_onnx))
 
 
 def test_golden_means_are_told_as_counts() -> None:
@@ -138,9 +132,7 @@ def test_a_table_of_counts_is_exactly_the_head() -> None:
 
 
 def test_tables_of_counts_stay_small() -> None:
-    assert fits_count_table(16, 1)
-    assert not fits_count_table(17, 1)
-    assert not fits_count_table(4000, 60000)
+    assert [fits_count_table(*size) for size in ((16, 1), (17, 1), (4000, 60000))] == [True, False, False]
     with pytest.raises(UsageError, match="rows"):
         count_table(head_bundle(random_layers([13, 4])), 4)
 
@@ -153,17 +145,15 @@ def test_int8_scores_are_those_of_the_definition(sizes: list[int], shots: int) -
     head = quantise_head(layers)
     decider = Int8Decider(head_bundle(layers, int8_head=head))
     counts = counts_of(sizes[0], shots)
-    np.testing.assert_allclose(
-        decider.scores_batch(counts, shots), naive.int8_reference(head, counts, shots), rtol=3e-7, atol=1e-6
-    )
+    wanted = naive.int8_reference(head, counts, shots)
+    np.testing.assert_allclose(decider.scores_batch(counts, shots), wanted, rtol=3e-7, atol=1e-6)
 
 
 def test_the_sums_of_layer_one_are_exact_integers() -> None:
     head = quantise_head(random_layers([64, 32, 4], seed=3))
     weights, scale, bias = head.matrices()[0]
-    plain = Int8Head(
-        np.array([64, 32]), head.weights[: 64 * 32], np.stack([np.ones(32), np.zeros(32)]).astype(np.float32)
-    )
+    affine = np.stack([np.ones(32), np.zeros(32)]).astype(np.float32)
+    plain = Int8Head(np.array([64, 32]), head.weights[: 64 * 32], affine)
     decider = Int8Decider(head_bundle(random_layers([64, 32]), int8_head=plain))
     counts = counts_of(64, 1, 200)
     for row, found in zip(counts, decider.scores_batch(counts, 1)):
@@ -183,10 +173,8 @@ def test_int8_errors_stay_within_their_bound() -> None:
     found, wanted = naive.int8_reference(head, calibration, 1), reference_scores(layers, calibration)
     hidden_error = calibration.sum(1)[:, None] * (s1 * step / 2)[None, :] + step / 2
     hidden = np.maximum(calibration @ layers[0].weights.astype(float) + layers[0].bias, 0)
-    bound = (
-        hidden_error @ np.abs(layers[1].weights.astype(float))
-        + (hidden / step + 1) @ (s2 / 2 * np.ones((64, 6))) * 1.02
-    )
+    bound = hidden_error @ np.abs(layers[1].weights.astype(float))
+    bound += (hidden / step + 1) @ (s2 / 2 * np.ones((64, 6))) * 1.02
     assert (np.abs(found - wanted) <= bound).all()
     assert np.abs(found - wanted).max() < 0.1 * np.abs(wanted).max()
     assert w1.dtype == w2.dtype == np.int8
