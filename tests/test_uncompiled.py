@@ -15,13 +15,9 @@ from tree import ROOT
 def test_kernels_without_the_compiler() -> None:
     marked = [path for path in ROOT.glob("tests/*/**/test_*.py") if "pytest.mark.uncompiled" in path.read_text()]
     wanted = sum(len(re.findall(r"@pytest\.mark\.uncompiled", path.read_text())) for path in marked)
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rA", *map(str, marked)],
-        cwd=ROOT,
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-    )
+    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rA", *map(str, marked)]
+    env = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(words, cwd=ROOT, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     ran = {line.split()[1].partition("[")[0] for line in done.stdout.splitlines() if line.startswith("PASSED ")}
     assert len(ran) == wanted > 0, ran

@@ -100,9 +100,8 @@ def runnable(page: Path) -> list[Block]:
 @pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
 def test_no_block_escapes(page: Path) -> None:
     for block in blocks(page):
-        assert block.language in (*SHELL, *EXAMPLES, "text", "toml", "json"), (
-            f"line {block.line}: a block of kind {block.language!r}"
-        )
+        known = block.language in (*SHELL, *EXAMPLES, "text", "toml", "json")
+        assert known, f"line {block.line}: a block of kind {block.language!r}"
         assert block.notes.get("not run", "why").strip(), f"line {block.line}: no reason"
     assert not indented(page), "a command in an indented block: no test sees it"
 
@@ -130,9 +129,8 @@ def test_the_page_does_what_it_says(page: Path, tmp_path: Path, monkeypatch: pyt
             exec(compile(block.text, where, "exec"), names)
         elif block.language == "pycon":
             example = doctest.DocTestParser().get_doctest(block.text, names, where, str(page), block.line)
-            assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, clear_globs=False).failed == 0, (
-                where
-            )
+            found = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, clear_globs=False)
+            assert found.failed == 0, where
             names.update(example.globs)
         else:
             assert run_block(block) == int(block.notes.get("exit", "0")), where
@@ -140,12 +138,10 @@ def test_the_page_does_what_it_says(page: Path, tmp_path: Path, monkeypatch: pyt
 
 def run_block(block: Block) -> int:
     """Run a block and return the exit code of its last command; an earlier one must have gone well."""
-    lines = [
-        line for line in block.script.replace("\\\n", " ").split("\n") if line.strip() and not line.startswith("#")
-    ]
-    if not all(
-        line.startswith("pans ") and len(pans_commands(line)) == 1 and not set(line) & set("|&;<>") for line in lines
-    ):
+    script = block.script.replace("\\\n", " ")
+    lines = [line for line in script.split("\n") if line.strip() and not line.startswith("#")]
+    ours = (line.startswith("pans ") and len(pans_commands(line)) == 1 and not {*line} & {*"|&;<>"} for line in lines)
+    if not all(ours):
         return subprocess.run(["bash", "-ec", block.script], timeout=300, check=False).returncode
     for line in lines[:-1]:
         assert status(pans_commands(line)[0]) == 0, line

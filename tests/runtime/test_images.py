@@ -12,24 +12,17 @@ RAMP = np.tile(np.arange(0, 256, 17, dtype=np.uint8), (4, 1))
 RAMP_16 = RAMP.astype(np.uint16) * 257
 
 
-@pytest.mark.parametrize(
-    ("pixels", "ending"),
-    [
-        (RAMP, "png"),
-        (RAMP, "tiff"),
-        (RAMP_16, "png"),
-        (RAMP_16, "tiff"),
-        (RAMP_16.astype(np.int32), "tiff"),
-        ((RAMP / 255).astype(np.float32), "tiff"),
-        (np.dstack([RAMP] * 3), "png"),
-        (np.dstack([RAMP, RAMP, RAMP, 255 - RAMP]), "png"),
-    ],
-    ids=["8 png", "8 tiff", "16 png", "16 tiff", "32 tiff", "float tiff", "rgb png", "rgba png"],
-)
-def test_grey_levels_are_kept(tmp_path, pixels, ending):
-    path = tmp_path / f"a.{ending}"
-    Image.fromarray(pixels).save(path)
-    found = read_grey(path, 1000)
+PIXELS = {
+    **{"8.png": RAMP, "8.tiff": RAMP, "16.png": RAMP_16, "16.tiff": RAMP_16, "32.tiff": RAMP_16.astype(np.int32)},
+    **{"float.tiff": (RAMP / 255).astype(np.float32), "rgb.png": np.dstack([RAMP] * 3)},
+    "rgba.png": np.dstack([RAMP, RAMP, RAMP, 255 - RAMP]),
+}
+
+
+@pytest.mark.parametrize("name", PIXELS)
+def test_grey_levels_are_kept(tmp_path, name):
+    Image.fromarray(PIXELS[name]).save(tmp_path / name)
+    found = read_grey(tmp_path / name, 1000)
     assert found.dtype == np.uint8
     assert np.array_equal(found, RAMP)
 

@@ -24,13 +24,8 @@ from pans.runtime.report.verify import verify_file
 
 def test_ranges() -> None:
     assert Range(0, 1).checked(1, "x") == 1
-    for allowed, value in (
-        (Range(0, 1), True),
-        (Range(0, 1), "1"),
-        (WHOLE, 1.0),
-        (WHOLE, 1 << 63),
-        (FINITE, float("nan")),
-    ):
+    wrong = (Range(0, 1), True), (Range(0, 1), "1"), (WHOLE, 1.0), (WHOLE, 1 << 63), (FINITE, float("nan"))
+    for allowed, value in wrong:
         with pytest.raises(ValueError, match=r"x is .*allowed: a"):
             allowed.checked(value, "x")
 
@@ -55,12 +50,8 @@ def test_json_up_to_its_limits_is_read(text: str) -> None:
 def test_only_regular_files_are_read(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.pans"
     os.mkfifo(pipe)
-    for path, kind in (
-        (pipe, "pipe"),
-        (tmp_path, "folder"),
-        (Path("/dev/zero"), "device"),
-        (tmp_path / "none", "No such file"),
-    ):
+    kinds = {pipe: "pipe", tmp_path: "folder", Path("/dev/zero"): "device", tmp_path / "none": "No such file"}
+    for path, kind in kinds.items():
         with pytest.raises(UsageError, match=kind):
             open_regular(path)
     with pytest.raises(UsageError, match="pipe"):

@@ -50,9 +50,6 @@ def test_jeffreys_interval_covers(exposures: int, mean: float) -> None:
     for clicks in range(int(mean + 12 * mean**0.5 + 12)):
         low, high = jeffreys_interval(clicks, exposures)
         if low <= p <= high:
-            covered += float(
-                mpmath.binomial(exposures, clicks)
-                * mpmath.mpf(p) ** clicks
-                * (1 - mpmath.mpf(p)) ** (exposures - clicks)
-            )
+            chance = mpmath.mpf(p) ** clicks * (1 - mpmath.mpf(p)) ** (exposures - clicks)
+            covered += float(mpmath.binomial(exposures, clicks) * chance)
     assert 0.92 < covered < 0.985

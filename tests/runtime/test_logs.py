@@ -12,6 +12,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import fixed_run
 
@@ -25,27 +26,21 @@ def asked(path: Path | None, form: str | None = None, rotate_mb: float | None = 
     return Namespace(log_file=path, log_format=form, log_rotate_mb=rotate_mb)
 
 
-def test_a_text_line_has_time_level_and_facts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "pans.log"
-    with logging_of(asked(path)):
+def test_a_line_has_time_level_and_facts_as_text_or_as_one_object(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with logging_of(asked(tmp_path / "pans.log")):
         warn("arming\nnow")
         log_event("gap", {"lost": 3, "why": "a\nb\x1b[2J"})
-    said, event = path.read_text().splitlines()
-    assert said.split(" ", 1)[1] == "WARNING arming\\nnow"
-    assert event.split(" ", 1)[1] == "INFO gap lost=3 why=a\\nb\\x1b[2J"
-    assert all(is_log_line(line.encode()) for line in (said, event))
+    lines = (tmp_path / "pans.log").read_text().splitlines()
+    texts = [line.split(" ", 1)[1] for line in lines]
+    assert texts == ["WARNING arming\\nnow", "INFO gap lost=3 why=a\\nb\\x1b[2J"]
     assert capsys.readouterr().err == "pans: warning: arming\nnow\n"
-
-
-def test_a_json_line_is_one_object(tmp_path: Path) -> None:
-    import numpy as np
-
-    path = tmp_path / "pans.log"
-    with logging_of(asked(path, "json")):
+    with logging_of(asked(tmp_path / "json.log", "json")):
         log_event("gap", {"lost": np.int64(3), "rows": np.arange(2)}, logging.ERROR)
-    line = json.loads(path.read_text())
+    line = json.loads(text := (tmp_path / "json.log").read_text())
     assert (line["level"], line["message"], line["facts"]) == ("ERROR", "gap", {"lost": 3, "rows": [0, 1]})
-    assert is_log_line(path.read_bytes())
+    assert all(is_log_line(line.encode()) for line in (*lines, text))
 
 
 def test_a_log_goes_on_and_rotates(tmp_path: Path) -> None:

@@ -16,14 +16,11 @@ from pans.runtime.bundle.model import Bundle
 def random_layers(sizes: list[int], seed: int = 0) -> tuple[Layer, ...]:
     """Layers with weights of the size that training starts from, rectified but for the last."""
     rng = np.random.default_rng(seed)
-    return tuple(
-        Layer(
-            (rng.normal(size=(n_in, n_out)) * np.sqrt(2 / n_in)).astype(np.float32),
-            (rng.normal(size=n_out) * 0.3).astype(np.float32),
-            number < len(sizes) - 2,
-        )
-        for number, (n_in, n_out) in enumerate(pairwise(sizes))
-    )
+    layers = []
+    for number, (n_in, n_out) in enumerate(pairwise(sizes)):
+        weights, bias = rng.normal(size=(n_in, n_out)) * np.sqrt(2 / n_in), rng.normal(size=n_out) * 0.3
+        layers.append(Layer(weights.astype(np.float32), bias.astype(np.float32), number < len(sizes) - 2))
+    return tuple(layers)
 
 
 def onnx_chain(
