@@ -141,13 +141,13 @@ class LogReader:
 class _LogHash:
     """SHA-256 over the hashes of verdicts, codes and whole runs, and of exposures where there are any.
 
-    A run that goes on in the next block is hashed when it ends.
+    A run that continues in the next block is hashed when it ends.
     """
 
     def __init__(self) -> None:
         self._verdicts, self._codes, self._runs = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
         self._exposures, self._walks = hashlib.sha256(), False
-        self._open: NDArray[np.void] = np.zeros(0, RUN_DTYPE)  # the last run, which may go on
+        self._open: NDArray[np.void] = np.zeros(0, RUN_DTYPE)  # the last run, which may continue
 
     def update(self, parts: _Parts) -> None:
         runs, verdicts, exposures, codes = parts

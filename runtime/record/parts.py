@@ -116,7 +116,7 @@ def first_decision(recording: Recording) -> int:
 
 
 def chain_violations(recordings: Sequence[Recording]) -> list[str]:
-    """Return what is wrong between parts that should follow each other; each by itself is verify.py's."""
+    """Return what is wrong between parts that should follow each other; verify.py checks each by itself."""
     known = _known(recordings)
     violations = [f"{one.path}: not a part" for one in recordings if "part" not in one.header]
     if len(runs := {recording.header["part"].get("run") for recording, _ in known}) > 1:

@@ -1,7 +1,7 @@
 """Append-only recordings: everything a run saw and decided, in one file or in parts, which survive a power cut.
 
 What is added is buffered; full buffers and `flush` write blocks to a `RecordingFile`. `Recorder.close` returns the SHA-256 of the decision
-log, which a replay must give again. Reading is recording.py's.
+log, which a replay must give again (reading: recording.py).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 import secrets
 import shutil
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -112,7 +112,7 @@ class Recorder:
         overwrite: bool = False,
         limits: PartLimits | None = None,
     ) -> None:
-        """Create `path`, or part 1 beside it (`part_path`); UsageError if it exists, unless `overwrite`.
+        """Create `path`, or part 1 next to it (`part_path`); UsageError if it exists, unless `overwrite`.
 
         Header and bundle are in the file, or it is not there. What is replaced stays until there are messages, decisions or an end to
         write: a device that refuses before that costs nobody a recording. `header` is JSON-able; `format_version`, `created_utc` and
@@ -137,16 +137,23 @@ class Recorder:
         self._pack = _packing()
         self._replaced = self._files_in_the_way(overwrite)
         self._closed: deque[dict[str, Any]] = deque()  # what the next part says of each
-        self._deleted = {"parts": 0, "bytes": 0, "decisions": 0}
+        self._deleted = Counter(parts=0, bytes=0, decisions=0)
         self._chain = self._trouble = ""
         self._news: list[dict[str, Any]] = []
         self._finishing: list[Future[None]] = []
         self._kept: Path | None = None  # the open file, continued elsewhere: its folder was deleted
+        self._run, self._bundle = secrets.token_hex(8), bundle
         if limits is None:
             self.open_file = RecordingFile(self.path, self._header, bundle)
         else:
-            self._begin_parts(bundle)
+            # files are made and closed by another thread, so that the loop never waits for a disk over a rotation
+            self._worker = ThreadPoolExecutor(1, "pans-parts")
+            self.open_file = self._make_part(1)
         try:
+            if limits is not None:
+                self._begin_part({"decisions": 0}, (), 0, None)
+                self._make_next()
+                self.open_file.sync()  # a part with a name says where it begins; later ones cannot be waited for (`parts.part_of`)
             if not self._replaced:
                 self.open_file.take_name()
         except BaseException:
@@ -174,7 +181,7 @@ class Recorder:
         return self.open_file.first_decision + self.open_file.n_decisions
 
     def keep_deleted(self) -> Path | None:
-        """Continue in a copy beside the folder of a file that was deleted; return its path, None where nothing was deleted.
+        """Continue in a copy next to the folder of a file that was deleted; return its path, None where nothing was deleted.
 
         Parts that were closed before cannot be kept.
         """
@@ -358,18 +365,6 @@ class Recorder:
             _remove(ahead)
         return [one for one in there if not one.name.startswith(".")]
 
-    def _begin_parts(self, bundle: bytes) -> None:
-        self._run, self._bundle = secrets.token_hex(8), bundle
-        # files are made and closed by another thread, so that the loop never waits for a disk over a rotation
-        self._worker = ThreadPoolExecutor(1, "pans-parts")
-        self.open_file = self._make_part(1)
-        try:
-            self._begin_part({"decisions": 0}, (), 0, None)
-            self.open_file.sync()  # a part with a name says where it begins; later ones cannot be waited for (`parts.part_of`)
-        except BaseException:
-            self._abandon()
-            raise
-
     def _begin_part(
         self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int, before: Mapping[str, Any] | None
     ) -> None:
@@ -389,8 +384,6 @@ class Recorder:
             self.add_command(host_ns, data)
         self._write(*self._framed(Kind.EVENTS, self._buffers[Kind.EVENTS].empty()))  # a part begins with it
         self.flush()
-        if before is None:
-            self._make_next()
 
     def _make_part(self, number: int) -> RecordingFile:
         path = part_path(self.path, number)
@@ -404,30 +397,22 @@ class Recorder:
     def _strike_oldest(self) -> list[Path]:
         """Return the parts to delete, so that those that stay keep within the limits; the part that begins now says how many are gone."""
         assert self.limits is not None
-        struck = []
-        needed = RESERVE_PARTS * self.limits.rotate_bytes
-        free = shutil.disk_usage(self.path.parent).free
+        struck, free = [], shutil.disk_usage(self.path.parent).free
         while len(self._closed) > 1:
             kept = sum(part["bytes"] for part in self._closed) + self.limits.rotate_bytes
-            if self.limits.keep_bytes and kept > self.limits.keep_bytes:
-                why = "the cap"
-            elif free < needed:
-                why = "the disk is nearly full"
-            else:
+            too_many = 0 < self.limits.keep_bytes < kept
+            if not too_many and free >= RESERVE_PARTS * self.limits.rotate_bytes:
                 break
+            why = "the cap" if too_many else "the disk is nearly full"
             oldest = self._closed.popleft()
             free += oldest["bytes"]
-            self._deleted = {
-                key: n + oldest.get(key, 1) for key, n in self._deleted.items()
-            }  # one part, its bytes and decisions
+            self._deleted.update(parts=1, bytes=oldest["bytes"], decisions=oldest["decisions"])
             self._news.append({"kind": "part_deleted", "name": oldest["name"], "bytes": oldest["bytes"], "why": why})
             struck.append(self.path.with_name(oldest["name"]))
         return struck
 
     def _note_finished(self) -> None:
         """Look at what the other thread has done."""
-        if not self.parts:
-            return
         for done in [one for one in self._finishing if one.done()]:
             self._finishing.remove(done)
             if (error := done.exception()) is not None:

@@ -26,7 +26,7 @@ Pieces = tuple[bytes, bytes | memoryview, bytes]  # what stands before a payload
 
 
 class RecordingFile:
-    """A file with header and bundle under a hidden name beside `path`, until `take_name` gives it its own."""
+    """A file with header and bundle under a hidden name next to `path`, until `take_name` gives it its own."""
 
     def __init__(self, path: Path, header: Mapping[str, Any], bundle: bytes = b"") -> None:
         """Create the file and sync it. UsageError where that fails; nothing is left behind then.
@@ -143,7 +143,7 @@ class RecordingFile:
                 self._hidden.unlink(missing_ok=True)
 
     def keep_deleted(self) -> None:
-        """Continue in a copy beside the folder of a file that was deleted; `path` is then the copy's.
+        """Continue in a copy next to the folder of a file that was deleted, and take its path.
 
         A file without a name cannot be given one again (link(2) refuses it), but it can be read as long as it is open.
         """
@@ -179,7 +179,7 @@ def _create(name: Path, path: Path) -> Any:
 
 
 def _folder_beside(folder: Path) -> Path:
-    """Make a new folder beside `folder`, which may be gone itself."""
+    """Make a new folder next to `folder`, which may be gone itself."""
     for number in itertools.count(1):
         kept = folder.with_name(f"{folder.name}-kept" + (f"-{number}" if number > 1 else ""))
         with suppress(FileExistsError):

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[Any]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
@@ -101,21 +102,14 @@ class Evidence:
         return np.bincount(self.object_id, values, self.n_objects) / self.shown
 
 
-def evidence_of(
-    scores: NDArray[Any],
-    clicks: NDArray[Any],
-    row: NDArray[Any],
-    truth: NDArray[Any],
-    object_id: NDArray[Any],
-    shots: int = 1,
-) -> Evidence:
+def evidence_of(scores: Array, clicks: Array, row: Array, truth: Array, object_id: Array, shots: int = 1) -> Evidence:
     """Return the evidence with scores centred on each row's mean, in float64, and objects numbered without gaps."""
     numbers = np.unique(object_id, return_inverse=True)[1]
     wide = np.asarray(clicks, np.float64)
     return Evidence(centred(scores), wide, row.astype(np.int64), truth.astype(np.int64), numbers, shots)
 
 
-def centred(scores: NDArray[Any]) -> F64:
+def centred(scores: Array) -> F64:
     """Return scores (n, classes) around the mean of each row."""
     wide = np.asarray(scores, np.float64)
     return np.asarray(wide - wide.mean(axis=1, keepdims=True))

@@ -40,7 +40,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rebuilt:
-    """The new bundle, and what had to change besides."""
+    """The new bundle, and what else had to change."""
 
     bundle: Bundle
     slots_corrected: int  # of an automaton: exposures after which the states' posteriors were corrected too
@@ -85,7 +85,7 @@ def _layers(bundle: Bundle) -> tuple[Layer, ...] | None:
 
 
 def rebuilt(bundle: Bundle, rows: Rows, found: Refitted, clicks: Labelled, provenance: Mapping[str, Any]) -> Rebuilt:
-    """Return `bundle` with what was `found` in place of its back end, and `provenance` beside its own; the old one where nothing was."""
+    """Return `bundle` with what was `found` in place of its back end, and `provenance` added to its own; the old one where nothing was."""
     facts = {**bundle.provenance, "refit": dict(provenance)}
     if found.correction is None:
         return Rebuilt(replace(bundle, provenance=facts), 0, ())
@@ -168,7 +168,7 @@ def _automaton(
 def corrected_layers(layers: tuple[Layer, ...], correction: Correction) -> tuple[Layer, ...]:
     """Return the layers whose scores are the corrected ones; the last one must not be rectified.
 
-    Where the correction reads the clicks, each hidden layer passes them on beside its own values: they are 0 or more, which a rectifier
+    Where the correction reads the clicks, each hidden layer passes them on next to its own values: they are 0 or more, which a rectifier
     leaves as it is.
     """
     *hidden, last = layers
