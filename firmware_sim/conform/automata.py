@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.wire.commands import (
-    Arm,
     Extension,
     MaskChunk,
     Show,
@@ -22,6 +21,7 @@ from pans.runtime.wire.commands import (
 from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, ClickBlock, DeviceState, Opcode
 
 from .bench import Bench
+from .plans import Layout
 from .rules import NotTried, need, rule
 
 CYCLES = 15
@@ -139,8 +139,7 @@ def half_an_automaton(bench: Bench) -> None:
     bench.upload(bench.layout(adaptive=SLOTS))
     good = four_states(steps)
     bench.done(Opcode.LOAD_STATES, pack_command(good._replace(states=good.states[:2])))
-    start = bench.ping().tx_tick + bench.facts["tick_hz"]
-    bench.refused(STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM with two of four states")
+    bench.arm_refused("ARM with two of four states")
 
 
 @rule(
@@ -152,22 +151,21 @@ def follows(bench: Bench) -> None:
     layout, automaton = bench.layout(adaptive=SLOTS), four_states(steps)
     bench.upload(layout)
     bench.done(Opcode.LOAD_STATES, pack_command(automaton))
-    bench.grant()
-    bench.arm(CYCLES)
-    bench.closing(layout, CYCLES)
-    node, seen = 0, 0
-    for block in (one for one in bench.stream() if isinstance(one, ClickBlock)):
-        for place, (stamp, click) in enumerate(zip(block.patterns.tolist(), block.bits.tolist())):
-            slot = (block.exposure_index + place) % layout.n_slots
-            node = 0 if slot == 0 else node
-            lit = slot < SLOTS and node < 4
+    follow(bench, layout, automaton)
+
+
+def follow(bench: Bench, layout: Layout, automaton: StateChunk) -> None:
+    """Run what is loaded for `CYCLES`; hold the stamps against the readings and the states."""
+    node, seen, largest = 0, 0, automaton.outcomes - 1
+    for block in (one for one in bench.expose(layout, CYCLES) if isinstance(one, ClickBlock)):
+        need(block.largest == largest, f"a block has the largest number {block.largest}, asked for was {largest}")
+        for exposure, (stamp, reading) in enumerate(zip(block.patterns, block.bits), block.exposure_index):
+            slot = exposure % layout.n_slots
+            node = node if slot else 0
+            lit = slot < SLOTS and node < automaton.n_states
             wanted = node if lit else DARK_PATTERN
-            need(
-                stamp == wanted,
-                f"exposure {block.exposure_index + place} is stamped {stamp}, the walk stands in {wanted}",
-            )
-            if lit:
-                node = int(automaton.states["next"][node, click])
+            need(stamp == wanted, f"exposure {exposure} is stamped {stamp}, the walk stands in {wanted}")
+            node = int(automaton.states["next"][node, reading]) if lit else node
             seen += 1
     need(seen == CYCLES * layout.n_slots, f"{seen} exposures, the run has {CYCLES * layout.n_slots}")
 

@@ -13,7 +13,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, announced_channels, announced_counts, pack_command
-from pans.runtime.wire.messages import DeviceState, Frame, MalformedMessage, MessageType, Opcode
+from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MalformedMessage, MessageType, Opcode
 from pans.runtime.wire.session import STREAM_TYPES
 
 from .plans import Layout, layout_for
@@ -62,7 +62,7 @@ class Bench:
         self.pieces: list[Piece] = []
         self.inbox: list[Heard] = []
         self._decoder = wire.FrameDecoder()
-        self._raw: list[bytes] = []  # payloads of the latest CLICKS
+        self.raw_clicks: list[bytes] = []  # payloads of the latest CLICKS, as they came
         self._probe = 0
 
     # -- bytes ---------------------------------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ class Bench:
                 "COUNTS came from a device that announces neither photon numbers nor several detectors at once"
             )
         if frame.type == MessageType.CLICKS:
-            self._raw = [*self._raw[-KEPT_PIECES:], frame.payload]
+            self.raw_clicks = [*self.raw_clicks[-KEPT_PIECES:], frame.payload]
         self.inbox.append(Heard(frame.type, message, self.link.now_ns()))
 
     def _note(self, way: str, data: bytes) -> None:
@@ -154,10 +154,6 @@ class Bench:
         found = [heard.message for heard in self.inbox if heard.kind in STREAM_TYPES]
         self.inbox = [heard for heard in self.inbox if heard.kind not in STREAM_TYPES]
         return found
-
-    def raw_clicks(self) -> list[bytes]:
-        """Payloads of the latest CLICKS, as they came."""
-        return list(self._raw)
 
     # -- a session -----------------------------------------------------------------------------------------------------
 
@@ -232,6 +228,18 @@ class Bench:
         self.done(Opcode.ARM, pack_command(Arm(start, cycles, lease_ms)))
         return start
 
+    def arm_refused(self, what: str) -> None:
+        """Ask for a run, which must be refused because of what the device holds, or of its state."""
+        start = int(self.ping().tx_tick) + self.facts["tick_hz"]
+        self.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), what)
+
+    def expose(self, layout: Layout, cycles: int) -> list[Any]:
+        """Arm what is loaded and wait for the end; return the stream messages."""
+        self.grant()
+        self.arm(cycles)
+        self.closing(layout, cycles)
+        return self.stream()
+
     def until_state(self, state: DeviceState, within_s: float = PATIENCE_S) -> Any:
         """Return the STATUS that says `state`."""
         return self.wait(MessageType.STATUS, lambda status: status.state == state, within_s, f"that says {state.name}")
@@ -251,14 +259,6 @@ class Bench:
         self.grant()
         self.arm(0)
         self.until_state(DeviceState.RUNNING)
-
-    def wait_idle(self, within_s: float) -> Any:
-        """Return the first STATUS that says IDLE."""
-        return self.until_state(DeviceState.IDLE, within_s)
-
-    def wait_safe(self, within_s: float) -> Any:
-        """Return the first STATUS that says SAFE."""
-        return self.until_state(DeviceState.SAFE, within_s)
 
     def closing(self, layout: Layout, cycles: int) -> Any:
         """Wait for the end of a run, renewing its lease; return its STATUS."""

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pans.runtime.wire.commands import Arm, pack_command
 from pans.runtime.wire.messages import (
-    AckStatus,
     ClickBlock,
     DeviceState,
     FrameBlock,
@@ -62,7 +60,7 @@ def states(bench: Bench) -> None:
     running = bench.until_state(DeviceState.RUNNING)
     need(running.tick >= start, f"RUNNING at tick {running.tick}, the start tick is {start}")
     bench.grant(lease_ms=LEASE_MS)
-    idle = bench.wait_idle(layout.seconds(CYCLES) + PATIENCE_S)
+    idle = bench.until_state(DeviceState.IDLE, layout.seconds(CYCLES) + PATIENCE_S)
     need(idle.reason == StateReason.COMPLETED, f"reason {idle.reason}, expected 1 (completed)")
     need(idle.tick >= start + CYCLES * layout.cycle_ticks, "IDLE before the last cycle was over")
     need(
@@ -118,7 +116,7 @@ def renewal(bench: Bench) -> None:
     after, hz = bench.ping().rx_tick, bench.facts["tick_hz"]
     bench.listen(0.15)
     bench.grant()
-    late = (bench.wait_safe(PATIENCE_S).tick - after) / hz - 0.3
+    late = (bench.until_state(DeviceState.SAFE).tick - after) / hz - 0.3
     need(late <= LEASE_SLACK_S, f"SAFE {late * 1000:.0f} ms after the lease, which a GRANT with 0 must not renew")
 
 
@@ -127,8 +125,7 @@ def safe(bench: Bench) -> None:
     bench.upload(bench.layout())
     bench.arm(0, lease_ms=150, ahead_s=0.05)
     bench.until_state(DeviceState.SAFE)
-    start = bench.ping().tx_tick + bench.facts["tick_hz"]
-    bench.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM in SAFE")
+    bench.arm_refused("ARM in SAFE")
     bench.done(Opcode.RESET)
     bench.until_state(DeviceState.IDLE)
     bench.arm(0, lease_ms=150, ahead_s=0.05)
@@ -361,7 +358,7 @@ def broken_off(bench: Bench) -> None:
 def spare_bits(bench: Bench) -> None:
     layout, _, stream, _ = run_once(bench)
     if not layout.mode:
-        for piece in bench.raw_clicks():
+        for piece in bench.raw_clicks:
             count = int.from_bytes(piece[28:30], "little")
             spare = piece[-1] >> (count % 8) if count % 8 else 0
             need(spare == 0, f"a block of {count} exposures with the last byte {piece[-1]:#04x}")

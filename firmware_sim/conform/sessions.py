@@ -5,9 +5,8 @@ from __future__ import annotations
 from contextlib import suppress
 
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, pack_command
 from pans.runtime.wire.framing import encode_frame
-from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode
+from pans.runtime.wire.messages import DeviceState, MessageType, Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA, wrong_facts
 
 from .bench import LEASE_MS, PATIENCE_S, Bench
@@ -42,15 +41,11 @@ def new_session(bench: Bench) -> None:
     bench.open()
     ack = bench.command(Opcode.STOP)
     need(ack.last_id == bench.last_id, f"the command ids did not start over: last id {ack.last_id}")
-    start = bench.ping().tx_tick + bench.facts["tick_hz"]
-    bench.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM after a new session")
+    bench.arm_refused("ARM after a new session")
     for opcode, body in bench.layout().commands():
         if opcode != Opcode.LOAD_PLAN:
             bench.done(opcode, body)
-    start = bench.ping().tx_tick + bench.facts["tick_hz"]
-    bench.refused(
-        AckStatus.WRONG_STATE, Opcode.ARM, pack_command(Arm(start, 1, 1000)), "ARM with the plan of the session before"
-    )
+    bench.arm_refused("ARM with the plan of the session before")
 
 
 @rule("2.4", "Frames of another session are dropped.")
