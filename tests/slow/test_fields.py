@@ -61,7 +61,7 @@ def stages() -> dict[str, Stage]:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_any_field_is_taken_or_refused_and_never_passes_against_the_evidence(
     mode: str, stages: dict[str, Stage], tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
