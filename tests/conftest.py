@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import hypothesis
 import pytest
 from tree import ROOT
 
+# these packages need the extra `train`
+TRAINER = ("adaptive", "baselines", "choose", "commands", "export", "model", "reproduce", "train", "test_processor.py")
+collect_ignore = [] if find_spec("torch") else [f"trainer/{name}" for name in TRAINER]
 UNCOMPILED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 # `python -m pytest` puts the checkout on the path, and then `import runtime` would make a second copy of every class.
 sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != ROOT]

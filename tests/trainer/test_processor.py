@@ -8,9 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch", reason="needs the train extra")
-
 import torch
 from trainings import practice_folder
 
@@ -69,16 +66,15 @@ def test_the_type_of_products_works_in_this_process():
     np.testing.assert_allclose(found, a.astype(float) @ b, rtol=2e-2)
 
 
-@pytest.mark.parametrize("how", ["raise", "die"])
+@pytest.mark.parametrize("how", ["die", pytest.param("raise", marks=pytest.mark.slow)])
 def test_refused_products_and_convolutions_are_found_out_once(tmp_path, how):
     answer = "float32 ['AVX512_CORE_BF16']"
     env = refusing(tmp_path, how)
     first = ran(env, "-c", SETTLE)
     assert first.stdout.strip() == answer
     assert "once per machine" in first.stderr
-    (kept, inherited) = (
-        tmp_path / "cache" / "pans-runtime"
-    ).iterdir()  # by the environment before and after the choice
+    # by the environment before and after the choice
+    kept, inherited = (tmp_path / "cache" / "pans-runtime").iterdir()
     told = json.loads(kept.read_text())
     reasons = {reason for tried in told["trials"] for reason in tried["failed"].values()}
     assert reasons == {"SIGILL" if how == "die" else "RuntimeError: could not create a primitive"}

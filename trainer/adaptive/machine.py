@@ -421,35 +421,25 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
 
 def machine_state(machine: Machine) -> dict[str, Any]:
     """Return `machine` as nested lists and dicts of tensors and numbers."""
-    return {
-        "counts": list(machine.counts),
-        "levels": [{"successors": level.successors, **_light_state(level.light)} for level in machine.levels],
-    }
+    levels = []
+    for level in machine.levels:
+        light = {name: getattr(level.light, name) for name in level.light.__slots__}
+        levels.append({"successors": level.successors, "light": light})
+    return {"counts": list(machine.counts), "levels": levels}
 
 
 def machine_from(state: dict[str, Any]) -> Machine:
     """Return the machine of `machine_state`; a tensor that several levels shared is one tensor again."""
     shared: dict[int, Tensor] = {}
-    levels = [Level(_light_from(level, shared), here(level["successors"])) for level in state["levels"]]
+
+    def once(value: Any) -> Any:  # torch.load keeps what was one storage one
+        return shared.setdefault(value.data_ptr(), here(value)) if isinstance(value, Tensor) else value
+
+    levels = []
+    for level in state["levels"]:
+        light = {name: once(value) for name, value in level["light"].items()}
+        levels.append(Level((Grey if "root" in light else Bits)(**light), here(level["successors"])))
     return Machine(levels, [here(counts) for counts in state["counts"]])
-
-
-def _light_state(light: Light) -> dict[str, Any]:
-    if isinstance(light, Grey):
-        return {"root": light.root, "top": light.top, "whole_levels": light.levels}
-    limits = {"bottom": light.bottom, "top": light.top}
-    return {"lean": light.lean, "log_light": light.log_light, "rows": light.rows, "parts": light.parts, **limits}
-
-
-def _light_from(level: dict[str, Any], shared: dict[int, Tensor]) -> Light:
-    def once(tensor: Tensor) -> Tensor:
-        return shared.setdefault(tensor.data_ptr(), here(tensor))  # torch.load keeps what was one storage one
-
-    if "root" in level:
-        return Grey(here(level["root"]), level["top"], level["whole_levels"])
-    rows = None if level["rows"] is None else here(level["rows"])
-    lean, log_light = once(level["lean"]), once(level["log_light"])
-    return Bits(lean, log_light, level["bottom"], level["top"], rows, level.get("parts", 1))
 
 
 def machine_of(bundle: Bundle) -> Machine:

@@ -118,13 +118,7 @@ class TrainingObjects:
         return grey if self._optics is None else self._optics.through(grey.float() + self._black / self.gain, draw)
 
     def _blocks(
-        self,
-        objects: Objects,
-        size: int,
-        dtype: torch.dtype,
-        targets: NDArray[np.float32] | None = None,
-        *,
-        draw: int,
+        self, objects: Objects, size: int, dtype: torch.dtype, targets: NDArray[np.float32] | None = None, *, draw: int
     ) -> Iterator[Block]:
         grey, labels = self._shown(objects.images, draw), objects.labels
         for first in range(0, len(labels), size):

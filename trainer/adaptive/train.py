@@ -39,17 +39,7 @@ from .budget import (
     tune_epochs_of,
     with_defaults,
 )
-from .finish import (
-    Finished,
-    Posteriors,
-    bit_grid,
-    calibrated,
-    finished,
-    meet_budget,
-    node_counts,
-    set_top,
-    to_grid,
-)
+from .finish import Finished, Posteriors, bit_grid, calibrated, finished, meet_budget, node_counts, set_top, to_grid
 from .grow import Growth
 from .machine import COUNT_FLOOR, Bits, Grey, Machine, Sight, as_bits, forward, machine_from, machine_of, machine_state
 from .objects import Block, TrainingObjects

@@ -129,8 +129,5 @@ DATA = Command(
     "list or fetch the public data sets; write a scene for the simulator",
     _configure,
     _data,
-    examples=(
-        "pans data list",
-        "pans data scene parts -o parts.npz",
-    ),
+    examples=("pans data list", "pans data scene parts -o parts.npz"),
 )

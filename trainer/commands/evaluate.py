@@ -203,10 +203,7 @@ def passive_light(bundle: Bundle, held_out: HeldOut) -> dict[str, Any]:
     if bundle.analyser is None:
         return {}
     reaching = bundle.analyser.reaching(held_out.objects.images)
-    return {
-        "amplification": amplification(bundle.analyser.kind, bundle.analyser.matrix),
-        "reaching_photons": reaching,
-    }
+    return {"amplification": amplification(bundle.analyser.kind, bundle.analyser.matrix), "reaching_photons": reaching}
 
 
 def words_of(

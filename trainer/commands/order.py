@@ -80,18 +80,9 @@ def _order(args: argparse.Namespace) -> int:
             new = of_first(new, kept, training_readings(new, held_out.profile, held_out.task.train))
     digest = write_bundle(new, args.out, force=args.force)
     rows = _rows(bundle, order, kept)
-    payload = {
-        "bundle": str(args.out),
-        "sha256": digest,
-        "by": args.by,
-        "exact": None if order is None else order.exact,
-        "objects": None if order is None else order.objects,
-        "patterns": rows,
-        "dose_cap": args.dose_cap,
-        "illumination": new.illumination(),
-        "bleaching": bleaching.spelled() or None,
-        "simulated": True,
-    }
+    payload = {"bundle": str(args.out), "sha256": digest, "by": args.by, "patterns": rows, "dose_cap": args.dose_cap}
+    payload |= {key: None if order is None else getattr(order, key) for key in ("exact", "objects")}
+    payload |= {"illumination": new.illumination(), "bleaching": bleaching.spelled() or None, "simulated": True}
     emit(args, payload, "\n".join(_lines(args.out, digest, rows, order, new)))
     return EXIT_FINE
 
@@ -124,8 +115,5 @@ ORDER = Command(
     "show fixed patterns in the order that tells most first, within a dose",
     _configure,
     _order,
-    examples=(
-        "pans order fashion10 -o ordered.pans",
-        "pans order fashion10 --by dose --dose-cap 60 -o dim.pans",
-    ),
+    examples=("pans order fashion10 -o ordered.pans", "pans order fashion10 --by dose --dose-cap 60 -o dim.pans"),
 )

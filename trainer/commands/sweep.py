@@ -81,17 +81,10 @@ def _run(args: argparse.Namespace) -> int:
         say(f"interrupted; finished trials are in {shown_storage(args.storage)}\n  continue with the same command")
         return EXIT_INTERRUPTED
     done = [trial for trial in study.trials if trial.state == finished]
-    payload = {
-        "study": name,
-        "trials": len(done),
-        "best_loss": study.best_value,
-        "best": study.best_params,
-        "seconds": time.perf_counter() - started,
-        "simulated": True,
-    }
-    emit(
-        args, payload, f"{name}: {len(done)} trials, best validation loss {study.best_value:.4f}\n  {study.best_params}"
-    )
+    payload = {"study": name, "trials": len(done), "best_loss": study.best_value, "best": study.best_params}
+    payload |= {"seconds": time.perf_counter() - started, "simulated": True}
+    words = f"{name}: {len(done)} trials, best validation loss {study.best_value:.4f}\n  {study.best_params}"
+    emit(args, payload, words)
     return EXIT_FINE
 
 
@@ -177,10 +170,8 @@ def _base(args: argparse.Namespace) -> Options:
 
 def _check_same(study: Any, base: Options, data_sha256: str) -> None:
     """A study holds trials of one question; UsageError when this one is another."""
-    wanted = {
-        "data": data_sha256,
-        **{key: str(getattr(base, key)) for key in ("clicks", "photons", "estimator", "epochs", "hidden")},
-    }
+    wanted = {key: str(getattr(base, key)) for key in ("clicks", "photons", "estimator", "epochs", "hidden")}
+    wanted = {"data": data_sha256} | wanted
     found = study.user_attrs
     differing = [f"{key} {found[key]} (now {value})" for key, value in wanted.items() if found.get(key, value) != value]
     if differing:

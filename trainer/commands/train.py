@@ -13,15 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_new_bundle, emit, say
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
-from pans.trainer.options import (
-    ENCODERS,
-    SEED,
-    AutomatonOptions,
-    Options,
-    add_unset_options,
-    flag_of,
-    option_names,
-)
+from pans.trainer.options import ENCODERS, SEED, AutomatonOptions, Options, add_unset_options, flag_of, option_names
 
 from .arguments import (
     HISTORY_FILES,

@@ -109,12 +109,7 @@ def held_out_of(
 
 
 def measure(
-    bundle: Bundle,
-    held_out: HeldOut,
-    *,
-    shots: int = 1,
-    trials: int | None = None,
-    conditions: Conditions = AS_IT_IS,
+    bundle: Bundle, held_out: HeldOut, *, shots: int = 1, trials: int | None = None, conditions: Conditions = AS_IT_IS
 ) -> Measured | MeasuredPictures | MeasuredWalks:
     """Return what `bundle` decides on the objects: from `trials` decisions per object, or exact without (not of pictures)."""
     objects = held_out.objects
@@ -145,12 +140,7 @@ def measure(
 
 
 def walks_on(
-    bundle: Bundle,
-    held_out: HeldOut,
-    *,
-    shots: int = 1,
-    trials: int | None = None,
-    conditions: Conditions = AS_IT_IS,
+    bundle: Bundle, held_out: HeldOut, *, shots: int = 1, trials: int | None = None, conditions: Conditions = AS_IT_IS
 ) -> Walks:
     """Return what the automaton of `bundle` does on the objects: `trials` walks of each, or exact without."""
     if shots != 1:

@@ -56,9 +56,9 @@ def export_automaton(
 ) -> ExportedAutomaton:
     """Write what `train_automaton` returned to `path`; UsageError if it exists, unless `force`. A wrong bundle never stands there."""
     bundle = bundle_of(trained, task, profile, name, provenance)
-    bundle = with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
-    difference = compare_walks(bundle, trained, task, profile)
     dark = trained.options.dark
+    bundle = with_tolerance(bundle, task, profile, trained.options.optics, dark)
+    difference = compare_walks(bundle, trained, task, profile)
     found = measure_walks(bundle, task.test, profile, dark)
     first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, dark)
     expected = expected_figures(found, profile.name, task.name, "test")
@@ -74,14 +74,8 @@ def bundle_of(
 ) -> Bundle:
     """Return the bundle of a trained automaton: states and leaves that no walk reaches are left out, and patterns that none shows."""
     arrays = trained.arrays
-    automaton = reachable_automaton(
-        arrays.pattern,
-        arrays.dwell,
-        arrays.dwell_steps,
-        arrays.successors,
-        arrays.posteriors,
-        trained.options.outcomes > 2,
-    )
+    parts = arrays.pattern, arrays.dwell, arrays.dwell_steps, arrays.successors, arrays.posteriors
+    automaton = reachable_automaton(*parts, trained.options.outcomes > 2)
     first, pattern = np.unique(automaton.pattern, return_inverse=True)
     channels = automaton.channels
     automaton = replace(automaton, pattern=(channels * pattern).astype(np.uint16))

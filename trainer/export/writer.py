@@ -191,12 +191,6 @@ def export_trained(
     facts = origin(task, profile) | {"validation_losses": list(trained.validation_losses), **provenance}
     about = Description(name, task.name, task.classes, task.image_shape, facts, trained.options.outcomes)
 
-    def check(bundle: Bundle) -> None:
-        compare_optics(bundle, trained, task, profile)
-
-    def finish(bundle: Bundle) -> Bundle:
-        return with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
-
     def ordering(bundle: Bundle) -> tuple[list[int], Mapping[str, Any]]:
         found = information_order(bundle, profile, task.train, by=order or "")
         return list(found.patterns), order_facts(found, bundle)
@@ -207,9 +201,9 @@ def export_trained(
         trained.click_mean.numpy(),
         optics,
         about,
-        check,
+        lambda bundle: compare_optics(bundle, trained, task, profile),
         force=force,
-        finish=finish,
+        finish=lambda bundle: with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark),
         ordering=None if order is None else ordering,
     )
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,21 +35,6 @@ FIRST = 200
 STEPS_SHOWN = 8
 PATTERNS_SHOWN = 8
 QUANTITIES = (("loss", "loss"), ("clicks", "clicks per decision"), ("photons", "photons per decision"))
-
-
-class Reported(Protocol):
-    """What both kinds of training tell of a step; a dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def stage(self) -> str: ...
-    @property
-    def loss(self) -> float: ...
-    @property
-    def clicks(self) -> float: ...
-    @property
-    def photons(self) -> float: ...
 
 
 class History:
@@ -85,9 +70,9 @@ class History:
 
 
 def write_course(
-    folder: Path, reports: Sequence[Reported], more: Mapping[str, Any] = MappingProxyType({}), *, force: bool = False
+    folder: Path, reports: Sequence[Any], more: Mapping[str, Any] = MappingProxyType({}), *, force: bool = False
 ) -> list[Path]:
-    """Write history.json (the reports and `more`) and curves.png into `folder`; return both paths."""
+    """Write history.json (`reports` of either kind of training, and `more`) and curves.png into `folder`; return both paths."""
     make_folder(folder)
     facts = {"simulated": True, "epochs": [asdict(report) for report in reports], **more}
     write_file(folder / "history.json", (json.dumps(facts, indent=1) + "\n").encode(), force=force)
@@ -95,13 +80,14 @@ def write_course(
     return [folder / "history.json", folder / "curves.png"]
 
 
-def draw_curves(path: Path, reports: Sequence[Reported], *, force: bool = False) -> None:
+def draw_curves(path: Path, reports: Sequence[Any], *, force: bool = False) -> None:
     """Draw loss, clicks and photons over the epochs (of an automaton: levels, then epochs), one line per restart."""
     figure, axes = new_figure(width=12.0, height=3.6, panels=len(QUANTITIES))
     for axis, (name, label) in zip(axes, QUANTITIES):
-        for restart in sorted({_restart(report) for report in reports}):
+        restarts = [getattr(report, "restart", 0) for report in reports]
+        for restart in sorted(set(restarts)):
             # starts and restarts run through the same epochs again: the order is that of the training
-            values = [getattr(report, name) for report in reports if _restart(report) == restart]
+            values = [getattr(report, name) for report, own in zip(reports, restarts) if own == restart]
             axis.plot(range(1, len(values) + 1), values, color="C0", alpha=0.9 if restart == 0 else 0.4)
         axis.set(xlabel="epochs trained", ylabel=label)
         axis.grid(alpha=0.3)
@@ -113,10 +99,6 @@ def draw_curves(path: Path, reports: Sequence[Reported], *, force: bool = False)
         axes[0].annotate(stage, (begin, 1.0), xycoords=("data", "axes fraction"), fontsize=7, rotation=90, va="top")
     figure.suptitle("SIMULATED, training objects", fontsize=9)
     save_figure(figure, path, force=force)
-
-
-def _restart(report: Reported) -> int:
-    return int(getattr(report, "restart", 0))
 
 
 def draw_evolution(
@@ -162,13 +144,7 @@ class Course:
     trained: Trained
 
 
-def follow(
-    task: Task,
-    profile: Profile,
-    options: Options,
-    *,
-    patterns_after: tuple[int, ...] = (),
-) -> Course:
+def follow(task: Task, profile: Profile, options: Options, *, patterns_after: tuple[int, ...] = ()) -> Course:
     """Train one run of active illumination by `options` and judge it after every epoch; the result is that of `train`."""
     data = TrainingData(task, profile, options)
     run = Run(data, profile, options, 0)

@@ -54,7 +54,7 @@ HEAD_DRAWS = 4  # optics through which the head sees every object when it is fit
 
 
 def second_stage(options: Options) -> int:
-    """Return the epoch at which stage_at 2 begins; the end when there is no stage_at 2."""
+    """Return the epoch at which stage 2 begins; the end when there is no stage 2."""
     return options.epochs if options.estimator in STRAIGHT_THROUGH else round(options.warm * options.epochs)
 
 
@@ -64,18 +64,18 @@ def whole_levels(options: Options) -> int:
 
 
 def estimator_at(options: Options, epoch: int) -> str:
-    """Return the name of the estimator_at of an epoch."""
+    """Return the name of the estimator of an epoch."""
     first = options.estimator if options.estimator in STRAIGHT_THROUGH else "ste"
     return first if epoch < second_stage(options) else options.estimator
 
 
 def stage_at(options: Options, epoch: int) -> str:
-    """Return the name of the stage_at of an epoch, for reports."""
+    """Return the name of the stage of an epoch, for reports."""
     return estimator_at(options, epoch) + (", levels" if epoch >= whole_levels(options) else "")
 
 
 def rates_at(options: Options, now: float) -> tuple[float, float]:
-    """Return learning rates_at of patterns and head: one cycle per estimator_at, the second one half as high in front."""
+    """Return the learning rates of patterns and head: one cycle per estimator, the second one half as high in front."""
     if options.constant:
         return options.front_rate, options.head_rate
     first, second = now < second_stage(options), second_stage(options)
@@ -88,13 +88,13 @@ def rates_at(options: Options, now: float) -> tuple[float, float]:
 
 
 def black_at(options: Options, now: float, floor: float) -> float:
-    """Return the transmission of black_at: 0 in stage_at 1, then rising to the modulator's; patterns found at once are worse by points."""
+    """Return the transmission of black: 0 in stage 1, then rising to the modulator's; patterns found at once are worse by points."""
     start = 0.3 * options.epochs if options.estimator in STRAIGHT_THROUGH else second_stage(options)
     return floor * min(1.0, max(0.0, (now - start) / (0.4 * options.epochs)))
 
 
 def slope_and_clamp(options: Options, now: float) -> tuple[float, float]:
-    """Return the factor on the light and the most photoelectrons that count; 1 and infinity once stage_at 1 is over."""
+    """Return the factor on the light and the most photoelectrons that count; 1 and infinity once stage 1 is over."""
     done = min(1.0, now / (0.3 * options.epochs))
     if now >= second_stage(options) or done == 1.0:
         return 1.0, math.inf
@@ -104,7 +104,7 @@ def slope_and_clamp(options: Options, now: float) -> tuple[float, float]:
 def loss_at(options: Options, now: float, picture_shape: tuple[int, int] | None) -> LossOf:
     """Return the cross-entropy, which turns to wrong decisions in the last part of the epochs; of pictures error and similarity.
 
-    Similarity waits for stage_at 2, where there is one: it takes most of the time, and to start without it cost nothing measurable.
+    Similarity waits for stage 2, where there is one: it takes most of the time, and to start without it cost nothing measurable.
     """
     if picture_shape is not None:
         waits = now < second_stage(options) < options.epochs

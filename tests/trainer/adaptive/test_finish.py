@@ -1,12 +1,7 @@
 """Posteriors of the nodes: smoothing, calibration on held-back objects, and the calibration error."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 import numpy as np
+import pytest
 
 from pans.trainer.adaptive.finish import calibrated, calibration_error, log_loss, smoothed
 

@@ -1,13 +1,10 @@
 """The exact forward pass and its gradient: against all outcome words one by one, and against differences of the loss."""
 
-# ruff: noqa: E402  (what follows needs torch)
 from itertools import product
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
+import torch
 from mpmath import mp, mpf
 from trainings import assert_slope, random_machine
 

@@ -1,11 +1,7 @@
 """A sweep that moves edges: it never raises the loss of its objects, and leaves no node without an edge."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
+import torch
 from trainings import bars_task, random_machine
 
 from pans.runtime.instrument.click_law import ClickLaw

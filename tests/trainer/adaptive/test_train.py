@@ -1,14 +1,10 @@
 """Training of an automaton on a small task: what it learns, the budget, repeatability, checkpoints, the export, and what is refused."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 from dataclasses import replace
 
 import numpy as np
+import pytest
+import torch
 from trainings import bars_task
 
 from pans.runtime.bundle.model import load_bundle

@@ -1,6 +1,5 @@
 """The alternatives to PANS: equal photons, exact posteriors against loops and closed forms, networks that learn, the command."""
 
-# ruff: noqa: E402  (what follows needs torch)
 from __future__ import annotations
 
 import json
@@ -12,9 +11,7 @@ from typing import Any
 import naive_baselines
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
+import torch
 from trainings import kept_task
 
 from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_USAGE, main

@@ -1,14 +1,9 @@
 """The size of a training follows from the images, and every reason for a warning is told."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from trainings import practice_folder
 
 from pans.runtime.instrument.profile import load_profile

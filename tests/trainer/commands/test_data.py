@@ -27,16 +27,20 @@ def test_a_drawn_task_becomes_a_scene(part: str, tmp_path: Path, capsys: pytest.
     assert scene.classes == task.classes
 
 
-def test_what_cannot_be_meant_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = str(tmp_path / "x.npz")
-    for words, said in [
-        (["scene", "-o", out], "one task"),
-        (["scene", "cells", "barcode", "-o", out], "one task"),
-        (["scene", "cells"], "one file"),
-        (["scene", "cells", "-o", str(tmp_path / "x.png")], "ends in .npz"),
-        (["scene", "cells", "-o", out, "--objects", "0"], "--objects is 0"),
-        (["scene", "nonsense", "-o", out], "neither one of"),
-    ]:
-        assert main(["data", *words]) == 2
-        assert said in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("-o x.npz", "one task"),
+        ("cells barcode -o x.npz", "one task"),
+        ("cells", "one file"),
+        ("cells -o x.png", "ends in .npz"),
+        ("cells -o x.npz --objects 0", "--objects is 0"),
+        ("cells -o x.npz --data-seed -1", "--data-seed is -1"),
+        ("nonsense -o x.npz", "neither one of"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(words: str, said: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["data", "scene", *words.split()]) == 2
+    assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

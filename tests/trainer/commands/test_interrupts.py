@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from trainings import bars_task, kept_task, short_fits  # noqa: F401 - a fixture
 
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
-from trainings import bars_task, kept_task, short_fits  # noqa: E402, F401 - a fixture
-
-from pans.runtime.bundle.model import load_bundle  # noqa: E402
-from pans.runtime.cli import main  # noqa: E402
-from pans.trainer.train import checkpoint  # noqa: E402
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.cli import main
+from pans.trainer.train import checkpoint
 
 FIXED = ["--features", "2", "--epochs", "2", "--batch", "64", "--hidden", "8"]
 AUTOMATON = ["--encoder", "automaton", "--photons", "3", "--exposures", "3", "--states", "4", "--epochs", "1"]

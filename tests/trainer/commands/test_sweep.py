@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from databases import postgres_server
 
-pytest.importorskip("torch", reason="needs the train extra")
 optuna = pytest.importorskip("optuna", reason="needs the sweep extra")
-
 from pans.runtime.cli import main  # noqa: E402
 
 

@@ -3,9 +3,6 @@
 import json
 
 import pytest
-
-pytest.importorskip("torch", reason="needs the train extra")
-
 from trainings import bars_task, kept_task
 
 from pans.runtime.bundle.model import load_bundle

@@ -5,10 +5,6 @@ import shlex
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch", reason="needs the train extra")
-pytest.importorskip("PIL", reason="needs the train extra")
-
 from trainings import practice_folder
 
 from pans.runtime.bundle.model import load_bundle
@@ -54,13 +50,6 @@ def test_a_folder_needs_no_option_and_the_next_commands_work(letters, capsys):
     assert bundle.expected["objects"] == 30
 
 
-def test_the_answer_holds_direct_imaging_at_equal_photons(letters, capsys):
-    assert main(["train", letters, *QUICK, "--photons", "5", "-o", "letters.pans", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["direct_imaging"]["photons_mean"] == pytest.approx(answer["photons_mean"], rel=1e-3)
-    assert 0.1 < answer["direct_imaging"]["accuracy_mean"] < 1
-
-
 def test_as_is_chooses_nothing(letters, capsys):
     assert main(["train", letters, "--as-is", "-o", "letters.pans"]) == 2
     assert "--features is missing" in capsys.readouterr().err
@@ -83,9 +72,13 @@ def test_an_option_of_fixed_patterns_asks_for_them(letters, capsys, monkeypatch)
     assert load_bundle("letters.pans")[0].pattern_levels.shape[0] == 3
 
 
-def test_the_course_of_an_automaton_is_written_and_drawn(letters, tmp_path):
+def test_the_course_of_an_automaton_is_written_and_the_answer_holds_direct_imaging(letters, tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
-    assert main(["train", letters, *QUICK, "--history", "course", "-o", "letters.pans"]) == 0
+    more = ["--photons", "5", "--history", "course", "-o", "letters.pans", "--json"]
+    assert main(["train", letters, *QUICK, *more]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["direct_imaging"]["photons_mean"] == pytest.approx(answer["photons_mean"], rel=1e-3)
+    assert 0.1 < answer["direct_imaging"]["accuracy_mean"] < 1
     course = json.loads((tmp_path / "course/history.json").read_text())
     stages = [step["stage"] for step in course["epochs"]]
     assert stages == ["grow"] * 4 + ["grey"] * 3 + ["shown"]

@@ -69,7 +69,7 @@ def test_fixed_patterns_bring_what_pixels_have_left() -> None:
 def test_walks_before_samples_that_bleach_are_those_of_all_words(mixed: bool) -> None:
     law = Bleaching(2.0, mixed)
     bundle = automaton_bundle(six_states(), photons=1.5)
-    automaton, trials = bundle.automaton, 4000
+    automaton, trials = bundle.automaton, 1500
     assert automaton is not None
     wanted, photons = np.zeros((len(IMAGES), automaton.n_leaves)), np.zeros(len(IMAGES))
     for row, object_ in enumerate(transmission()):

@@ -1,15 +1,11 @@
 """Every task: a tiny training, its bundle, the runtime's decisions on it; passive sensors and pictures through a whole run."""
 
-# ruff: noqa: E402  (what follows needs torch)
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-pytest.importorskip("onnx", reason="needs the train extra")
-
+import torch
 from trainings import short_fits  # noqa: F401  a fixture
 
 from pans.runtime.bundle.model import load_bundle

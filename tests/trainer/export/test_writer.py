@@ -1,15 +1,11 @@
 """Export: folded normalisation with dead and saturated channels, the ONNX graph, and parity of the written file."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
+import torch
 from heads import head_bundle, random_layers
 from naive_decide import int8_reference
 from trainings import bars_task, short_fits  # noqa: F401 - a fixture

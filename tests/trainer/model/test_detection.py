@@ -1,14 +1,10 @@
 """Detection in torch: the click law, the damped straight-through gradient, exact enumeration."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 from itertools import product
 
 import numpy as np
+import pytest
+import torch
 from trainings import random_machine
 
 from pans.runtime.detector import Afterpulses

@@ -1,12 +1,8 @@
 """Active illumination: squared weights inside the limits of the projector, whole levels, gradients through the rounding."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 import numpy as np
+import pytest
+import torch
 from trainings import random_machine
 
 from pans.runtime.bundle.optics import amplification

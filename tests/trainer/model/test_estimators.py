@@ -1,16 +1,12 @@
 """Gradient estimators: exact against finite differences, the unbiased ones against exact, the flips against plain passes."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 import itertools
 import math
 
 import naive_ssim
 import numpy as np
+import pytest
+import torch
 from trainings import assert_slope
 
 from pans.runtime.instrument.click_law import ClickLaw, CountLaw, count_chances

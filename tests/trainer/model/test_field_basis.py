@@ -1,10 +1,8 @@
 """Fields that one class has and the others lack: against the definition, on scenes where they are known, and back to pixels."""
 
-# ruff: noqa: E402  (what follows needs torch)
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
+import torch
 
 from pans.trainer.model.encoders import CoherentField
 from pans.trainer.model.field_basis import discriminant_basis, in_pixels

@@ -1,9 +1,7 @@
 """Heads: shapes for every number of patterns, flips against plain passes, the same start from the same generator."""
 
-# ruff: noqa: E402  (what follows needs torch)
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
+import torch
 
 from pans.trainer.model.heads import new_head
 from pans.trainer.options import PICTURE_HEADS, Options

@@ -1,10 +1,8 @@
 """Objects through drawn optics, as training sees them: held against the light that pans.runtime.imaging states."""
 
-# ruff: noqa: E402  (what follows needs torch)
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
+import torch
 
 from pans.runtime.imaging import Bleaching, Imaging, bleached, met
 from pans.trainer.model.encoders import ActiveIllumination

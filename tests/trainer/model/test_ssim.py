@@ -5,10 +5,9 @@ from __future__ import annotations
 import naive_ssim
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from pans.trainer.model.ssim import ssim  # noqa: E402
+from pans.trainer.model.ssim import ssim
 
 
 def test_the_mean_is_that_of_the_slow_oracle_the_edge_included() -> None:

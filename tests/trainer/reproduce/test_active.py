@@ -1,14 +1,10 @@
 """The active tables: rows trained, resumed, told from those of another recipe, and put beside the paper's and direct imaging."""
 
-# ruff: noqa: E402  (what follows needs torch)
 import dataclasses
 import json
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 from trainings import columns_task
 
 from pans.trainer.options import Options

@@ -1,22 +1,18 @@
 """Pages of the alternatives, of readouts and of trainings that are followed: measured once, read between levels, drawn."""
 
-# ruff: noqa: E402  (what follows needs torch)
 import dataclasses
 
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="needs the train extra")
 pytest.importorskip("matplotlib", reason="needs the plot extra")
 pytest.importorskip("sklearn", reason="needs the plot extra")
-
 from trainings import columns_task, short_fits  # noqa: F401 - a fixture
 
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import Options
 from pans.trainer.reproduce import curves, dynamics, readouts, ways
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
-from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.history import follow
 from pans.trainer.train.loop import train
 
@@ -137,12 +133,7 @@ def test_frames_are_drawn_mapped_and_judged(task, asked, tmp_path, monkeypatch):
 
 
 def test_readouts_of_the_shipped_patterns_stand_beside_frames(asked, tmp_path, monkeypatch):
-    rng = np.random.default_rng(3)
-    labels = rng.integers(0, 10, 700)
-    images = np.zeros((700, 28, 28), np.uint8)
-    images[np.arange(700), 2 * labels + 4, 4:24] = 255
-    parts = [Objects(images[at], labels[at]) for at in (slice(500), slice(500, 700))]
-    task = Task("fashion-mnist", tuple("abcdefghij"), *parts, "0" * 64, "")
+    task = columns_task(500, 200, 10, 28, "fashion-mnist")
     monkeypatch.setattr(readouts, "load_task", lambda *_: task)
     monkeypatch.setattr(readouts, "PHOTONS", (3.0, 1e4))
     page, _ = asked

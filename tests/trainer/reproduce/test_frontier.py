@@ -1,15 +1,12 @@
 """The frontier: points of its recipes, means and margins against figures by hand, rows of every kind measured once."""
 
-# ruff: noqa: E402  (what follows needs torch)
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
+from trainings import columns_task
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.instrument.profile import load_profile
@@ -20,7 +17,7 @@ from pans.trainer.reproduce.curves import EXACT, STOPPING
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
 from pans.trainer.reproduce.printed import ACTIVE
 from pans.trainer.reproduce.ways import Point
-from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.tasks.registry import Task
 
 QUICK = {"exposures": 4, "states": 3, "grow_epochs": 1, "tune_epochs": 1, "epochs": 1, "reroutes": 0}
 GROWN = Point("mnist", "automaton", 2.0, "automaton", (("photons", 2.0), *QUICK.items()))
@@ -28,12 +25,7 @@ GROWN = Point("mnist", "automaton", 2.0, "automaton", (("photons", 2.0), *QUICK.
 
 @pytest.fixture(scope="module")
 def halves() -> Task:
-    rng = np.random.default_rng(8)
-    labels = rng.integers(0, 2, 1500)
-    bright = 190 * (np.arange(4)[None, None] // 2 == labels[:, None, None])
-    images = (rng.integers(0, 60, (1500, 4, 4)) + bright).astype(np.uint8)
-    parts = [Objects(images[at], labels[at]) for at in (slice(1200), slice(1200, 1500))]
-    return Task("mnist", ("left", "right"), *parts, "0" * 64, "made here")
+    return columns_task(1200, 300, 2, 4, "mnist")
 
 
 @pytest.fixture
@@ -144,15 +136,15 @@ def test_the_page_measures_every_kind_of_point_and_is_drawn(asked, tmp_path, mon
     stopping = bayes | {"method": "stopping"}
     fixed = {"features": 3, "alpha": 0.0, "photons": 3.0, "epochs": 2, "hidden": 8, "batch": 50}
     wanted = [
-        {"name": EXACT, "kind": "baseline", "options": bayes, "levels": {"mnist": {"1": {}, "100": {}}}},
+        {"name": EXACT, "kind": "baseline", "options": bayes, "levels": {"mnist": {"0.5": {}, "100": {}}}},
         {"name": STOPPING, "kind": "baseline", "options": stopping, "levels": {"mnist": {"3": {}, "1000": {}}}},
         {"name": "fixed", "kind": "fixed", "options": fixed, "levels": {"mnist": {"3": {}}}},
     ]
     monkeypatch.setattr(ways, "WAYS", wanted)
     page = curves.frontier_page(asked)
     points = {(row["way"], row["level"]): row for row in of_table(page.rows, "mnist")}
-    assert set(points) == {(EXACT, 1), (EXACT, 100), (STOPPING, 3), ("fixed", 3)}  # stopping cannot spend 1000 photons
-    assert points[EXACT, 1]["photons"] == pytest.approx(1, rel=1e-4)
+    assert set(points) == {(EXACT, 0.5), (EXACT, 100), (STOPPING, 3), ("fixed", 3)}  # no 1000 for stopping
+    assert points[EXACT, 0.5]["photons"] == pytest.approx(0.5, rel=1e-4)
     assert points["fixed", 3]["exposures"] == 3
     assert "ahead" in points["fixed", 3]
     assert curves.frontier_page(replace(asked, collect=True)).rows == page.rows

@@ -6,8 +6,6 @@ import re
 import pytest
 from tree import ROOT
 
-pytest.importorskip("torch", reason="needs the train extra")
-
 from pans.runtime.errors import UsageError
 from pans.trainer.reproduce.page import (
     NAMES,

@@ -1,13 +1,11 @@
 """The tables over dark counts: cells judged and kept, pictures given back, other draws of the generator, direct imaging beside a cell."""
 
-# ruff: noqa: E402  (what follows needs torch)
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
+import torch
 from trainings import columns_task
 
 from pans.runtime.cli import main
@@ -19,6 +17,7 @@ from pans.trainer.reproduce.page import Asked, page_of, write_page
 from pans.trainer.reproduce.printed import PASSIVE, recipe
 from pans.trainer.tasks import mmf as task_mmf
 from pans.trainer.tasks.registry import Objects, Task, draw_task
+from pans.trainer.train import exact_search
 from pans.trainer.train.data import TrainingData
 
 CELLS = PASSIVE["cells"].rows[0]
@@ -48,6 +47,7 @@ def few_cells(monkeypatch):
 
 def test_a_barcode_cell_is_judged_on_all_strings_and_kept(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
+    monkeypatch.setattr(exact_search, "search_bars", partial(exact_search.search_bars, steps=400))
     small = dataclasses.replace(recipe("barcode", PASSIVE["barcode"].rows[0], 0.0), restarts=1, hidden=8)
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     asked = quiet("barcode", tmp_path, rows=(3,), dark=(0.0,))

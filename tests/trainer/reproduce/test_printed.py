@@ -2,8 +2,6 @@
 
 import pytest
 
-pytest.importorskip("torch", reason="needs the train extra")
-
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import check_options
 from pans.trainer.reproduce import active, dynamics, passive, sequence

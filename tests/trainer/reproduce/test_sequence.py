@@ -5,8 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs the train extra")
-
 from pans.trainer.reproduce import sequence
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
 from pans.trainer.tasks.registry import Objects

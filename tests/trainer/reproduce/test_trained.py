@@ -5,9 +5,6 @@ import json
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch", reason="needs the train extra")
-
 from bundles import made_bundle
 from heads import onnx_chain
 
@@ -47,7 +44,6 @@ def code_bundle():
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
     """One row of either table."""
-    pytest.importorskip("onnx", reason="needs the train extra")
     folder = tmp_path_factory.mktemp("cache")
     for name in ACTIVE:
         row = next(row for row in ACTIVE[name] if row.features == 4)

@@ -1,4 +1,4 @@
-"""Tasks: pinned public files, a user's own data, and what is refused before it is unpacked."""
+"""Tasks: pinned public files, a user's own data, what is refused before it is unpacked, and the fibre of MMF-MNIST."""
 
 import gzip
 from importlib.metadata import EntryPoint
@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pans.runtime.bundle.optics import phase_mask, scatter
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
 from pans.trainer.tasks import registry as tasks
+from pans.trainer.tasks.mmf import release_intensity
 from pans.trainer.tasks.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
-from pans.trainer.tasks.registry import load_task, path_from, remembered_task, task_names
+from pans.trainer.tasks.registry import FIBRE_TASKS, load_task, path_from, remembered_task, task_names
 
 RNG = np.random.default_rng(0)
 
@@ -266,3 +268,41 @@ def test_what_is_not_there_is_told_with_the_places(lab: Path) -> None:
     assert "looked for gone/parts, parts, bundles/parts" in caught.value.message
     assert "SHA-256 abababababab…" in caught.value.message
     assert caught.value.remedy.startswith("name it: --task")
+
+
+IMAGES = np.random.default_rng(1).integers(0, 256, (5, 28, 28), dtype=np.uint8)
+
+
+def test_the_mask_is_pinned():
+    mask = phase_mask()
+    assert mask.shape == (28, 28)  # RandomState(42): .3745 .9507 .7320
+    assert mask.ravel()[:3] == pytest.approx([2.353312, 5.973520, 4.599257], abs=1e-5)
+    assert 0 <= mask.min() < mask.max() < 2 * np.pi
+
+
+def test_the_fibre_loses_no_light():
+    assert (np.abs(scatter(IMAGES)) ** 2).sum(axis=(1, 2)) == pytest.approx(
+        ((IMAGES / 255) ** 2).sum(axis=(1, 2)), rel=1e-5
+    )
+
+
+def test_the_speckle_by_the_definition_of_the_fourier_transform():
+    n = np.arange(28)
+    fourier = np.exp(-2j * np.pi * np.outer(n, n) / 28)
+    spectrum = fourier @ (IMAGES[0] / 255) @ fourier * np.exp(1j * phase_mask())
+    wanted = fourier.conj() @ spectrum @ fourier.conj() / 784
+    assert np.abs(scatter(IMAGES[:1])[0] - wanted).max() < 1e-5
+
+
+def test_the_release_normalises_every_batch_by_itself():
+    batched = release_intensity(IMAGES, batch=2)
+    for start in (0, 2, 4):
+        assert np.allclose(batched[start : start + 2], release_intensity(IMAGES[start : start + 2]))
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", FIBRE_TASKS)
+def test_mmf_mnist_is_mnist_behind_the_fibre(name, data_dir):
+    task, digits = load_task(name, data_dir), load_task("mnist", data_dir)
+    assert (task.name, task.light, task.optics, task.target) == (name, "field", "mmf", FIBRE_TASKS[name])
+    assert np.array_equal(task.test.images, digits.test.images)

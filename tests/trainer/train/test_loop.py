@@ -1,16 +1,12 @@
 """Training: a tiny synthetic task end to end, budgets, repeatability, checkpoints, and what is refused."""
 
-# ruff: noqa: E402  (what follows needs torch)
-
-import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 import json
 import os
 from dataclasses import replace
 
 import numpy as np
+import pytest
+import torch
 from bundles import made_bundle
 from trainings import bars_task, short_fits  # noqa: F401 - a fixture
 

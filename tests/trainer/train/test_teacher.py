@@ -1,13 +1,9 @@
 """Soft targets: what the network learns, that its answers repeat, and the file they are kept in."""
 
-# ruff: noqa: E402  (what follows needs torch)
 from dataclasses import replace
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch", reason="needs the train extra")
-
 from trainings import bars_task
 
 from pans.runtime.errors import DamagedFileError, UsageError
