@@ -15,7 +15,8 @@ from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, new_file, say
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import check_outputs, write_file
 from pans.trainer.tasks.generators import GENERATORS
-from pans.trainer.tasks.registry import Objects, draw_task, load_task
+from pans.trainer.tasks.public_sets import PUBLIC_SETS, check_pinned, data_folder, fetch
+from pans.trainer.tasks.registry import FIBRE_TASKS, Objects, draw_task, load_task
 
 from .arguments import add_data_dir
 
@@ -70,8 +71,6 @@ def _objects(name: str, args: argparse.Namespace) -> tuple[tuple[str, ...], Obje
 
 
 def _sets(args: argparse.Namespace) -> int:
-    from pans.trainer.tasks.public_sets import PUBLIC_SETS, data_folder
-
     unknown = [name for name in args.names if name not in PUBLIC_SETS]
     if unknown:
         raise UsageError(f"no data set {unknown[0]!r}, allowed: {', '.join(PUBLIC_SETS)}")
@@ -90,8 +89,6 @@ def _sets(args: argparse.Namespace) -> int:
 
 def _files(folder: Path, name: str, *, fetching: bool) -> list[dict[str, object]]:
     """The state of each file of a public set, fetched before if wanted."""
-    from pans.trainer.tasks.public_sets import PUBLIC_SETS, check_pinned, fetch
-
     rows: list[dict[str, object]] = []
     for pinned in PUBLIC_SETS[name].files:
         path = folder / PUBLIC_SETS[name].folder / pinned.name
@@ -109,9 +106,6 @@ def _files(folder: Path, name: str, *, fetching: bool) -> list[dict[str, object]
 
 def _tasks(absent: set[str]) -> list[dict[str, str]]:
     """Every task by name: the encoder that its physics asks for, and whether its images can be had now."""
-    from pans.trainer.tasks.public_sets import PUBLIC_SETS
-    from pans.trainer.tasks.registry import FIBRE_TASKS
-
     found = [
         (name, "active", "not there" if name in absent else "there", f"public, {one.licence}")
         for name, one in PUBLIC_SETS.items()
