@@ -1,7 +1,4 @@
-"""Figures as small PNG files (extra `plot`): a new one with its axes, and saving it.
-
-Owns the resolution and the back end, which needs no screen; what is drawn is the caller's.
-"""
+"""Figures as small PNG files (extra `plot`), without a screen: a new one with its axes, and saving it."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ class Growth:
                 mask, _ = light.displayed()
                 chances, falls = readings(self.sight.light(mask, block.grey), self.sight.law)
                 arrived = [(alpha * chance) @ block.one_hot.T for chance in chances]
-                slope = slope_of(falls, _told(parts, whole, block), self.sight.law)
+                slope = slope_of(falls, _gains(parts, whole, block), self.sight.law)
                 slope.neg_().add_(price).mul_(by_row(alpha, self.channels)).mul_(1.0 / len(block))
                 light.set_gradients(self.sight.mask_slope(slope, block.grey, light), None)
                 optimiser.param_groups[0]["lr"] = RATE * (1 - done / steps) + 1e-4
@@ -203,7 +203,7 @@ def remainder(whole: Tensor, parts: list[Tensor]) -> Tensor:
     return rest
 
 
-def _told(parts: list[Tensor], whole: Tensor, block: Block) -> list[Tensor]:
+def _gains(parts: list[Tensor], whole: Tensor, block: Block) -> list[Tensor]:
     """By how much the cross-entropy of each outcome but the last is above that of the last, (states, objects), by their class counts."""
     rest = remainder(whole, parts)
     if len(parts) > 1:

@@ -88,38 +88,30 @@ class Measurement:
 
 def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str = "source") -> Measurement:
     """Measure all objects of `task` by `patterns` (d_f, pixels, at least 0), or pixel by pixel without them (direct imaging)."""
-    n_pixels = math.prod(task.image_shape)
+    n_pixels, shape = math.prod(task.image_shape), task.image_shape if patterns is None else None
     if not task.test.images.any():
         raise ValueError(f"the test objects of {task.name} are black: no light can reach the detector")
-    shared = (task.train.labels, task.test.labels, len(task.classes))
-    if task.light != "transmission" or task.optics != "none":
-        return _incident_frames(task, patterns, brightness)
-    train, test = (part.images.reshape(len(part), n_pixels) for part in (task.train, task.test))
-    if patterns is None:
-        ones = np.ones(n_pixels, np.float32)
-        return Measurement(train, shared[0], test, shared[1], shared[2], ones, 1 / 255, brightness, task.image_shape)
-    if patterns.ndim != 2 or patterns.shape[1] != n_pixels or not (patterns >= 0).all() or not patterns.any():
-        raise ValueError(f"patterns are {patterns.shape}, allowed: (d_f, {n_pixels}), at least 0 and not all 0")
-    weights = patterns.astype(np.float32).T
-    features = [_features(images, weights) for images in (train, test)]
-    full = weights.sum(axis=0)
-    return Measurement(features[0], shared[0], features[1], shared[1], shared[2], full, 1.0, brightness, None)
-
-
-def _incident_frames(task: Task, patterns: NDArray[np.floating] | None, brightness: str) -> Measurement:
-    """Frames of light that reaches us: a camera sees the intensity of a field, not its amplitude."""
-    if patterns is not None:
-        raise ValueError(
-            f"{task.name} is light that reaches us: no patterns can be thrown on it, only a direct image taken"
-        )
-    n_pixels = math.prod(task.image_shape)
-    train, test = (
-        incident_intensity(part.images, task.light, task.optics).reshape(-1, n_pixels)
-        for part in (task.train, task.test)
-    )
-    full = np.full(n_pixels, float(test.mean()), np.float32)  # so that a floor is a part of the mean light
+    flat: list[NDArray[Any]] = [part.images.reshape(len(part), n_pixels) for part in (task.train, task.test)]
+    train, test = flat
+    full, unit = np.ones(n_pixels, np.float32), 1.0
+    if (
+        task.light != "transmission" or task.optics != "none"
+    ):  # a camera sees the intensity of a field, not its amplitude
+        if patterns is not None:
+            raise ValueError(f"{task.name} is light that reaches us: it takes no patterns, only a direct image")
+        lit = (incident_intensity(part.images, task.light, task.optics) for part in (task.train, task.test))
+        train, test = (images.reshape(-1, n_pixels) for images in lit)
+        full *= np.float32(test.mean())  # so that a floor is a part of the mean light
+    elif patterns is None:
+        unit = 1 / 255
+    else:
+        if patterns.ndim != 2 or patterns.shape[1] != n_pixels or not (patterns >= 0).all() or not patterns.any():
+            raise ValueError(f"patterns are {patterns.shape}, allowed: (d_f, {n_pixels}), at least 0 and not all 0")
+        weights = patterns.astype(np.float32).T
+        train, test = (_features(images, weights) for images in (train, test))
+        full = weights.sum(axis=0)
     labels, n_classes = (task.train.labels, task.test.labels), len(task.classes)
-    return Measurement(train, labels[0], test, labels[1], n_classes, full, 1.0, brightness, task.image_shape)
+    return Measurement(train, labels[0], test, labels[1], n_classes, full, unit, brightness, shape)
 
 
 def _features(images: NDArray[np.uint8], weights: F32) -> F32:

@@ -24,7 +24,7 @@ from pans.trainer.tasks.registry import Task
 from pans.trainer.train.history import write_course
 
 from .arguments import Show, stated_tolerance
-from .evaluate import class_words
+from .evaluate import words_of
 
 BUDGET_TOLERANCE = 0.01  # of the light or the clicks that were asked for
 
@@ -100,9 +100,7 @@ class AutomatonTraining:
         }
         lines = [
             f"{automaton.n_states} states, {bundle.n_patterns} patterns, at most {automaton.n_slots} exposures",
-            _words("all held-out objects", measured),
-            *class_words(answer["by_class"]),
-            _words("the first 200", exported.first_200),
+            words_of(measured, {"first_200": answer["first_200"]}),
             *missed,
         ]
         return exported.sha256, answer, lines
@@ -123,14 +121,3 @@ def budget_off(options: AutomatonOptions, found: MeasuredWalks) -> tuple[float, 
     again = f"--{name} {wanted / (1 + off):.4g}" if off > -1 else f"a larger --{name}"
     words = f"budget missed by {off:+.1%}: {got:.3g} {name} on all held-out objects, asked for {wanted:g}; "
     return off, [f"{words}to come closer, train with {again}"] if abs(off) > BUDGET_TOLERANCE else []
-
-
-def _words(which: str, found: MeasuredWalks) -> str:
-    accuracy, error = 100 * (found.accuracy_mean or 0.0), 100 * (found.accuracy_se_objects or 0.0)
-    off = 100 * (found.expected_calibration_error or 0.0)
-    return (
-        f"SIMULATED accuracy {accuracy:.2f} %  ({which}: {found.objects}, exact expectation, "
-        f"error from the objects {error:.2f} points)\n"
-        f"  clicks {found.clicks_mean:.3f}   photons {found.photons_mean:.2f}   illumination {found.illumination:.1f}   "
-        f"exposures {found.exposures_mean:.1f}   calibration error {off:.1f} points"
-    )

@@ -202,7 +202,11 @@ def order_facts(order: Order, bundle: Bundle) -> dict[str, Any]:
 
 def _back_end(bundle: Bundle, places: list[int]) -> BackEnd:
     outcomes = bundle.largest + 1
-    table = None if bundle.table is None else bundle.table[_old_rows(places, outcomes)]
+    table = None
+    if bundle.table is not None:  # digit i of a new row was that of pattern places[i]
+        word = np.arange(outcomes**bundle.n_features, dtype=np.int64)
+        digits = (word // outcomes**new % outcomes * outcomes**old for new, old in enumerate(places))
+        table = bundle.table[np.asarray(sum(digits), np.int64)]
     if bundle.head_onnx is None:
         return BackEnd(table=table, outcomes=outcomes)
     layers = plain_layers(bundle)
@@ -214,12 +218,6 @@ def _back_end(bundle: Bundle, places: list[int]) -> BackEnd:
 
         quantised = int8_onnx(int8)
     return BackEnd(chain_onnx((first, *layers[1:])), table, int8, quantised, outcomes)
-
-
-def _old_rows(places: list[int], outcomes: int) -> NDArray[np.int64]:
-    """The row of the old table for each of the new one: digit i was that of pattern places[i]."""
-    word = np.arange(outcomes ** len(places), dtype=np.int64)
-    return np.asarray(sum(word // outcomes**new % outcomes * outcomes**old for new, old in enumerate(places)), np.int64)
 
 
 def _int8(head: Int8Head, places: list[int]) -> Int8Head:

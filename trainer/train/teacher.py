@@ -82,7 +82,9 @@ def _fit(network: nn.Sequential, objects: Objects, epochs: int, report: Callable
     optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
     rates = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=max(2, steps))
     for epoch in range(epochs):
-        images, total = _version(objects.images, epoch), 0.0
+        # distorted anew in each epoch; images too small for it stay as they are
+        small, total = min(objects.images.shape[1:]) < SIDE_MIN_PX, 0.0
+        images = objects.images if small else distorted(objects.images, [STREAM, epoch], DISTORTION)
         for which in np.array_split(np.random.default_rng([STREAM, epoch]).permutation(n), -(-n // BATCH)):
             loss = nn.functional.cross_entropy(_scores(network, images[which]), labels[which])
             optimiser.zero_grad()
@@ -93,20 +95,10 @@ def _fit(network: nn.Sequential, objects: Objects, epochs: int, report: Callable
         report(epoch, total / n)
 
 
-def _version(images: NDArray[np.uint8], epoch: int) -> NDArray[np.uint8]:
-    """Distorted anew in each epoch; images too small for it stay as they are."""
-    return distorted(images, [STREAM, epoch], DISTORTION) if min(images.shape[1:]) >= SIDE_MIN_PX else images
-
-
 def _scores(network: nn.Module, images: NDArray[np.uint8]) -> Tensor:
     """Scores of images (n, height, width), in the type of training's products, as float32 (n, classes)."""
-    shown = (
-        here(torch.from_numpy(images.copy()))
-        .float()
-        .unsqueeze(1)
-        .div_(255.0)
-        .contiguous(memory_format=torch.channels_last)
-    )
+    shown = here(torch.from_numpy(images.copy())).float().unsqueeze(1).div_(255.0)
+    shown = shown.contiguous(memory_format=torch.channels_last)
     with torch.autocast(shown.device.type, torch.bfloat16, enabled=product_dtype() == torch.bfloat16):
         scores: Tensor = network(shown)
     return scores.float()
@@ -138,20 +130,15 @@ def read_targets(path: Path, taught: Taught, n_classes: int) -> F32:
             task, fitted, epochs, targets = (file[name] for name in FILE_FIELDS)
         found = Taught(str(task), int(fitted), int(epochs))
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise DamagedFileError(
-            f"{path}: no soft targets: {error}", remedy="remove it, and they are made anew"
-        ) from error
+        raise DamagedFileError(f"{path}: no soft targets: {error}", remedy="remove it to make them anew") from error
     if found != taught:
         raise UsageError(f"{path} holds {found}, wanted: {taught}", remedy="name another file, and they are made anew")
-    _check_targets(path, targets, (taught.fitted, n_classes))
-    return np.asarray(targets, np.float32)
-
-
-def _check_targets(path: Path, targets: NDArray[np.float32], shape: tuple[int, int]) -> None:
-    wanted = f"float32 {shape}, each row probabilities that sum to 1"
+    shape = (taught.fitted, n_classes)
     fine = targets.shape == shape and targets.dtype == np.float32 and bool(np.isfinite(targets).all())
     if not fine or (targets < 0).any() or (abs(targets.sum(axis=1) - 1.0) > SUM_TOLERANCE).any():
+        wanted = f"float32 {shape}, each row probabilities that sum to 1"
         raise DamagedFileError(
             f"{path}: targets are {targets.dtype} {targets.shape}, allowed: {wanted}",
-            remedy="remove it, and they are made anew",
+            remedy="remove it to make them anew",
         )
+    return np.asarray(targets, np.float32)
