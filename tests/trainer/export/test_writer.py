@@ -96,16 +96,6 @@ def test_patterns_in_another_order_are_held_against_the_model(tmp_path):
         compare(done.bundle, head, mean)
 
 
-def test_another_model_is_noticed(tmp_path):
-    mean = np.full(6, 0.4)
-    done = written(tmp_path / "small.pans", trained_head(6, seed=1), mean, 6)
-    other = trained_head(6, seed=1)
-    with torch.no_grad():
-        other.output.bias[0] += 1e-3
-    with pytest.raises(PansError, match="differs from the trained model"):
-        compare(done.bundle, other, mean)
-
-
 def test_a_wrong_fold_never_leaves_the_export(tmp_path, monkeypatch):
     fold = fold_normalisation
     monkeypatch.setattr(onnx_heads, "fold_normalisation", lambda *layer: fold(*layer[:4], layer[4] * 1.001))
