@@ -46,7 +46,7 @@ ALL_CHANNELS = -1
 # goes to rising channels, which spoil decisions soonest.
 SHARES = {"rise": 0.6, "fall": 0.2, "burst": 0.1, "drift": 0.1}
 MAX_CHANNELS = 4096
-_ALARM_ROOM = 256  # alarms of one call; more are counted, not kept
+_ALARM_ROOM = 256  # alarms of one call; more are not kept
 # columns of a test's state
 SUM, THRESHOLD, CLICK_STEP, SILENT_STEP, LAST, SINCE, N_STATE = range(7)
 
@@ -223,7 +223,6 @@ class ChannelWatch:
         self.expected = np.clip(np.asarray(expected, np.float64), FLOOR_RATE, RATE_MAX)
         self.clicks: I64 = np.zeros(n_channels, np.int64)
         self.exposures = 0
-        self.dropped_alarms = 0
         high = self.expected if guard_high is None else np.clip(guard_high, self.expected, RATE_MAX)
         low = self.expected if guard_low is None else np.clip(guard_low, FLOOR_RATE, self.expected)
         self.low = low
@@ -300,7 +299,6 @@ class ChannelWatch:
         return math.ceil(needed.min()) if len(needed) else None
 
     def _alarms(self, n: int) -> list[Alarm]:
-        self.dropped_alarms += max(0, n - _ALARM_ROOM)
         alarms = []
         for row in self._room[: min(n, _ALARM_ROOM)]:
             test = int(row[0])

@@ -74,19 +74,6 @@ def counted_mean(dead_time: DeadTime, mean: ArrayLike) -> F64:
     return np.asarray(mean * np.interp(np.log1p(mean), _MARKS, table))
 
 
-def counted_slope(dead_time: DeadTime, mean: F64) -> F64:
-    """Return the derivative of `counted_mean` by the mean, of its shape."""
-    if not dead_time.reach:
-        return np.ones_like(mean)
-    table = counted_table(dead_time)
-    place = np.minimum(np.log1p(mean) / STEP, INTERVALS)
-    left = np.minimum(place.astype(np.int64), INTERVALS - 1)
-    rise = table[left + 1] - table[left]
-    return np.asarray(
-        table[left] + rise * (place - left) + np.where(place < INTERVALS, rise / STEP, 0.0) * mean / (1 + mean)
-    )
-
-
 @lru_cache(maxsize=64)
 def mean_of_most_clicks(dead_time: DeadTime) -> float:
     """Return the mean beyond which more light clicks less often, as it does where it paralyses; inf where there is none."""

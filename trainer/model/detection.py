@@ -58,7 +58,7 @@ def click_probability(photoelectrons: Tensor, law: Law | CountLaw, slope: float 
 def counted_mean(mean: Tensor, dead_time: DeadTime) -> tuple[Tensor, Tensor]:
     """Return what dead time leaves of `mean`, and the derivative by it: both of its shape and dtype, the first differentiable.
 
-    The same as `pans.runtime.instrument.dead_time.counted_mean` and `counted_slope`.
+    The same as `pans.runtime.instrument.dead_time.counted_mean`.
     """
     if not dead_time.reach:
         return mean, torch.ones_like(mean)

@@ -12,7 +12,7 @@ from naive_dead_time import share_of_clicks
 
 from pans.runtime.instrument import dead_time as law_module
 from pans.runtime.instrument.click_law import ClickLaw, both_chances, click_law, click_probability, dead_time_of
-from pans.runtime.instrument.dead_time import DeadTime, counted_mean, counted_slope
+from pans.runtime.instrument.dead_time import DeadTime, counted_mean
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light
 from pans.runtime.instrument.profile import load_profile
 
@@ -63,7 +63,6 @@ def test_the_law_against_every_photon_on_the_whole_grid() -> None:
 def test_a_pause_that_outlasts_it_leaves_nothing(dead_time: DeadTime) -> None:
     mean = np.array([0.0, 0.5, 1e7])
     assert np.array_equal(counted_mean(dead_time, mean), mean)
-    assert np.array_equal(counted_slope(dead_time, mean), np.ones(3))
 
 
 @pytest.mark.parametrize("dead_time", [DeadTime(0.6), DeadTime(0.6, 0.2, True, True)])
@@ -96,13 +95,6 @@ def test_the_table_is_fine_enough(dead_time: DeadTime) -> None:
     silent = np.exp(-counted_mean(dead_time, mean))
     np.testing.assert_allclose(silent, np.exp(-exact), atol=2e-5)
     np.testing.assert_allclose(-np.expm1(-exact[:8]), 1 - silent[:8], rtol=1e-4)
-
-
-@pytest.mark.parametrize("dead_time", CASES)
-def test_the_slope_is_the_derivative(dead_time: DeadTime) -> None:
-    mean = np.exp(np.random.default_rng(2).uniform(-4, 3, 50))
-    difference = (counted_mean(dead_time, mean * (1 + 1e-6)) - counted_mean(dead_time, mean)) / (mean * 1e-6)
-    np.testing.assert_allclose(counted_slope(dead_time, mean), difference, atol=2e-3)
 
 
 def exact_silence(mean: float, dead: float, reach: float) -> mpmath.mpf:

@@ -45,18 +45,8 @@ GOOD: dict[str, tuple[Any, ...]] = {
 }
 TAILS = {"CLICKS": bytes(8 * 2 + 1), "FRAMES": bytes(8 * 2), "COUNTS": bytes(8 * 3)}
 FACTS_OF_A_DEVICE = {
-    **{"tick_hz": 1000, "mode": "parallel", "channels": 1, "levels": 2, "pattern_memory": 0, "pattern_pixels": 0},
-    **{
-        "slot_memory": 1,
-        "epoch": 0,
-        "tick": 0,
-        "buffer_messages": 1,
-        "firmware": "f",
-        "serial": "s",
-        "simulated": True,
-    },
-    **{"automaton_schema": AUTOMATON_SCHEMA, "automaton_states": 0, "dwell_steps": 1, "count_schema": COUNT_SCHEMA},
-    **{"photon_number_max": 1, "objects": 0, "scene_height_px": 1, "scene_width_px": 1, "scene_n_classes": 1},
+    key: fact.low if fact.kind is int else True if fact.kind is bool else (*fact.words, "text")[0]
+    for key, fact in FACTS.items()
 }
 
 
