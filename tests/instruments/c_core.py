@@ -76,12 +76,8 @@ def build_library(folder: Path = FOLDER, cache: Path | None = None, flags: tuple
 
 def settings_text(profile: Profile, scene: Any, seed: int, buffer: int) -> str:
     """Return what the library is told before it starts: lines of whole ticks, bytes and counts, `start` the last of them."""
-    hz, projector, exposure, parallel = (
-        profile.clock.tick_hz,
-        profile.projector,
-        profile.exposure,
-        profile.mode == "parallel",
-    )
+    hz, projector, exposure = profile.clock.tick_hz, profile.projector, profile.exposure
+    parallel = profile.mode == "parallel"
     lines = {
         "tick_hz": hz,
         "parallel": int(parallel),

@@ -75,32 +75,17 @@ class Pair:
         self.command(Opcode.ARM, pack_command(Arm(self.tick + 5000, cycles, lease_ms)))
 
     def differences(self) -> list[str]:
-        """What the two have not said alike; the texts of refusals and of WELCOME are each device's own."""
-        ours, theirs = (said(heard) for heard in self.heard)
-        return [
-            f"{kind:#04x}: {len(ours[kind])} and {len(theirs[kind])} messages, {first_difference(ours[kind], theirs[kind])}"
-            for kind in ours | theirs
-            if ours[kind] != theirs[kind]
-        ]
+        """Kinds of messages that the two have not sent alike; the texts of refusals and of WELCOME are each device's own."""
+        ours, theirs = (sent_by_kind(heard) for heard in self.heard)
+        return [f"{kind:#04x}: {ours[kind]} and {theirs[kind]}" for kind in ours | theirs if ours[kind] != theirs[kind]]
 
 
-def said(heard: list[Frame]) -> defaultdict[int, list[bytes]]:
-    """Payloads by type, as far as two devices must agree."""
-    found: defaultdict[int, list[bytes]] = defaultdict(list)
+def sent_by_kind(heard: list[Frame]) -> defaultdict[int, list[str]]:
+    """Payloads by type, in hex, as far as two devices must agree."""
+    found: defaultdict[int, list[str]] = defaultdict(list)
     for frame in heard:
-        payload = frame.payload
-        if frame.type == MessageType.ACK:
-            payload = payload[:14]
-        elif frame.type == MessageType.WELCOME:
-            payload = payload[:8]
-        found[frame.type].append(payload)
+        found[frame.type].append(frame.payload[: {MessageType.ACK: 14, MessageType.WELCOME: 8}.get(frame.type)].hex())
     return found
-
-
-def first_difference(ours: list[bytes], theirs: list[bytes]) -> str:
-    """The first pair that differs, as hex."""
-    pairs = ((a.hex(), b.hex()) for a, b in zip(ours, theirs) if a != b)
-    return " against ".join(next(pairs, ("one more", "one less")))
 
 
 def strange_frames(seed: int, pair: Pair, count: int) -> list[bytes]:
