@@ -92,19 +92,30 @@ _BLOCK = (
     Field("count", "H", "exposures", "exposures", low=1),
 )
 _OBJECT = Field("object_index", "I", "object")
+_PROBE = (Field("probe_id", "I", "probe id"), Field("host_ns", "Q", "host nanoseconds", "ns"))
+_VERSION = (Field("schema", "I"), Field("protocol", "H"), _reserved("H"))
+_FIRST_PIXEL = Field("first_pixel", "I", "first pixel", "pixels")
+_ALL_PIXELS = Field("n_pixels", "I", "pixels in the whole pattern", "pixels", low=1)
+_N_STATES = Field("n_states", "H", "states in all", "states", low=1, high=MAX_STATES)
+_FIRST_STATE = Field("first_state", "H", "first state", high=MAX_STATES - 1)
+_STEPS = Field("dwell_steps", "H", "dwell steps", "steps", low=1)
+_LEAVES = Field("n_leaves", "I", "leaves", low=1, high=MAX_LEAVES)
+_PATTERN = Field("pattern", "H", "pattern", high=U16_MAX - 1)
+_DWELL = Field("dwell", "H", "dwell", "steps", low=1)
+_LARGEST = Field("largest", "H", "largest number", "photons", low=2, high=MAX_PHOTON_NUMBER)
+
+
+def _next(name: str, title: str) -> Field:
+    return Field(name, "I", title, low=1, high=MAX_STATES + MAX_LEAVES - 1)
+
 
 # In the order of the schema text: it is made from this table, and the two ends compare its checksum.
 MESSAGES: Mapping[str, tuple[Field, ...]] = {
     "HEADER": (Field("type", "B"), Field("flags", "B"), _reserved("H"), Field("session", "I", "session", low=1)),
-    "HELLO": (Field("schema", "I"), Field("protocol", "H"), _reserved("H")),
-    "WELCOME": (Field("schema", "I"), Field("protocol", "H"), _reserved("H")),
-    "PING": (Field("probe_id", "I", "probe id"), Field("host_ns", "Q", "host nanoseconds", "ns")),
-    "PONG": (
-        Field("probe_id", "I", "probe id"),
-        Field("host_ns", "Q", "host nanoseconds", "ns"),
-        _tick("rx_tick", "tick of arrival"),
-        _tick("tx_tick", "of departure"),
-    ),
+    "HELLO": _VERSION,
+    "WELCOME": _VERSION,
+    "PING": _PROBE,
+    "PONG": (*_PROBE, _tick("rx_tick", "tick of arrival"), _tick("tx_tick", "of departure")),
     "COMMAND": (Field("command_id", "I", "command id", low=1), Field("opcode", "B"), _reserved("B"), _reserved("H")),
     "ACK": (
         Field("last_id", "I", "last id"),
@@ -137,12 +148,7 @@ MESSAGES: Mapping[str, tuple[Field, ...]] = {
         _tick("tick", "tick"),
         Field("photons", "f", "expected photoelectrons", "photoelectrons", low=0.0, high=_LARGEST_REAL),
     ),
-    "LOAD_PATTERN": (
-        Field("index", "H", "index"),
-        _reserved("H"),
-        Field("first_pixel", "I", "first pixel", "pixels"),
-        Field("n_pixels", "I", "pixels in the whole pattern", "pixels", low=1),
-    ),
+    "LOAD_PATTERN": (Field("index", "H", "index"), _reserved("H"), _FIRST_PIXEL, _ALL_PIXELS),
     "LOAD_PLAN": (
         Field("mode", "B", high=1),
         _reserved("B"),
@@ -175,50 +181,34 @@ AUTOMATON_MESSAGES: Mapping[str, tuple[Field, ...]] = {
     "LOAD_MASKS": (
         Field("index", "H", "index of the first"),
         Field("count", "H", "masks", "patterns", low=1),
-        Field("first_pixel", "I", "first pixel", "pixels"),
-        Field("n_pixels", "I", "pixels in the whole pattern", "pixels", low=1),
+        _FIRST_PIXEL,
+        _ALL_PIXELS,
         Field("pixels", "I", "pixels here", "pixels", low=1),
     ),
-    "LOAD_STATES": (
-        Field("n_states", "H", "states in all", "states", low=1, high=MAX_STATES),
-        Field("first_state", "H", "first state", high=MAX_STATES - 1),
-        Field("dwell_steps", "H", "dwell steps", "steps", low=1),
-        _reserved("H"),
-        Field("n_leaves", "I", "leaves", low=1, high=MAX_LEAVES),
-    ),
+    "LOAD_STATES": (_N_STATES, _FIRST_STATE, _STEPS, _reserved("H"), _LEAVES),
     "STATE": (
-        Field("pattern", "H", "pattern", high=U16_MAX - 1),
-        Field("dwell", "H", "dwell", "steps", low=1),
-        Field("next_dark", "I", "successor without a click", low=1, high=MAX_STATES + MAX_LEAVES - 1),
-        Field("next_click", "I", "successor after a click", low=1, high=MAX_STATES + MAX_LEAVES - 1),
+        *(_PATTERN, _DWELL, _next("next_dark", "successor without a click")),
+        _next("next_click", "successor after a click"),
     ),
     "SHOW": (
         Field("exposure_index", "Q", "exposure", "exposures", high=LARGEST_TICK),
         Field("state", "H", "state", high=MAX_STATES - 1),
-        Field("pattern", "H", "pattern", high=U16_MAX - 1),
-        Field("dwell", "H", "dwell", "steps", low=1),
-        Field("dwell_steps", "H", "dwell steps", "steps", low=1),
+        _PATTERN,
+        _DWELL,
+        _STEPS,
     ),
 }
 # The same for photon numbers (protocol.md, section 13).
 COUNT_MESSAGES: Mapping[str, tuple[Field, ...]] = {
-    "COUNTS": (*_BLOCK, Field("largest", "H", "largest number", "photons", low=2, high=MAX_PHOTON_NUMBER), _OBJECT),
-    "READ_COUNTS": (
-        Field("largest", "H", "largest number", "photons", low=2, high=MAX_PHOTON_NUMBER),
-        Field("channels", "H", "detectors read at once", "detectors", high=MAX_CHANNELS_AT_ONCE),
-    ),
+    "COUNTS": (*_BLOCK, _LARGEST, _OBJECT),
+    "READ_COUNTS": (_LARGEST, Field("channels", "H", "detectors read at once", "detectors", high=MAX_CHANNELS_AT_ONCE)),
     "LOAD_COUNT_STATES": (
-        Field("n_states", "H", "states in all", "states", low=1, high=MAX_STATES),
-        Field("first_state", "H", "first state", high=MAX_STATES - 1),
-        Field("dwell_steps", "H", "dwell steps", "steps", low=1),
+        *(_N_STATES, _FIRST_STATE, _STEPS),
         Field("outcomes", "H", "outcomes", "photon numbers", low=3, high=MAX_PHOTON_NUMBER + 1),
-        Field("n_leaves", "I", "leaves", low=1, high=MAX_LEAVES),
+        _LEAVES,
     ),
-    "COUNT_STATE": (
-        Field("pattern", "H", "pattern", high=U16_MAX - 1),
-        Field("dwell", "H", "dwell", "steps", low=1),
-    ),
-    "COUNT_SUCCESSOR": (Field("next", "I", "successor", low=1, high=MAX_STATES + MAX_LEAVES - 1),),
+    "COUNT_STATE": (_PATTERN, _DWELL),
+    "COUNT_SUCCESSOR": (_next("next", "successor"),),
 }
 _WHOLE = {**MESSAGES, **AUTOMATON_MESSAGES, **COUNT_MESSAGES}
 # without what is reserved: those are 0 when sent and not looked at when they come
