@@ -232,12 +232,10 @@ def _run(args: argparse.Namespace) -> int:
             raise UsageError(f"--{name} has no effect with `pans service {args.action}`", remedy="leave it out")
     if args.action == "monitoring":
         return _monitoring(args)
+    remedies = {"config": "write the options to a file: pans run ... --write-config", "name": "name the service"}
     needed = "config" if args.action in ("install", "show") else "name"
     if getattr(args, needed) is None:
-        remedy = (
-            "write the options to a file: pans run ... --write-config" if needed == "config" else "name the service"
-        )
-        raise UsageError(f"`pans service {args.action}` needs --{needed}", remedy=remedy)
+        raise UsageError(f"`pans service {args.action}` needs --{needed}", remedy=remedies[needed])
     name = check_name(args.name or args.config.stem)
     folder = args.unit_dir or (USER_UNITS.expanduser() if args.user else SYSTEM_UNITS)
     return _ACTIONS[args.action](args, name, folder / f"pans-{name}.service")

@@ -39,10 +39,10 @@ class Watchdog:
 
     def __init__(self, *, continuous: bool) -> None:
         self.run: LiveRun | None = None
+        self.recorder: Recorder | None = None  # to be flushed
+        self.note: Callable[[str], object] = str  # is told why the process ends
+        self.closes = False  # from here on the light is off and files are closed
         self._continuous = continuous
-        self._recorder: Recorder | None = None
-        self._note: Callable[[str], None] | None = None
-        self._closing = False
         self._done = threading.Event()
         self._main = threading.get_ident()
 
@@ -64,14 +64,6 @@ class Watchdog:
         self._thread.join()
         self._hears.close()
 
-    def watch(self, recorder: Recorder | None, note: Callable[[str], None]) -> None:
-        """Know what is to be flushed, and what notes why the process ends."""
-        self._recorder, self._note = recorder, note
-
-    def closes(self) -> None:
-        """From here on the light is off and files are closed."""
-        self._closing = True
-
     def _listen(self) -> None:
         while data := self._hears.recv(64):
             if asked := SIGNALS & set(data):
@@ -87,15 +79,14 @@ class Watchdog:
             _within(STEP_S, lambda: link.write(session.stop_frames(receiver.next_id())))  # in the loop's place
         if self._is_done_by(asked_s + END_AFTER_S):
             return
-        while self._is_closing and time.monotonic() < asked_s + CLOSING_END_AFTER_S:
+        while self.closes or (
+            self.run is not None and self.run.stopped
+        ):  # a busy machine is slow to close links and files
             if self._done.wait(0.1):
                 return
+            if time.monotonic() >= asked_s + CLOSING_END_AFTER_S:
+                break
         self._end_process(signum)
-
-    @property
-    def _is_closing(self) -> bool:
-        """Whether only links and files are left, which a busy machine is slow to close."""
-        return self._closing or (self.run is not None and self.run.stopped)
 
     def _is_done_by(self, at_s: float) -> bool:
         return self._done.wait(max(0.0, at_s - time.monotonic()))
@@ -108,10 +99,9 @@ class Watchdog:
         why = f"{asked}: the run did not end by itself; it was in {place}"
         # The main thread is not in the recorder, and is not expected back: what is buffered can be written from here.
         modules = [str(frame.f_globals.get("__name__", "")) for frame in stack]
-        if self._recorder is not None and not any(name.startswith("pans.runtime.record") for name in modules):
-            _within(STEP_S, self._recorder.flush)
-        if (note := self._note) is not None:
-            _within(STEP_S, lambda: note(why))
+        if self.recorder is not None and not any(name.startswith("pans.runtime.record") for name in modules):
+            _within(STEP_S, self.recorder.flush)
+        _within(STEP_S, lambda: self.note(why))
         shown = "\x1b[?25h" if sys.stderr.isatty() else ""  # a live view had hidden the cursor
         _within(STEP_S, lambda: os.write(2, f"{shown}pans: {why}\n".encode(errors="replace")))
         os._exit(EXIT_TIMING if asked == ASKED_TO_STOP else EXIT_INTERRUPTED)

@@ -63,14 +63,14 @@ class Watchers:
                 opening.callback(self._notifier.close)
             self._open = opening.pop_all()
         if self._watchdog is not None:
-            self._watchdog.watch(self._recorder, self._note_end)
+            self._watchdog.recorder, self._watchdog.note = self._recorder, self._note_end
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._watchdog is not None:
-            self._watchdog.closes()
+            self._watchdog.closes = True
         try:
             if self._run is not None and error is None:
                 self.note_news(self._run)  # the recording is still open
