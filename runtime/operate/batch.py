@@ -227,7 +227,7 @@ class Journal:
 
 
 def flat_rows(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows for a table: the answer's keys beside the others, one level of objects with a dot in between."""
+    """Return rows for a table: the answer's keys among the others, one level of objects with a dot in between."""
     flat = []
     for row in rows:
         found = {key: value for key, value in row.items() if key not in ("format", "key", "answer")}
@@ -298,7 +298,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _journal(args: argparse.Namespace) -> Journal:
-    """Check the outputs and return the journal: OUT itself, or beside a Parquet file."""
+    """Check the outputs and return the journal: OUT itself, or one next to a Parquet file."""
     if args.out.suffix not in (".parquet", ".jsonl"):
         raise UsageError(f"--out {args.out}: allowed are .parquet and .jsonl", remedy="name it results.jsonl")
     if args.out.suffix == ".parquet":

@@ -25,7 +25,7 @@ HERE = ("config", "write_config", "unset", "help", "json", "quiet", "verbose", "
 def add_option_file(parser: argparse.ArgumentParser) -> None:
     """Add `--config`, `--write-config` and `--unset` to a command whose `prepare` is `prepare_options`."""
     group = parser.add_argument_group("options in a file (docs/how-to/run-for-days.md)")
-    group.add_argument("--config", type=Path, metavar="FILE", help="take the options of this TOML file")
+    group.add_argument("--config", type=Path, metavar="FILE", help="read options from this TOML file")
     group.add_argument("--unset", action="append", default=[], metavar="NAME", help="leave out an option of the file")
     what = "write all options to this TOML file, and do not run"
     group.add_argument("--write-config", type=Path, metavar="FILE", help=what)

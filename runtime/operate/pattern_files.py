@@ -29,14 +29,14 @@ METADATA = 14  # ModelProto.metadata_props (onnx.proto)
 def pattern_pngs(bundle: Bundle) -> Iterator[tuple[str, bytes]]:
     """Yield name and bytes of a grey picture per pattern, 8 bits for up to 256 levels, else 16; UsageError without patterns."""
     if not bundle.pattern_levels.size:
-        raise UsageError(f"{bundle.name} shows no patterns: its optics are passive", remedy="use --format npy")
+        raise UsageError(f"{bundle.name} has no patterns to display: its optics are passive", remedy="use --format npy")
     digits = len(str(len(bundle.pattern_levels) - 1))
     for number, levels in enumerate(bundle.pattern_levels):
         yield f"pattern-{number:0{digits}d}.png", levels_png(levels.reshape(bundle.image_shape), bundle.levels)
 
 
 def array_parts(bundle: Bundle) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield names and arrays of what a bundle shows and of how it decides, without its head."""
+    """Yield names and arrays of what a bundle displays and of how it decides, without its head."""
     if bundle.analyser is not None:
         yield "analyser.npy", np.asarray(bundle.analyser.matrix)
     else:

@@ -156,7 +156,7 @@ def prunable(
 ) -> list[Run]:
     """Return the runs, oldest last, that are older than `older_s` and larger than `larger` bytes (None: whatever that is).
 
-    The `keep` newest ones stay, and so does every run that is going on.
+    The `keep` newest ones stay, and so does every run that has not ended.
     """
     at = time.time() if now is None else now
     return [

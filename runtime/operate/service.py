@@ -1,6 +1,6 @@
 """`pans service`: a systemd unit for a run whose options are in a file: written, shown, verified, removed; and what Prometheus needs.
 
-Starting and stopping services is systemctl's. `verify --start` starts the run as systemd does and hears its messages (sd_notify(3)) on a
+Starting and stopping services is systemctl's. `verify --start` starts the run as systemd does and receives its messages (sd_notify(3)) on a
 real socket. A unit of ours begins with MARK; others are never replaced or removed. Quoting: systemd.service(5), systemd.syntax(7).
 """
 
@@ -135,11 +135,11 @@ def read_unit(path: Path) -> str:
     return text
 
 
-# ---- what a service tells systemd ----
+# ---- what a service sends to systemd ----
 
 
 @dataclass(slots=True)
-class Heard:
+class ServiceRun:
     """What a service said: each line with its time, seconds since the start; and how it ended."""
 
     lines: list[tuple[float, str]] = field(default_factory=list)
@@ -159,16 +159,16 @@ class Heard:
         return max(after - before for before, after in pairwise([ready_s, *alive_s, until_s]))
 
 
-def start_and_hear(
+def run_as_systemd(
     command: Sequence[str], folder: Path, *, watchdog_s: float, seconds: float, start_s: float, stop_s: float
-) -> Heard:
+) -> ServiceRun:
     """Run `command` in `folder` for `seconds` after it is ready, stop it with SIGTERM, and return what it said.
 
     It has `start_s` to be ready and `stop_s` to end, as systemd gives it. UsageError where there are no such sockets.
     """
     if not hasattr(socket, "AF_UNIX"):
         raise UsageError("systemd's notify protocol needs sockets of the family AF_UNIX", remedy="use Linux")
-    heard = Heard()
+    run = ServiceRun()
     with ExitStack() as opened:
         place = opened.enter_context(tempfile.TemporaryDirectory(prefix="pans-notify-"))
         stderr = opened.enter_context(tempfile.TemporaryFile())
@@ -187,23 +187,23 @@ def start_and_hear(
             ended = process.poll() is not None
             try:
                 said = manager.recv(4096).decode("utf-8", "replace")
-                heard.lines += [(time.monotonic() - began_s, line) for line in said.split("\n")]
+                run.lines += [(time.monotonic() - began_s, line) for line in said.split("\n")]
             except TimeoutError:
                 if ended:
                     break
             now_s = time.monotonic() - began_s
-            if heard.asked_s is None and (ready_s := heard.times_s("READY=1")):
+            if run.asked_s is None and (ready_s := run.times_s("READY=1")):
                 due_s = ready_s[0] + seconds
             if now_s <= due_s or ended:
                 continue
-            if heard.asked_s is not None:
+            if run.asked_s is not None:
                 break
-            heard.asked_s, due_s = now_s, now_s + stop_s
+            run.asked_s, due_s = now_s, now_s + stop_s
             process.send_signal(signal.SIGTERM)
-        heard.ended_s, heard.exit_code = time.monotonic() - began_s, process.returncode
+        run.ended_s, run.exit_code = time.monotonic() - began_s, process.returncode
         stderr.seek(max(0, stderr.tell() - 2000))
-        heard.errors = stderr.read().decode("utf-8", "replace")
-    return heard
+        run.errors = stderr.read().decode("utf-8", "replace")
+    return run
 
 
 # ---- the command ----
@@ -220,7 +220,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     add("--watchdog-s", type=WATCHDOG.option, metavar="S", help="restart after S s of silence (default 20)")
     add("--user", action="store_true", help="a unit of the user's own manager, not of the system's")
     add("--unit-dir", type=Path, metavar="DIR", help="where units are (default: systemd's folder)")
-    add("--start", type=START.option, metavar="S", help="verify: run it for S s and check what it tells systemd")
+    add("--start", type=START.option, metavar="S", help="verify: run it for S s and check what it sends to systemd")
     add("-o", "--out", type=Path, metavar="DIR", help="monitoring: the folder to write to")
     add_force(parser)
 
@@ -301,9 +301,9 @@ def _verify(args: argparse.Namespace, name: str, path: Path) -> int:
     if args.start is not None and there:
         watchdog_s = float(text.partition("\nWatchdogSec=")[2].partition("\n")[0])
         say(f"starting {path.name} for {args.start:g} s ...")
-        told_s = min(watchdog_s, args.start / 3)  # a run speaks three times in that time: nine times while it is heard
-        findings += _heard(
-            start_and_hear(command, folder, watchdog_s=told_s, seconds=args.start, start_s=START_S, stop_s=STOP_S),
+        every_s = min(watchdog_s, args.start / 3)  # a run sends three messages in that time: nine in all
+        findings += _start_findings(
+            run_as_systemd(command, folder, watchdog_s=every_s, seconds=args.start, start_s=START_S, stop_s=STOP_S),
             watchdog_s,
         )
     return _judge(args, path, findings, {"unit": str(path)})
@@ -359,23 +359,23 @@ def _analysed(path: Path, *, user: bool) -> dict[str, Any]:
     return _finding("systemd-analyze", fine, "; ".join(said) or "no complaints", "install the unit again")
 
 
-def _heard(heard: Heard, watchdog_s: float) -> Iterator[dict[str, Any]]:
+def _start_findings(run: ServiceRun, watchdog_s: float) -> Iterator[dict[str, Any]]:
     """Yield what is to be said of one start, of the protocol's four parts."""
-    last = heard.errors.strip().rsplit("\n", 1)[-1]
-    ready_s, said, stops = (heard.times_s(f"{word}=1") for word in ("READY", "WATCHDOG", "STOPPING"))
+    last = run.errors.strip().rsplit("\n", 1)[-1]
+    ready_s, said, stops = (run.times_s(f"{word}=1") for word in ("READY", "WATCHDOG", "STOPPING"))
     if not ready_s:
         yield _finding("READY", False, f"not within {START_S} s, or the run ended: {last}", "start the run by hand")
         return
     yield _finding("READY", True, f"after {ready_s[0]:.1f} s", "")
-    silence_s = heard.longest_silence_s()
+    silence_s = run.longest_silence_s()
     found = f"{len(said)} messages, {silence_s:.2f} s apart at most, allowed {watchdog_s:g} s"
     lives = bool(said) and silence_s < watchdog_s
     yield _finding("WATCHDOG", lives, found, "the machine is too slow, or the watchdog's time too short: --watchdog-s")
     found = "said" if stops else "not said before the process ended"
     yield _finding("STOPPING", bool(stops), found, "look into its log")
-    ended = f"exit code {heard.exit_code}" if heard.exit_code is not None else f"not within {STOP_S} s of SIGTERM"
-    alone = "" if heard.asked_s is not None else ", by itself"
-    yield _finding("end", heard.exit_code in (0, 1), f"{ended}{alone}: {last}"[:400], "look into its log")
+    ended = f"exit code {run.exit_code}" if run.exit_code is not None else f"not within {STOP_S} s of SIGTERM"
+    alone = "" if run.asked_s is not None else ", by itself"
+    yield _finding("end", run.exit_code in (0, 1), f"{ended}{alone}: {last}"[:400], "look into its log")
 
 
 def _finding(check: str, ok: bool, found: str, remedy: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ Every nanosecond between the end of the exposure and the decision is given to th
     decode      the loop's own work, none of the above (reading messages, recording)
 
 The largest share is the cause. What separates link from device is in docs/explanation/timing.md: a click block says when it was exposed,
-never when it was sent, so that only a PONG or a STATUS that falls into the silence can tell; without one the verdict is `link`, not sure.
+never when it was sent, so that only a PONG or a STATUS in the silence shows which it was; without one the verdict is `link`, not sure.
 Memory is bounded. In virtual time the counters of the machine mean nothing and are not read.
 """
 
@@ -86,7 +86,7 @@ class Facts(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """The cause, how much of the delay it explains, whether the evidence settles it, and why in plain words."""
+    """The cause, how much of the delay it explains, whether the evidence is conclusive, and why in plain words."""
 
     cause: str
     share_ns: int
@@ -279,7 +279,7 @@ class Evidence:
             self._spans.append(Span(kind, begin_ns, end_ns, cpu_ns))
 
     def waited(self, begin_ns: int, asked_s: float, end_ns: int) -> None:
-        """Note a wait for bytes of at most `asked_s`: what it took beyond that, no timer takes; the machine gave us no time."""
+        """Note a wait for bytes of at most `asked_s`; one that lasts longer by OVERSLEPT_NS or more is the machine's delay."""
         if not self._virtual:
             self._cpu_mark_ns = time.thread_time_ns()
         asked_ns = begin_ns + int(asked_s * NS_PER_S)
@@ -299,18 +299,18 @@ class Evidence:
         """Note a message that says when it left the device."""
         self._stamped.append(message)
 
-    def heard_since(self, end_ns: int) -> bool:
+    def read_since(self, end_ns: int) -> bool:
         """Return whether the system's counters were read after `end_ns`; in virtual time they do not count."""
-        return self._virtual or self._counters.heard_ns >= end_ns
+        return self._virtual or self._counters.read_ns >= end_ns
 
     def read_if_stale(self, now_ns: int) -> None:
         """Read the counters here and now if nobody has done so for STALE_NS, as a loop that is never away makes it happen."""
-        if not self.heard_since(now_ns - STALE_NS + 1):
+        if not self.read_since(now_ns - STALE_NS + 1):
             self._counters.read()
 
     def facts(self, begin_ns: int, arrival_ns: int, end_ns: int) -> Facts:
         """Return what is known about the time from `begin_ns` to `end_ns`, both host times."""
-        if not self.heard_since(end_ns):
+        if not self.read_since(end_ns):
             self._counters.read()
         steal_ns, cpu_ns, own, *readers = self._counters.grown(begin_ns, end_ns)
         spans, arrivals_ns = list(self._spans), list(self._arrivals)  # both in the order of their ends
@@ -343,13 +343,13 @@ class Evidence:
 class Counters:
     """Samples of the counters of some threads, the loop's first; made by a thread of their own, or by `read` in the caller's.
 
-    The thread runs one step below the loop's priority, where that is a real-time one: it never takes the processor from the loop. Not
+    The thread runs one step below the loop's priority, where that is a real-time one: the loop never waits for it. Not
     further down: whoever holds the interpreter must not wait for the rest of the machine, since the loop may be waiting for it.
-    Where the system does not tell, there is no thread, and a sample holds the caller's own computing time and zeros.
+    Where the system has no such files, there is no thread, and a sample holds the caller's own computing time and zeros.
     """
 
     def __init__(self, now_ns: Callable[[], int], threads: Sequence[int]) -> None:
-        self.heard_ns = 0  # when the latest reading began
+        self.read_ns = 0  # when the latest reading began
         self._now = now_ns
         # when a reading began and ended; steal of the whole machine, computing time of the loop, how long each thread waited to run, ns
         self._samples: deque[tuple[int, int, list[int]]] = deque(maxlen=MAX_SAMPLES)
@@ -376,7 +376,7 @@ class Counters:
                 steal_ns = stat[7] * (NS_PER_S // os.sysconf("SC_CLK_TCK"))
                 found = [steal_ns, tasks[0][0], *(task[1] for task in tasks)]
             self._samples.append((began_ns, self._now(), found))
-            self.heard_ns = began_ns
+            self.read_ns = began_ns
         finally:
             self._lock.release()
 
@@ -485,7 +485,7 @@ class Incidents:
         if not final:
             if quiet_ns < QUIET_NS and now_ns - oldest.first.end_ns < LONGEST_INCIDENT_NS:
                 return None
-            if quiet_ns < PATIENCE_NS and not self.evidence.heard_since(oldest.worst.end_ns):
+            if quiet_ns < PATIENCE_NS and not self.evidence.read_since(oldest.worst.end_ns):
                 return None
         self._waiting.popleft()
         self._known = oldest, self.evidence.facts(*oldest.worst[1:])

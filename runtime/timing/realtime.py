@@ -318,7 +318,7 @@ class ThreadCounts:
         self._before = _counts()
 
     def since(self) -> dict[str, int]:
-        """Return {minor, major, involuntary_switches} so far; {} where the system does not tell."""
+        """Return {minor, major, involuntary_switches} so far; {} where the system has no such counts."""
         return {name: count - self._before[name] for name, count in _counts().items() if name in self._before}
 
 

@@ -1,7 +1,7 @@
 """How late a thread wakes under one real-time condition after another, on this computer, now; and which core is the quietest.
 
 All conditions alternate in ROUNDS rounds, so that whatever else the machine does hits every condition. Nothing stays changed. It must not
-run beside a live run: it takes a core for tenths of a second at the run's own priority. Loops are Python's: about a microsecond.
+run alongside a live run: it takes a core for tenths of a second at the run's own priority. Loops are Python's: about a microsecond.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The computer around a run: the space left on the disk of the recording, and whether the computer's own clock was set.
 
-What is found stands in `facts`, what is to be noted in `news`; a run must stop before its disk is full. The loop takes the news and never
+What is found stands in `facts`, what is to be noted in `news`; a run must stop before its disk is full. The loop reads the news and never
 waits for a look. Decisions use a monotonic clock: a clock that was set changes the times of day in a recording and nothing else.
 """
 
@@ -130,7 +130,7 @@ def clock_offset_ns() -> int:
 
 
 def clock_is_synchronised() -> bool | None:
-    """Return whether the kernel takes its clock for synchronised (NTP, PTP), None where it does not tell."""
+    """Return whether the kernel holds its clock to be synchronised (NTP, PTP), None where that is not known."""
     if sys.platform != "linux" or sys.maxsize < 1 << 32:
         return None
     timex = ctypes.create_string_buffer(512)  # struct timex of 64 bits; it is only read, as its `modes` are 0

@@ -93,7 +93,7 @@ def state_of(run: LiveRun) -> str:
 
 
 def resources_used() -> dict[str, int]:
-    """Return resident memory in bytes, open handles and threads of this process; 0 where the system does not tell."""
+    """Return resident memory in bytes, open handles and threads of this process; 0 where that is not known."""
     rss = handles = 0
     with suppress(OSError, ValueError, IndexError):
         pages = int(Path("/proc/self/statm").read_text().split()[1])

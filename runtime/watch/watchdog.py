@@ -1,6 +1,6 @@
 """The end of a run that does not end itself: stuck in a back end or in a call of the file system when a signal asks for its end.
 
-A thread of its own hears of the signal even where the main thread cannot (`signal.set_wakeup_fd`): the device is told to stop, what is
+A thread of its own receives the signal even where the main thread cannot (`signal.set_wakeup_fd`): the device is told to stop, what is
 buffered is written as far as that does not block, the state file and stderr say where the loop was, and the process exits. A run that ends
 in its own time is left alone. Native code that keeps the interpreter's lock stops this thread too: then the lease turns the light off, and
 only SIGKILL ends the process.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
     from pans.runtime.record import Recorder
 
-# A loop that turns reads the signal within 20 ms and takes at most 1 s to hear that the device is dark.
+# A loop that turns reads the signal within 20 ms and takes at most 1 s until the device has said that it is dark.
 LIGHT_OFF_AFTER_S = 1.5
 END_AFTER_S = 3.5  # with the steps below the process is gone 5 s after the signal
 CLOSING_END_AFTER_S = 30.0  # once the light is off and only files are closed: a slow disk may take long to sync
@@ -40,18 +40,18 @@ class Watchdog:
     def __init__(self, *, continuous: bool) -> None:
         self.run: LiveRun | None = None
         self.recorder: Recorder | None = None  # to be flushed
-        self.note: Callable[[str], object] = str  # is told why the process ends
+        self.note: Callable[[str], object] = str  # is called with why the process ends
         self.closes = False  # from here on the light is off and files are closed
         self._continuous = continuous
         self._done = threading.Event()
         self._main = threading.get_ident()
 
     def __enter__(self) -> Self:
-        self._hears, self._tells = socket.socketpair()
-        self._tells.setblocking(False)
+        self._receiver, self._sender = socket.socketpair()
+        self._sender.setblocking(False)
         self._before = -1
         if threading.current_thread() is threading.main_thread():
-            self._before = signal.set_wakeup_fd(self._tells.fileno(), warn_on_full_buffer=False)
+            self._before = signal.set_wakeup_fd(self._sender.fileno(), warn_on_full_buffer=False)
         self._thread = threading.Thread(target=self._listen, name="pans-watchdog", daemon=True)
         self._thread.start()
         return self
@@ -60,17 +60,17 @@ class Watchdog:
         self._done.set()
         if threading.current_thread() is threading.main_thread():
             signal.set_wakeup_fd(self._before)
-        self._tells.close()  # the thread reads the end
+        self._sender.close()  # the thread reads the end
         self._thread.join()
-        self._hears.close()
+        self._receiver.close()
 
     def _listen(self) -> None:
-        while data := self._hears.recv(64):
+        while data := self._receiver.recv(64):
             if asked := SIGNALS & set(data):
-                self._see_off(min(asked), time.monotonic())
+                self._wait_for_end(min(asked), time.monotonic())
                 return
 
-    def _see_off(self, signum: int, asked_s: float) -> None:
+    def _wait_for_end(self, signum: int, asked_s: float) -> None:
         """Wait for the run to end, and end it when it does not."""
         if self._is_done_by(asked_s + LIGHT_OFF_AFTER_S):
             return

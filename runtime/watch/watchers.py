@@ -80,7 +80,7 @@ class Watchers:
             self._open.close()
 
     def prepared(self, run: LiveRun) -> None:
-        """Show `run` from here on."""
+        """Watch `run` from here on."""
         self._run = run
         if self._watchdog is not None:
             self._watchdog.run = run
@@ -106,7 +106,7 @@ class Watchers:
 class Notifier:
     """Messages to systemd (sd_notify(3)): READY when the run is prepared, WATCHDOG while the loop turns, STOPPING at the end.
 
-    A loop that is stuck is not spoken for, and systemd's WatchdogSec= ends the service.
+    For a loop that is stuck nothing is sent, and systemd's WatchdogSec= ends the service.
     """
 
     def __init__(self, address: str, every_s: float) -> None:
@@ -129,12 +129,12 @@ class Notifier:
         """Say that the service is ready, and from here on that the loop of `run` turns."""
         self._send("READY=1")
 
-        def speak() -> None:
+        def send_watchdog() -> None:
             if run.ended or not is_stalled(run):
                 self._send("WATCHDOG=1")
 
-        speak()
-        self._thread = Repeated("pans-systemd", self._every_s, speak)
+        send_watchdog()
+        self._thread = Repeated("pans-systemd", self._every_s, send_watchdog)
 
     def close(self) -> None:
         """Say that the service stops."""

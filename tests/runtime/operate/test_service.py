@@ -1,4 +1,4 @@
-"""`pans service`: units that systemd accepts, the protocol heard on a real socket, and nobody else's unit touched."""
+"""`pans service`: units that systemd accepts, the protocol run on a real socket, and nobody else's unit touched."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
-from pans.runtime.operate.service import Heard, check_name, command_line, command_of, start_and_hear, unit_text
+from pans.runtime.operate.service import ServiceRun, check_name, command_line, command_of, run_as_systemd, unit_text
 
 NASTY = ["/a b/pans", "50%.pans", "$HOME", 'say "hi"', "a\\b", "tab\tend", "Größe", "%n%%", "$$", "line\nend", ""]
 
@@ -104,20 +104,20 @@ def test_a_run_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(
 @pytest.mark.skipif(not hasattr(socket, "AF_UNIX") or sys.platform == "win32", reason="needs AF_UNIX")
 def test_a_service_that_says_nothing_or_hangs_is_found(tmp_path: Path) -> None:
     silent = [sys.executable, "-c", "import sys; sys.exit('no device')"]
-    heard = start_and_hear(silent, tmp_path, watchdog_s=1, seconds=1, start_s=30, stop_s=1)
-    assert (heard.lines, heard.exit_code, heard.errors) == ([], 1, "no device\n")
+    run = run_as_systemd(silent, tmp_path, watchdog_s=1, seconds=1, start_s=30, stop_s=1)
+    assert (run.lines, run.exit_code, run.errors) == ([], 1, "no device\n")
     speak = "import os, signal, socket, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM); s.connect(os.environ['NOTIFY_SOCKET'])"
     hangs = f"{speak}; signal.signal(signal.SIGTERM, signal.SIG_IGN); s.send(b'READY=1'); s.send(b'WATCHDOG=1'); time.sleep(60)"
-    heard = start_and_hear([sys.executable, "-c", hangs], tmp_path, watchdog_s=1, seconds=1, start_s=30, stop_s=0.3)
-    assert [line for _, line in heard.lines] == ["READY=1", "WATCHDOG=1"]
-    assert heard.exit_code is None
-    assert heard.longest_silence_s() > 0.9
+    run = run_as_systemd([sys.executable, "-c", hangs], tmp_path, watchdog_s=1, seconds=1, start_s=30, stop_s=0.3)
+    assert [line for _, line in run.lines] == ["READY=1", "WATCHDOG=1"]
+    assert run.exit_code is None
+    assert run.longest_silence_s() > 0.9
 
 
 def test_silence_is_counted_from_ready_to_the_end() -> None:
     lines = [(2.0, "READY=1"), *((at_s, "WATCHDOG=1") for at_s in (1.0, 3.0, 4.5, 9.0))]
-    assert Heard(lines, asked_s=5.0, ended_s=9.5).longest_silence_s() == 1.5
-    assert Heard(lines, ended_s=9.5).longest_silence_s() == 4.5
+    assert ServiceRun(lines, asked_s=5.0, ended_s=9.5).longest_silence_s() == 1.5
+    assert ServiceRun(lines, ended_s=9.5).longest_silence_s() == 4.5
 
 
 def test_monitoring_files_are_written_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

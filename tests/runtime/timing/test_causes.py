@@ -265,7 +265,7 @@ def test_the_processor_time_of_a_stretch_is_read_and_the_thread_ends(threads: li
     ended, give_up = time.perf_counter_ns(), time.monotonic() + 100 * READ_EVERY_S
     if not threads:
         counters.read()
-    while counters.heard_ns < ended and time.monotonic() < give_up:
+    while counters.read_ns < ended and time.monotonic() < give_up:
         time.sleep(READ_EVERY_S / 5)
     _, cpu_ns, *_ = counters.grown(began, ended)
     counters.close()
@@ -273,9 +273,9 @@ def test_the_processor_time_of_a_stretch_is_read_and_the_thread_ends(threads: li
     assert cpu_ns >= 20 * MS  # the kernel counts in steps of some ms while a thread goes on
     assert counters._thread is None or not counters._thread.is_alive()
     assert sys.platform != "linux" or len(os.listdir("/proc/self/fd")) == before
-    heard = counters.heard_ns
+    heard = counters.read_ns
     counters.read()
-    assert counters.heard_ns == heard  # closed
+    assert counters.read_ns == heard  # closed
 
 
 def test_a_verdict_waits_for_a_reading_and_not_for_ever() -> None:
@@ -288,7 +288,7 @@ def test_a_verdict_waits_for_a_reading_and_not_for_ever() -> None:
     now[0] = 300 * MS
     assert incidents.verdict(now[0]) is None  # gathered: the loop has read for itself
     assert incidents.verdict(now[0]) is not None  # judged
-    assert evidence.heard_since(300 * MS)
+    assert evidence.read_since(300 * MS)
 
 
 def test_a_starved_thread_is_stood_in_for() -> None:
@@ -297,7 +297,7 @@ def test_a_starved_thread_is_stood_in_for() -> None:
     for at, heard in ((200 * MS, False), (251 * MS, True)):
         now[0] = at
         evidence.read_if_stale(at)
-        assert evidence.heard_since(at) == heard
+        assert evidence.read_since(at) == heard
 
 
 @pytest.mark.parametrize(

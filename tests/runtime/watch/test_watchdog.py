@@ -80,7 +80,7 @@ def test_a_run_that_hangs_says_so_goes_dark_and_can_be_ended(tmp_path: Path) -> 
             assert sum(1 for _ in recording.messages()) >= 2 * HANGS_AFTER, "what was buffered is on record"
 
 
-def test_the_loop_alone_is_spoken_for_to_systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systemd_hears_of_the_loop_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     address = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(address))
@@ -121,5 +121,5 @@ def test_a_run_whose_light_is_off_has_time_to_close_its_links_and_files(monkeypa
     monkeypatch.setattr(dog, "_end_process", ended.append)
     monkeypatch.setattr(watchdog, "LIGHT_OFF_AFTER_S", 0.0)
     monkeypatch.setattr(watchdog, "END_AFTER_S", 0.0)
-    dog._see_off(signal.SIGTERM, time.monotonic())
+    dog._wait_for_end(signal.SIGTERM, time.monotonic())
     assert ended == []
