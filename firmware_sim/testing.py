@@ -13,21 +13,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import Automaton, reachable_automaton
+from pans.runtime.bundle.automaton import reachable_automaton
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle, with_expected
 from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.instrument.profile import Profile, load_profile
 
 N_PATTERNS = 4
 EXPOSURE_US = 100.0
-
-
-def following_profile(levels: int = 65_536, channels: int = 1) -> Profile:
-    """Return the ideal instrument as one that follows automata of up to 16 states, with four dwell steps and so many detectors."""
-    profile = load_profile("ideal")
-    projector = replace(profile.projector, automaton_states=16, dwell_steps=4, levels=levels)
-    detector = replace(profile.detector, channels=channels)
-    return replace(profile, projector=projector, detector=detector, timing=replace(profile.timing, host_turn_us=50.0))
 
 
 def small_setup(mode: str = "sequential") -> tuple[Profile, Bundle, Plan]:
@@ -38,9 +30,11 @@ def small_setup(mode: str = "sequential") -> tuple[Profile, Bundle, Plan]:
     """
     driven, _, what = mode.partition("-driven")
     if driven in ("device", "host"):
-        profile = following_profile(levels=2, channels=2 if what == "-detectors" else 1)
-        made = {"": small_automaton_bundle, "-counts": small_counting_bundle, "-detectors": small_detectors_bundle}
-        bundle = made[what]()
+        bundle, profile = small_automaton_bundle(what=what), load_profile("ideal")
+        projector = replace(profile.projector, automaton_states=16, dwell_steps=4, levels=2)
+        detector = replace(profile.detector, channels=2 if what == "-detectors" else 1)
+        timing = replace(profile.timing, host_turn_us=50.0)
+        profile = replace(profile, projector=projector, detector=detector, timing=timing)
         plan = build_plan(profile, bundle, shots_per_object=4, drive=driven)
         return profile, bundle, replace(plan, block_exposures=min(2, plan.block_exposures))
     profile = load_profile("ideal")
@@ -69,46 +63,32 @@ def small_bundle(profile: Profile, exposure_us: float) -> Bundle:
     )
 
 
-def small_automaton_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) -> Bundle:
+# name, seed, and the successors of each state after each reading: clicks of one detector, photon numbers, clicks of two
+_WALKS: dict[str, tuple[str, int, list[list[int]]]] = {
+    "": ("small automaton", 2, [[1, 2], [3, 4], [4, 6], [5, 5], [5, 7], [8, 9]]),
+    "-counts": (
+        "small counting automaton",
+        3,
+        [[1, 2, 2], [3, 4, 4], [4, 3, 6], [5, 5, 7], [5, 7, 10], [8, 9, 10]],
+    ),
+    "-detectors": (
+        "small automaton of two detectors",
+        4,
+        [[1, 2, 2, 1], [3, 4, 4, 3], [4, 3, 6, 4], [5, 5, 7, 5], [5, 7, 10, 11], [8, 9, 10, 11]],
+    ),
+}
+
+
+def small_automaton_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US, what: str = "") -> Bundle:
     """Return a bundle of an automaton of six states and four slots: one edge ends early, walks meet again, states share patterns.
 
     Patterns have 2 x 2 pixels; the light is that of the profile `ideal`. The expected figures are in range, but nobody's measurement.
+    `what` is the automaton's kind, as in `small_setup`.
     """
-    successors = [[1, 2], [3, 4], [4, 6], [5, 5], [5, 7], [8, 9]]
-    return _small_walks("small automaton", 2, [0, 1, 2, 1, 3, 0], successors, levels, exposure_us)
-
-
-def small_counting_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) -> Bundle:
-    """Return the like of `small_automaton_bundle` over photon numbers 0, 1 and 2 or more."""
-    successors = [[1, 2, 2], [3, 4, 4], [4, 3, 6], [5, 5, 7], [5, 7, 10], [8, 9, 10]]
-    return _small_walks("small counting automaton", 3, [0, 1, 2, 1, 3, 0], successors, levels, exposure_us, counts=True)
-
-
-def small_detectors_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) -> Bundle:
-    """Return the like of `small_automaton_bundle` over the clicks of two detectors: 0, the first, the second, both."""
-    successors = [[1, 2, 2, 1], [3, 4, 4, 3], [4, 3, 6, 4], [5, 5, 7, 5], [5, 7, 10, 11], [8, 9, 10, 11]]
-    return _small_walks("small automaton of two detectors", 4, [0, 1, 2, 1, 2, 0], successors, levels, exposure_us)
-
-
-def _small_walks(
-    name: str,
-    seed: int,
-    pattern: list[int],
-    successors: list[list[int]],
-    levels: int,
-    exposure_us: float,
-    counts: bool = False,
-) -> Bundle:
-    """A bundle of six states with random posteriors; the last leaf is the largest successor."""
-    rng, n_nodes = np.random.default_rng(seed), 1 + max(map(max, successors))
-    posteriors = rng.dirichlet(np.full(3, 0.6), n_nodes)
-    automaton = reachable_automaton(pattern, [4, 2, 1, 4, 3, 2], 4, successors, posteriors, counts)
-    return _automaton_bundle(name, automaton, rng, levels, exposure_us)
-
-
-def _automaton_bundle(
-    name: str, automaton: Automaton, rng: np.random.Generator, levels: int, exposure_us: float
-) -> Bundle:
+    name, seed, successors = _WALKS[what]
+    rng, pattern = np.random.default_rng(seed), [0, 1, 2, 1, 2 if what == "-detectors" else 3, 0]
+    posteriors = rng.dirichlet(np.full(3, 0.6), 1 + max(map(max, successors)))
+    automaton = reachable_automaton(pattern, [4, 2, 1, 4, 3, 2], 4, successors, posteriors, what == "-counts")
     patterns = rng.integers(0, levels, (4, 4))
     patterns[:, 0] = levels - 1
     top_hz = load_profile("ideal").projector.peak_photoelectrons_hz

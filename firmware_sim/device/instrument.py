@@ -194,9 +194,6 @@ class Instrument:
         status = wire.Status(self.state, self.reason, left, self.stream.dropped_exposures & U32, self._tick, following)
         self._out.append(wire.encode_status(status, self.session))
 
-    def _send_ack(self) -> None:
-        self._out.append(wire.encode_ack(self._ack, self.session))
-
     # -- what the device receives --------------------------------------------------------------------------------------
 
     def _receive(self, frame: Frame) -> None:
@@ -256,7 +253,7 @@ class Instrument:
                 self._ack = wire.Ack(expected, expected, refusal.status, refusal.text, mask | 1)
             except wire.MalformedMessage as error:
                 self._ack = wire.Ack(expected, expected, AckStatus.MALFORMED, str(error), mask | 1)
-        self._send_ack()
+        self._out.append(wire.encode_ack(self._ack, self.session))
 
     # -- commands ------------------------------------------------------------------------------------------------------
 

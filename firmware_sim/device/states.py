@@ -206,7 +206,6 @@ class ShowList:
     def __init__(self, extension: Extension, channels: int = 1) -> None:
         self._extension, self._channels = extension, channels
         self._shown: dict[int, Shown] = {}
-        self.late = 0
 
     def put(self, show: Show, program: Program, begun: int, n_exposures: int | None) -> None:
         """Take a SHOW; `begun` exposures have begun, the run has `n_exposures` (None: no end). `Refused` leaves the list as it was."""
@@ -220,14 +219,10 @@ class ShowList:
         adaptive = program.patterns[show.exposure_index % program.n_slots] == ADAPTIVE_PATTERN
         _require(bool(adaptive), lambda: f"exposure {show.exposure_index} is dark: no adaptive slot")
         if show.exposure_index < begun:
-            self.late += 1
             raise Refused(AckStatus.TOO_LATE, f"exposure {show.exposure_index} has begun: {begun} have")
         full = show.exposure_index not in self._shown and len(self._shown) >= MAX_SHOWS
         _require(not full, lambda: f"{MAX_SHOWS} exposures are named already")
         self._shown[show.exposure_index] = Shown(show.state, show.pattern, show.dwell / show.dwell_steps)
-
-    def __len__(self) -> int:
-        return len(self._shown)
 
     def take(self, exposure_index: int) -> Shown | None:
         """Return what was named for an exposure and forget it; None if nothing was."""

@@ -56,11 +56,6 @@ class RunLight(Protocol):
         """Expected photoelectrons float64 (rows, channels), and int64 (count,) of the row of each of exposures first..first+count-1."""
 
 
-def light_table(profile: Profile, scene: Scene, levels: NDArray[np.uint16], exposure_us: float) -> LightTable:
-    """Tabulate a loaded pattern set, uint16 (patterns, pixels); ValueError when it does not fit the scene."""
-    return tabulate(profile, expected_photoelectrons(profile, scene, levels, exposure_us), exposure_us)
-
-
 def tabulate(profile: Profile, photons: F64, exposure_us: float) -> LightTable:
     """Return the table of expected photoelectrons (objects, patterns) of one exposure each."""
     with_dark = np.column_stack([photons, np.zeros(len(photons))])
@@ -82,7 +77,7 @@ def prepare(profile: Profile, scene: SceneFile, levels: NDArray[np.uint16], expo
         from .tape import BarTable
 
         return BarTable(profile, what, levels, exposure_us)
-    return light_table(profile, what, levels, exposure_us)
+    return tabulate(profile, expected_photoelectrons(profile, what, levels, exposure_us), exposure_us)
 
 
 def warm_up(scene: SceneFile) -> None:
