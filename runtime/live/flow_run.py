@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pans.runtime.core.decision import Output
+from pans.runtime.core.marks import mark_of
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.matching import PassageFigures
 from pans.runtime.kernel import state as ring
 from pans.runtime.kernel.calls import Kernel
-from pans.runtime.wire.messages import Mark, MessageType, decode_frames, decode_mark
-from pans.runtime.wire.schema import HEADER
+from pans.runtime.wire.messages import MessageType, decode_frames
+from pans.runtime.wire.schema import BLOCK_DTYPE, HEADER
 
 from .gates import Actuator, SecondInstrument
 from .receiver import Receiver
@@ -104,13 +105,15 @@ class FlowReceiver(Receiver):
         """Record decisions, too, and send the pulses that they ask for: before all else, since their time runs."""
         super()._record(kernel)
         run, steps = self._run, kernel.steps
-        if kernel.counts.steps and not steps.decides:
+        if not kernel.counts.steps:
+            return
+        assert isinstance(steps, FlowCore)
+        if not steps.decides:
             self._outputs = list(settled_blocks(kernel))  # the back end decides
             kernel.blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
-        assert isinstance(steps, FlowCore)
-        if kernel.counts.steps and run.recorder is not None:
+        if run.recorder is not None:
             run.recorder.add_decisions(kernel.rows)
-        if kernel.counts.steps and (pulses := steps.pulses(len(kernel.rows))):
+        if pulses := steps.pulses(len(kernel.rows)):
             run.gates.take(pulses)
             run.pulse()
 
@@ -133,46 +136,29 @@ class FlowReceiver(Receiver):
 
 def settled_blocks(kernel: Kernel) -> Iterator[Output]:
     """Let the core of a flow see what a call brought; yield what came of each block of which something came."""
-    steps, blocks = kernel.steps, kernel.blocks
-    assert isinstance(steps, FlowCore)
-    core = steps
+    core, blocks = kernel.steps, kernel.blocks
+    assert isinstance(core, FlowCore)
     by_block = core.guard is not None and not core.watches_empty  # it wants to see every block
-    behind, row = _blocks_behind(kernel), 0
+    spans, heads = kernel.heads(MessageType.FRAMES, BLOCK_DTYPE)
+    behind = (heads["exposure_index"] + heads["count"]).astype(np.int64)  # the exposure that follows each block
     empty = {told[0]: told for told in core.told_empty()}
-    marks = _marks_of(kernel)
+    places = np.flatnonzero(kernel.messages[:, ring.WHAT] == int(MessageType.MARK)).tolist()
+    marks, row = deque(zip(places, map(mark_of, kernel.marks()))), 0
     decided = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
     some = decided | np.isin(behind, list(empty)) | by_block
     decided[-1] = some[-1] = True
     columns = blocks[:, ring.END_TICK : ring.MESSAGES + 1].tolist()
     for block, (end_tick, stop, place) in enumerate(columns):
-        while marks and marks[-1][0] < place:
-            core.remember(marks.pop()[1])
+        while marks and marks[0][0] < place:
+            core.remember(marks.popleft()[1])
         following = int(behind[block])
         if decided[block] or by_block:
-            frames = decode_frames(_payload(kernel, place - 1)) if by_block else None
+            frames = decode_frames(kernel.bytes_of(spans[block])[HEADER.size :]) if by_block else None
             yield core.account(slice(row, stop), following, end_tick, empty.get(following), frames)
             row = stop
             continue
         if some[block] and (events := core.watch(empty[following])):
             yield Output([], events, end_tick)
         core.matcher.settle(following)
-    while marks:
-        core.remember(marks.pop()[1])
-
-
-def _blocks_behind(kernel: Kernel) -> npt.NDArray[np.int64]:
-    """Return the exposure that follows each block of a call, int64 (n,)."""
-    begins = kernel.rings.messages[kernel.blocks[:, ring.MESSAGES] - 1, ring.BEGIN] + HEADER.size
-    first = kernel.kept[begins[:, None] + np.arange(16, 24)].view("<u8")[:, 0]
-    count = kernel.kept[begins[:, None] + np.arange(28, 30)].view("<u2")[:, 0]
-    return first.astype(np.int64) + count
-
-
-def _marks_of(kernel: Kernel) -> list[tuple[int, Mark]]:
-    """Return the marks of a call, the first one last, each with its place among the ring's messages."""
-    places = np.flatnonzero(kernel.messages[:, ring.WHAT] == int(MessageType.MARK))
-    return [(place, decode_mark(_payload(kernel, place))) for place in places[::-1].tolist()]
-
-
-def _payload(kernel: Kernel, place: int) -> bytes:
-    return kernel.bytes_of(kernel.rings.messages[place])[HEADER.size :]
+    for _, mark in marks:
+        core.remember(mark)
