@@ -113,10 +113,10 @@ def recorded_run(
 @pytest.mark.parametrize("mode", ["sequential", "parallel"])  # of parallel frames many reads are taken at once
 def test_the_frames_of_attempts_that_failed_are_counted(mode: str, tmp_path: Path) -> None:
     frames: Counter[str] = Counter()
-    breaks = iter([("run", 500), ("first attempt", 3), ("second attempt", 7), ("rest", 1 << 30)])
+    breaks = iter([("run", 200), ("first attempt", 3), ("second attempt", 7), ("rest", 1 << 30)])
     first = Counted(small_link(mode), frames, *next(breaks))
     way_back = Recovery(lambda lost: Counted(lost.link.reopen(), frames, *next(breaks)), 60.0, first.link.pause)  # type: ignore[attr-defined,arg-type,return-value]
-    result, _, again = recorded_run(tmp_path / "run.pansrec", first, mode, cycles=1000, way_back=way_back)
+    result, _, again = recorded_run(tmp_path / "run.pansrec", first, mode, cycles=500, way_back=way_back)
     assert (result.ended, result.reconnects, again.as_recorded) == ("completed", 1, True)
     assert min(frames["first attempt"], frames["second attempt"]) > 0
     assert result.decoder["frames"] == frames.total()

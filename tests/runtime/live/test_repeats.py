@@ -23,7 +23,7 @@ from pans.runtime.wire.framing import FrameDecoder, encode_frame
 from pans.runtime.wire.messages import MessageType
 from pans.runtime.wire.session import STREAM_TYPES
 
-FRAMES = 100  # stream messages of a session
+FRAMES = 60  # stream messages of a session
 MOST_LATER = 40  # messages between the two
 CLEAN, EQUAL, CHANGED_FIRST, CHANGED_LATER, MIXED = range(5)  # what comes twice in a session
 HOW = ("clean", "equal", "changed first", "changed later", "mixed")

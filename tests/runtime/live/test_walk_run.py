@@ -32,7 +32,7 @@ from pans.runtime.wire.commands import count_announcement
 from pans.runtime.wire.messages import DARK_PATTERN
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA
 
-N_OBJECTS = 40
+N_OBJECTS = 24
 WALKS = ("object", "shot", "clicks", "label", "truth", "flags", "probability", "counts_crc", "exposures")
 
 
@@ -223,7 +223,7 @@ def test_what_makes_no_sense_with_walks_is_refused(
 
 # -- several detectors at once -------------------------------------------------------------------------------------------
 
-TRIALS, CHANNELS = 6, 3
+TRIALS, CHANNELS = 3, 3
 PROFILE = load_profile("dmd-four-snspd")
 IMAGES = np.random.default_rng(2).integers(0, 256, (N_OBJECTS, 2, 2)).astype(np.uint8)
 
@@ -345,13 +345,13 @@ def test_a_dead_detector_never_clicks(runs: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("change", "policy", "kind", "level"),
-    [("dead:at_s=0.2", "abstain", "dead", "warning"), ("hot:at_s=0.2:rate_hz=20000", "warn", "hot", "alarm")],
+    [("dead:at_s=0.1", "abstain", "dead", "warning"), ("hot:at_s=0.1:rate_hz=20000", "warn", "hot", "alarm")],
 )
 def test_what_one_of_several_detectors_does_in_the_dark_is_told_of_it_alone(
     runs: Path, tmp_path: Path, change: str, policy: str, kind: str, level: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     device = f"sim:dmd-four-snspd?scene={runs / 'tiny.npz'}&seed=5&pace=fast&changes={change}:channel=1"
-    words = ("--dark-slots", 2, "--decisions", 900, "--trials", 30, "--on-dark", policy, "--out", tmp_path)
+    words = ("--dark-slots", 2, "--decisions", 600, "--trials", 20, "--on-dark", policy, "--out", tmp_path)
     summary = json_of(capsys, "run", runs / "walk.pans", "--device", device, *words, code=None)
     dark = summary["dark"]
     found = [finding for finding in dark["findings"] if finding["state"] == kind]
