@@ -21,7 +21,8 @@ def postgres_server() -> Iterator[str]:
     for program in ("initdb", "pg_ctl"):
         if shutil.which(program) is None:
             pytest.skip(f"needs {program} of PostgreSQL")
-    user = next((name for name in USERS if _exists(name)), None) if os.getuid() == 0 else None
+    known = {entry.pw_name for entry in pwd.getpwall()}
+    user = next((name for name in USERS if name in known), None) if os.getuid() == 0 else None
     if os.getuid() == 0 and (user is None or shutil.which("runuser") is None):
         pytest.skip("needs a user who is not root")
     as_user = [] if user is None else ["runuser", "-u", user, "--"]
@@ -39,14 +40,6 @@ def postgres_server() -> Iterator[str]:
             _run([*as_user, "pg_ctl", "-D", data, "-m", "immediate", "stop"], folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _exists(name: str) -> bool:
-    try:
-        pwd.getpwnam(name)
-        return True
-    except KeyError:
-        return False
 
 
 def _run(words: list[str], folder: str) -> None:

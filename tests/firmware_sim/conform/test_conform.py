@@ -23,6 +23,7 @@ from pans.runtime.wire.messages import MessageType, Opcode
 
 BEYOND = {"2.8", "4.20"}  # no link can show them
 LONG = {number for number, rule in RULES.items() if rule.long}
+SOME = ("1.1", "5.1")  # before and beside the long ones
 SOON_S = 60.0  # of the link's clock: a device that crashed, fell silent or sends damaged frames keeps nobody longer
 RECEIVED = "    d->counters.frames++;\n"
 DEAF_AFTER_GATE = Mutant(
@@ -57,22 +58,12 @@ def test_the_reference_instrument_keeps_every_rule(name: str) -> None:
     } == BEYOND | LONG
 
 
-@pytest.mark.parametrize(
-    "name", ["ideal", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dmd-spad", "dmd-qcmos"))]
-)
-def test_the_simulator_keeps_the_long_rules(name: str) -> None:
-    device, clock = build_instrument(SimOptions(name, "uniform"), START_NS)
-    found = tried(name, device, clock, long=True)
-    assert {number: one.why for number, one in found.items() if one.verdict == "broken"} == {}
-    assert all(found[number].verdict == "kept" for number in LONG)
-
-
-@needs_compiler
+@pytest.mark.parametrize("core", [False, pytest.param(True, marks=needs_compiler)], ids=["simulator", "C core"])
 @pytest.mark.parametrize("name", ["ideal", pytest.param("dmd-spad", marks=pytest.mark.slow)])
-def test_the_reference_instrument_keeps_the_long_rules(name: str) -> None:
-    found = tried(name, *c_core(name), long=True)
-    assert {number: one.why for number, one in found.items() if one.verdict == "broken"} == {}
-    assert all(found[number].verdict == "kept" for number in LONG)
+def test_both_devices_keep_the_long_rules(name: str, core: bool) -> None:
+    device = c_core(name) if core else build_instrument(SimOptions(name, "uniform"), START_NS)
+    found = tried(name, *device, *SOME, *LONG)
+    assert {number: one.why for number, one in found.items() if one.verdict != "kept"} == {}
 
 
 def mutated(mutant: Mutant, tmp_path: Path) -> tuple[list[Finding], float]:

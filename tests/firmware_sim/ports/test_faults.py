@@ -227,12 +227,6 @@ def test_whole_runs_under_slow_faults(case: str) -> None:
     assert (result.reconnects > 0) == (case in ("disconnect", "reset"))
 
 
-def test_a_run_is_the_same_for_the_same_seed() -> None:
-    first, second, other = (run_case("all", seed, 1_000) for seed in (5, 5, 7))
-    assert (first.checked, first.faults) == (second.checked, second.faults)
-    assert other.faults != first.faults
-
-
 def test_a_device_that_goes_away_before_it_is_armed_ends_the_run() -> None:
     result = run_case("disconnect", 6, 100, "disconnect:10ms/60ms")
     assert result.faults["disconnects"] == 1
@@ -265,21 +259,19 @@ def other_message(log: DeviceLog, wire: ObservedLink) -> None:
     wire.answers.add(b"one more")
 
 
-CHANGES = [
-    (other_clicks, "other clicks than were emitted"),
-    (other_length, "STATUS claims"),
-    (second_execution, "executed after"),
-    (second_execution, "executed twice"),
-    (no_pulse, "neither executed nor reported"),
-    (other_message, "messages arrived"),
-    (other_message, "answers arrived"),
-]
-
-
-@pytest.mark.parametrize(("change", "text"), CHANGES, ids=lambda one: getattr(one, "__name__", one))
-def test_books_that_disagree_are_found(change: Any, text: str) -> None:
+@pytest.mark.parametrize(
+    ("change", "texts"),
+    [
+        (other_clicks, ["other clicks than were emitted"]),
+        (other_length, ["STATUS claims"]),
+        (second_execution, ["executed after", "executed twice"]),
+        (no_pulse, ["neither executed nor reported"]),
+        (other_message, ["messages arrived", "answers arrived"]),
+    ],
+)
+def test_books_that_disagree_are_found(change: Any, texts: list[str]) -> None:
     violations = run_case("none", 0, 1_500, None, change).violations
-    assert any(text in violation for violation in violations), violations
+    assert all(any(text in violation for violation in violations) for text in texts), violations
 
 
 @pytest.mark.parametrize(("name", "text"), [("gap", "no gap"), ("gate_refused", "neither executed nor reported")])
