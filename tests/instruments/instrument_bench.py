@@ -10,9 +10,10 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.scene.still import load_scene
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan
+from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, Show, pack_command
+from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, Show, mask_chunks, pack_command
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, Opcode
 
 NONCE = 0x11223344
@@ -80,6 +81,14 @@ class Bench:
         for index, row in enumerate(levels):
             self.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(index, 0, len(row), row)))
         self.done(Opcode.LOAD_PLAN, pack_command(plan(len(levels), shown, **changes)))
+
+    def load(self, levels: np.ndarray, made: Plan) -> None:
+        """Load patterns of two levels and a plan, and open the window."""
+        for masks in mask_chunks(levels):
+            self.done(Opcode.LOAD_MASKS, pack_command(masks))
+        for opcode, body in plan_commands(made):
+            self.done(opcode, body)
+        self.grant()
 
     def ready(self, levels: np.ndarray | None = None, shown: list[int] | None = None, **changes: Any) -> Bench:
         levels = np.full((2, 4), 100, np.uint16) if levels is None else levels

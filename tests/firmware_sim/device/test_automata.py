@@ -19,7 +19,6 @@ from pans.firmware_sim.scene.moving import Change, SceneFile
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan, build_plan
-from pans.runtime.core.plan_codec import plan_chunks, state_chunks
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import (
@@ -58,18 +57,8 @@ def set_up(automaton: Automaton, drive: str, profile: Profile | None = None, **o
     made = build_plan(profile, bundle, shots_per_object=2, drive=drive)
     bench = Bench(profile, options.pop("scene", SCENE), **{"seed": SEED, **options})
     bench.hello()
-    upload(bench, bundle.pattern_levels, made)
-    bench.grant()
+    bench.load(bundle.pattern_levels, made)
     return bench, made
-
-
-def upload(bench: Bench, levels: np.ndarray, made: Plan) -> None:
-    for masks in mask_chunks(levels):
-        bench.done(Opcode.LOAD_MASKS, pack_command(masks))
-    for chunk in plan_chunks(made):
-        bench.done(Opcode.LOAD_PLAN, pack_command(chunk))
-    for states in state_chunks(made):
-        bench.done(Opcode.LOAD_STATES, pack_command(states))
 
 
 def bright(automaton: Automaton, drive: str = "device", **options: Any) -> tuple[Bench, Plan]:
@@ -106,6 +95,13 @@ def naive(bench: Bench, made: Plan, automaton: Automaton, count: int) -> tuple[l
     dark = detector.dark_rate_hz * seconds
     slots = made.slot_pattern.tolist()
     return naive_walks.exposures(states, slots, light, dark, detector.afterpulse_probability, SEED, count)
+
+
+def walked_as_the_oracle(bench: Bench, made: Plan) -> int:
+    """Hold all that came against the oracle; return how many exposures it is."""
+    stamps, clicks = stamps_and_readings([message for _, message in bench.got])
+    assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
+    return len(stamps)
 
 
 @pytest.mark.parametrize("automaton", [two_states(), six_states()], ids=["two", "six"])
@@ -177,8 +173,7 @@ def test_the_size_of_time_steps_changes_nothing(cuts: list[int]) -> None:
     for cut in cuts:
         bench.run_to(bench.device.tick + cut)
     bench.run_to(bench.device.tick + 41 * made.cycle_ticks)
-    stamps, clicks = stamps_and_readings([message for _, message in bench.got])
-    assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
+    walked_as_the_oracle(bench, made)
 
 
 def test_work_that_is_done_ahead_changes_nothing_and_ends() -> None:
@@ -188,9 +183,7 @@ def test_work_that_is_done_ahead_changes_nothing_and_ends() -> None:
     for _ in range(100):
         bench.run_to(bench.device.tick + made.cycle_ticks // 2)
         bench.device.draw_ahead()
-    stamps, clicks = stamps_and_readings([message for _, message in bench.got])
-    assert len(stamps) == 40 * made.slots_per_cycle
-    assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
+    assert walked_as_the_oracle(bench, made) == 40 * made.slots_per_cycle
 
 
 def test_a_broken_off_walk_is_sent_as_far_as_it_went() -> None:
@@ -199,9 +192,7 @@ def test_a_broken_off_walk_is_sent_as_far_as_it_went() -> None:
     bench.done(Opcode.ARM, pack_command(Arm(start, 10, 100_000)))
     bench.run_to(start + 3 * made.cycle_ticks + 2 * made.slot_period_ticks + made.exposure_ticks + 1)
     bench.done(Opcode.STOP)
-    stamps, clicks = stamps_and_readings([message for _, message in bench.got])
-    assert len(stamps) == 3 * made.slots_per_cycle + 3
-    assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
+    assert walked_as_the_oracle(bench, made) == 3 * made.slots_per_cycle + 3
 
 
 def test_many_objects_and_patterns_need_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,6 @@ from pans.firmware_sim.scene.moving import Change, SceneFile
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan, build_plan
-from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import (
@@ -26,7 +25,6 @@ from pans.runtime.wire.commands import (
     PatternChunk,
     ReadCounts,
     announced_counts,
-    mask_chunks,
     pack_command,
 )
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
@@ -63,11 +61,7 @@ def set_up(automaton: Automaton, drive: str, profile: Profile | None = None, sce
     made = build_plan(profile, bundle, shots_per_object=2, drive=drive)
     bench = Bench(profile, scene, seed=7)
     bench.hello()
-    for masks in mask_chunks(bundle.pattern_levels):
-        bench.done(Opcode.LOAD_MASKS, pack_command(masks))
-    for opcode, body in plan_commands(made):
-        bench.done(opcode, body)
-    bench.grant()
+    bench.load(bundle.pattern_levels, made)
     return bench, made
 
 
