@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import DamagedFileError
+from pans.runtime.safe_text import one_line
 
 from .onnx_check import HeadCost, check_head
 from .onnx_model import MODEL_MAX_BYTES
@@ -37,8 +38,7 @@ class OnnxHead:
         step = 1 if self.cost.row_by_row else max(1, min(_BATCH_ROWS, _BATCH_VALUES // self.cost.values))
         out = np.empty((len(rows), self.n_classes), dtype=np.float32)
         for start in range(0, len(rows), step):
-            part = rows[start : start + step]
-            out[start : start + step] = self._run(part)
+            out[start : start + step] = self._run(rows[start : start + step])
         return out
 
     def _run(self, means: NDArray[np.float32]) -> Any:
@@ -70,11 +70,10 @@ def _session(head_onnx: bytes, where: str) -> Any:
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     try:
         # its own fall-back would try the same again and print about it on stdout, where our JSON belongs
-        return onnxruntime.InferenceSession(
-            head_onnx, options, providers=["CPUExecutionProvider"], enable_fallback=False
-        )
+        words = {"providers": ["CPUExecutionProvider"], "enable_fallback": False}
+        return onnxruntime.InferenceSession(head_onnx, options, **words)
     except Exception as error:  # onnxruntime raises a dozen unrelated classes
-        raise _damaged(where, f"onnxruntime refuses it: {_plain(error)}") from error
+        raise _damaged(where, f"onnxruntime refuses it: {_first_line(error)}") from error
 
 
 def _try_out(head: OnnxHead, where: str) -> None:
@@ -84,17 +83,15 @@ def _try_out(head: OnnxHead, where: str) -> None:
         try:
             found = np.asarray(head._run(means))
         except Exception as error:
-            raise _damaged(where, f"onnxruntime cannot run it on {rows} rows: {_plain(error)}") from error
+            raise _damaged(where, f"onnxruntime cannot run it on {rows} rows: {_first_line(error)}") from error
         if found.shape != (rows, head.n_classes) or found.dtype != np.float32:
             allowed = f"({rows}, {head.n_classes}) float32"
             raise _damaged(where, f"the output for {rows} rows is {found.shape} {found.dtype}, allowed: {allowed}")
 
 
+def _first_line(error: Exception) -> str:
+    return one_line(str(error).strip().split("\n")[0], 300)
+
+
 def _damaged(where: str, reason: str) -> DamagedFileError:
     return DamagedFileError(f"{where}: the ONNX head cannot be used: {reason}", remedy=_REMEDY)
-
-
-def _plain(value: Any) -> str:
-    """The first line of a foreign text, without control characters: it goes to a terminal."""
-    text = str(value).strip().split("\n")[0][:300]
-    return "".join(letter if letter.isprintable() else "?" for letter in text)

@@ -39,11 +39,10 @@ def quantise_patterns(
 ) -> QuantisedPatterns:
     """Round patterns, finite and >= 0, (d_f, pixels), to levels 0..levels-1 of which the highest gives `top` photoelectrons.
 
-    `top` is the brightest pixel unless given; brighter pixels are clipped to it. With `dither` it is what suits best (`dithered_top`).
-    `photons_per_level` is `top` over (levels - 1);
-    every pixel goes to the nearest level (halves to even). With `dither`, the rows and columns of a pattern, the error of each pixel is
-    carried on to its neighbours, for few levels. For transmissions in [0, 1] the photoelectrons of pattern i change by at
-    most `error_bound[i]`, the larger of the light added and the light taken away.
+    `top` is the brightest pixel unless given (with `dither`: `dithered_top`); brighter pixels are clipped to it. Every pixel goes to the
+    nearest level, halves to even. With `dither`, the rows and columns of a pattern, the error of each pixel is carried on to its
+    neighbours. ValueError for patterns that are no light. For transmissions in [0, 1] the photoelectrons of pattern i change by at most
+    `error_bound[i]`.
     """
     wanted = np.asarray(patterns)
     if wanted.ndim != 2 or wanted.size == 0 or not np.issubdtype(wanted.dtype, np.floating):

@@ -8,16 +8,12 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pans.runtime.container import watching_blocks
 
 from .printing import state
-
-if TYPE_CHECKING:  # a command that answers at once does not load it
-    from rich.progress import Progress, TaskID
 
 SHOWN_AFTER_S = 1.0
 DRAWN_EVERY_S = 0.2
@@ -32,15 +28,15 @@ class ReadingBar:
         self._began: dict[int, float] = {}
         self._number = 0
         self._heard_s = self._drawn_s = 0.0
-        self._progress: Progress | None = None
-        self._task: TaskID | None = None
+        self._shown = ExitStack()
+        self._report: Callable[[float], None] | None = None
 
     def passed(self, path: str, number: int, done: int, total: int) -> None:
         """Take a step of a pass: see container.watching_blocks."""
         now_s = self._now_s()
         began_s = self._began.setdefault(number, now_s)
         if number != self._number:
-            if self._progress is not None and now_s - self._heard_s < GIVEN_UP_AFTER_S:
+            if self._report is not None and now_s - self._heard_s < GIVEN_UP_AFTER_S:
                 return
             self.close()
             self._number = number
@@ -48,28 +44,17 @@ class ReadingBar:
         if done >= total:
             self.close()
         elif now_s - max(began_s + SHOWN_AFTER_S - DRAWN_EVERY_S, self._drawn_s) >= DRAWN_EVERY_S:
-            self._draw(path, done, total)
+            if self._report is None:
+                bar = progress_bar(f"reading {Path(path).name}", total, threaded=False)
+                self._report = self._shown.enter_context(bar)
+            self._report(done)
             self._drawn_s = now_s
 
     def close(self) -> None:
         """Take the bar off the screen."""
-        if self._progress is not None:
-            self._progress.stop()
-        self._progress = self._task = None
+        self._shown.close()
+        self._report = None
         self._began.pop(self._number, None)
-
-    def _draw(self, path: str, done: int, total: int) -> None:
-        if self._progress is None:
-            from rich.console import Console
-            from rich.markup import escape
-            from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
-
-            columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-            self._progress = Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
-            self._task = self._progress.add_task(escape(f"reading {Path(path).name}"), total=total)
-            self._progress.start()
-        assert self._task is not None
-        self._progress.update(self._task, completed=done, refresh=True)
 
 
 @contextmanager
@@ -95,7 +80,8 @@ def progress_bar(what: str, total: float, *, threaded: bool = True) -> Iterator[
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn(what), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    text = TextColumn("{task.description}", markup=False)
+    columns = (text, BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=threaded) as progress:
-        task = progress.add_task("", total=total)
+        task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=min(done, total), refresh=not threaded)
