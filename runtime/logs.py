@@ -43,12 +43,8 @@ def add_log_options(group: argparse._ActionsContainer) -> None:
     """Add `--log-file`, `--log-format` and `--log-rotate-mb`, of every command."""
     group.add_argument("--log-file", type=Path, metavar="FILE", help="append what happens to this file, line by line")
     group.add_argument("--log-format", choices=FORMATS, help="of the log file (default: text)")
-    group.add_argument(
-        "--log-rotate-mb",
-        type=ROTATE.option,
-        metavar="N",
-        help=f"begin a new log file after N MiB and keep {KEPT} old ones (default {ROTATE_MB:g})",
-    )
+    rotated = f"begin a new log file after N MiB and keep {KEPT} old ones (default {ROTATE_MB:g})"
+    group.add_argument("--log-rotate-mb", type=ROTATE.option, metavar="N", help=rotated)
 
 
 @contextmanager

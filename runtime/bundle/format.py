@@ -31,10 +31,8 @@ HEADER_MAX_BYTES = MIB
 _PROLOGUE = struct.Struct("<8sII")
 _DIGEST_BYTES = 32
 _KEYS = {"name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"}
-_FIXED_KEYS, _AUTOMATON_KEYS = (
-    {"sensor", "picture_shape", "outcomes"},
-    {"automaton", "expected"},
-)  # what some have besides
+# keys that some have besides
+_FIXED_KEYS, _AUTOMATON_KEYS = {"sensor", "picture_shape", "outcomes"}, {"automaton", "expected"}
 _PART_KEYS = {"name", "dtype", "shape", "offset", "length", "sha256"}
 _PARTS = {  # dtype and axes
     **{"pattern_levels": ("<u2", 2), "pattern_bits": ("|u1", 2), "pattern_bytes": ("|u1", 2)},

@@ -35,14 +35,8 @@ if TYPE_CHECKING:
 
 STATE_FORMAT = "pans-state 1"
 STATE_MAX_BYTES = 1 << 16
-NAME_FILES = (
-    "bundle",
-    "profile",
-    "flow",
-    "act_profile",
-    "calibration",
-    "registration",
-)  # options that name a file to read
+# options that name a file to read
+NAME_FILES = ("bundle", "profile", "flow", "act_profile", "calibration", "registration")
 
 
 def check_run_files(options: RunOptions) -> None:
@@ -175,9 +169,6 @@ def recording_header(
     options: RunOptions, profile: Profile, bundle_sha256: str, decider: Decider, n_objects: int, plan: Plan
 ) -> dict[str, Any]:
     """What a recording must say to be understood alone; units are in the keys."""
-    import numba
-    import numpy
-
     from pans.runtime.decide.verdict import choice_of
 
     dose = getattr(decider, "dose", None)
@@ -188,16 +179,9 @@ def recording_header(
         "profile": {"name": profile.name, "sha256": profile.sha256, "toml": profile.text},
         "options": changed_options(options),
         "config": {
-            "shots": options.shots,
-            "trials": options.trials,
-            "objects": n_objects,
-            "seconds": options.seconds,
-            "deadline_us": options.deadline_us,
-            "order": options.order,
-            "dark_slots_per_cycle": options.dark_slots,
-            "backend": decider.name,
-            "backend_choice": dict(choice_of(decider)),
-            "tick_hz": profile.clock.tick_hz,
+            **{name: getattr(options, name) for name in ("shots", "trials", "seconds", "deadline_us", "order")},
+            **{"objects": n_objects, "dark_slots_per_cycle": options.dark_slots, "tick_hz": profile.clock.tick_hz},
+            **{"backend": decider.name, "backend_choice": dict(choice_of(decider))},
             "realtime_requested": options.realtime,
             **({"mode": "parallel"} if profile.mode == "parallel" else {}),
             **({"drive": plan.drive, "confidence": options.confidence} if plan.drive else {}),
@@ -207,11 +191,7 @@ def recording_header(
             **({"walk_dose": {"most": dose.most, "states": dose.states}} if dose is not None else {}),
         },
         "versions": {
-            "pans": __version__,
-            "python": platform.python_version(),
-            "numpy": numpy.__version__,
-            "numba": numba.__version__,
-            "onnxruntime": version("onnxruntime"),
-            "platform": platform.platform(),
+            **{"pans": __version__, "python": platform.python_version(), "platform": platform.platform()},
+            **{name: version(name) for name in ("numpy", "numba", "onnxruntime")},
         },
     }
