@@ -24,6 +24,8 @@ from pans.runtime.cli import main
 from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
 from pans.runtime.errors import UsageError
+from pans.runtime.instrument.calibration import sealed
+from pans.runtime.instrument.profile import profile_text
 
 LIMIT_S = 60  # only against waiting for ever: a busy machine may take its time
 SLOW = ("torch", "optuna", "pans.trainer.train.loop")  # loaded before the limit counts, where they are installed
@@ -55,6 +57,7 @@ WRITES |= {"--storage": "log"}
 SUFFIXES = {"report": "html", "bundle": "pans", "calibrate": "json", "train": "pans", "data": "npz"}
 FOLDERS = {("demo", "--out"), ("run", "--out"), ("export", "--out"), ("reproduce", "--out"), ("service", "--out")}
 FOLDERS |= {("evaluate", "--pictures")}
+Refused = Callable[..., None]
 RUN = f"run b.pans --decisions 1 --out new --device {FAST}"
 DEVICE = "run b.pans --out new --profile oled-qcmos --decisions 1 --device"
 UNREACHABLE = {  # exit code 3: what no parser knows of
@@ -96,6 +99,34 @@ REFUSED = {  # exit code 2: addresses, options without effect, files that do not
     "batch info b.pans -o new.jsonl --": "vary x|vary =3|workers 0|with '|with=--colour",
     "": "nonsense|--nonsense|rnu|help nonsense|batch fuzz b.pans -o new.jsonl",
     **{f"{name} ": "--nonsense=1" for name in find_commands()},
+}
+MISTAKES = {  # files of another kind, and devices without a scheme: what is said, and the remedy
+    "run r.pansrec --device sim:oled-qcmos": "not a PANS bundle: it is a recording|`pans replay`",
+    "run lab.toml --device sim:oled-qcmos": "not a PANS bundle: it is a hardware profile|--profile",
+    "run s.npz --device sim:oled-qcmos": "not a PANS bundle: it is a .npz archive|?scene=FILE",
+    "run sealed.json --device sim:oled-qcmos": "not a PANS bundle: it is a calibration|--calibration",
+    "run folder.txt --device sim:oled-qcmos": "it is a folder|name a file",
+    "replay b.pans": "not a recording: it is a bundle|`pans run",
+    "replay lab.toml": "not a recording: it is a hardware profile|--profile",
+    "info there.txt": "is no file of this project|bundles (.pans)",
+    f"{RUN} --calibration lab.toml": "lab.toml: not a calibration: it is a hardware profile|--profile",
+    f"{RUN} --calibration options.toml": "options.toml: not a calibration: it is TOML text|--config",
+    f"{RUN} --registration sealed.json": "not a registration: it is a calibration|--calibration",
+    f"{RUN} --profile sealed.json": "not a hardware profile: it is a calibration|--calibration",
+    f"{RUN} --flow lab.toml": "not the settings of a flow: it is a hardware profile|--profile",
+    f"{RUN} --config lab.toml": "not a file of options: it is a hardware profile|--write-config",
+    "service show --config b.pans": "not a file of options: it is a bundle|--write-config",
+    "demo --profile b.pans": "not a hardware profile: it is a bundle|`pans run",
+    "bundle --patterns there.txt --head there.txt --classes a,b -o new.pans": "not a readable .npy array|numpy.save",
+    "verify folder.txt": "no parts of a recording are here|run-0001",
+    "run b.pans --out new --decisions 1 --device COM3": "'COM3' is no device URL|did you mean serial:COM3?",
+    "run b.pans --out new --decisions 1 --device /dev/ttyUSB0": "is no device URL|did you mean serial:/dev/ttyUSB0?",
+    "run b.pans --out new --decisions 1 --device 192.168.1.3:4000": "is no device URL|did you mean serial:socket://192.168.1.3:4000?",
+    "run b.pans --out new --decisions 1 --device tcp:localhost:4000 --profile oled-qcmos": "is no device URL|serial:socket://localhost:4000?",
+    "run b.pans --out new --decisions 1 --device r.pansrec": "is no device URL|`pans replay r.pansrec`",
+    "run b.pans --out new --decisions 1 --device lab.toml": "is no device URL|did you mean sim:lab.toml?",
+    "run b.pans --out new --decisions 1 --device some:thing": "unknown device scheme 'some'|known: serial, sim",
+    "demo --seconds 5ms": "'5ms' is not a number|pans help demo",
 }
 LINES = [
     (f"{words}{more}".split(" ") if words or more else [], code)
@@ -158,6 +189,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.savez(folder / "letters.npz", images=images, labels=labels, classes=np.array([*"abcdefghij"]))
     (folder / "f.toml").write_text("kind = 1\n")
     (folder / "c.json").write_text("{}\n")
+    (folder / "lab.toml").write_text(profile_text("oled-qcmos"))
+    (folder / "options.toml").write_text("decisions = 3\n")
+    (folder / "sealed.json").write_bytes(sealed({"what": 1}, "calibration"))
     for suffix in (*KINDS, "onnx", "txt", "html", "log"):
         (folder / f"empty.{suffix}").touch()
         (folder / f"noise.{suffix}").write_bytes(np.random.default_rng(1).bytes(3000))
@@ -180,13 +214,13 @@ def contents(folder: Path) -> dict[str, tuple[int, ...]]:
 
 
 @pytest.fixture(scope="module")
-def refused(folder: Path) -> Iterator[Callable[[list[str], int], None]]:
+def refused(folder: Path) -> Iterator[Refused]:
     """A call that runs a command line in `folder` and checks its refusal; what waits for ever, as on a FIFO, is ended."""
 
     def late(*signal: object) -> None:
         raise AssertionError(f"no answer within {LIMIT_S} s")
 
-    def check(words: list[str], wanted: int) -> None:
+    def check(words: list[str], wanted: int, *parts: str) -> None:
         kept, out, err = contents(folder), io.StringIO(), io.StringIO()
         signal.alarm(LIMIT_S)
         with contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -197,6 +231,7 @@ def refused(folder: Path) -> Iterator[Callable[[list[str], int], None]]:
         signal.alarm(0)
         said = out.getvalue() + err.getvalue()
         assert contents(folder) == kept
+        assert all(part in said for part in parts), said
         assert (code, said.count("remedy: "), "Traceback" in said) == (wanted, 1, False), said
         assert "explains the options" not in said or "allowed" in said or "must be" in said, said
 
@@ -209,16 +244,25 @@ def refused(folder: Path) -> Iterator[Callable[[list[str], int], None]]:
 @pytest.mark.parametrize("name", GOOD)
 @settings(max_examples=2, deadline=None, derandomize=True, suppress_health_check=[*HealthCheck])
 @given(data=st.data())
-def test_a_bad_argument_is_refused(name: str, refused: Callable[[list[str], int], None], data: st.DataObject) -> None:
+def test_a_bad_argument_is_refused(name: str, refused: Refused, data: st.DataObject) -> None:
     for lines in faults_of(name):
         refused(data.draw(st.sampled_from(lines)), 2)
 
 
 @pytest.mark.parametrize(("words", "code"), LINES, ids=[ascii(" ".join(words))[1:120] for words, _ in LINES])
-def test_a_line_that_makes_no_sense_is_refused(
-    words: list[str], code: int, refused: Callable[[list[str], int], None]
-) -> None:
+def test_a_line_that_makes_no_sense_is_refused(words: list[str], code: int, refused: Refused) -> None:
     refused(words, code)
+
+
+@pytest.mark.parametrize("line", MISTAKES)
+def test_a_mistake_is_named_with_its_remedy(line: str, refused: Refused) -> None:
+    refused(line.split(), 2, *MISTAKES[line].split("|"))
+
+
+def test_the_main_error_comes_before_that_of_the_device(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "fashion10", "--device", "COM3", "--profile", "ideal", "--decisions", "1"]) == 2
+    said = capsys.readouterr().err
+    assert 0 <= said.index("124 levels") < said.index("besides, the device could not be opened: 'COM3' is no")
 
 
 def test_every_command_is_tried_with_at_least_200_lines() -> None:
