@@ -101,12 +101,11 @@ class Verdict(NamedTuple):
 def judge(facts: Facts) -> Verdict:
     """Return the cause of the time from `facts.begin_ns` to `facts.end_ns`."""
     shares = _shares(facts)
-    outside = shares.pop("outside")
     source, sure, why = attribute_silence(facts)
-    shares[source] = shares.get(source, 0) + outside
-    cause = max(CAUSES, key=lambda name: shares.get(name, 0))
-    share = shares.get(cause, 0)
-    if cause == source and outside == share:
+    shares[source] = shares.pop("outside")
+    cause = max((name for name in CAUSES if name in shares), key=lambda name: shares[name])
+    share = shares[cause]
+    if cause == source:
         return Verdict(cause, share, sure, why, shares)
     return Verdict(cause, share, 2 * share >= facts.end_ns - facts.begin_ns, _words(cause, share, facts), shares)
 
@@ -220,8 +219,6 @@ SENTENCES = {
     "disk": "writing the recording did not return",
     "inference": "the decision back end computed",
     "decode": "the loop was busy with its own work, reading messages,",
-    "link": "the host was awake and waited for bytes",
-    "device": "the device had not sent the block",
     "host": "the host did not run",
 }
 
