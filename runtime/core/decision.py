@@ -87,20 +87,10 @@ class RowDecisions(Sequence[Decision]):
     """Decisions that stand in rows, DECISION_DTYPE (n,), valid until the next call, of which each is made when somebody asks for it."""
 
     def __init__(self, rows: npt.NDArray[np.void]) -> None:
-        self._rows = rows
-
-    @property
-    def rows(self) -> npt.NDArray[np.void]:
-        """All of them, DECISION_DTYPE (n,)."""
-        return self._rows
-
-    @property
-    def first(self) -> int:
-        """The number of the first one, behind which the others count up; 0 where there is none."""
-        return int(self._rows["index"][0]) if len(self._rows) else 0
+        self.rows = rows
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.rows)
 
     def __iter__(self) -> Iterator[Decision]:
         return iter([Decision(*row) for row in self.rows.tolist()])

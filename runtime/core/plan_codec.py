@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 SERIAL_BYTES_PER_S = 400_000  # ten bits a byte
 SLOTS_MAX = 1 << 24  # of a plan that is rebuilt: 256 MiB
+# what a plan and its chunks have in common, by name
+SHARED = ("n_patterns", "exposure_ticks", "slot_period_ticks", "cycle_ticks", "block_exposures", "cycles_per_object")
 
 
 def plan_chunks(plan: Plan) -> list[PlanChunk]:
@@ -37,21 +39,10 @@ def plan_chunks(plan: Plan) -> list[PlanChunk]:
     slots["offset_ticks"] = plan.slot_offset_ticks
     slots["pattern"] = plan.slot_pattern
     slots["shot"] = plan.slot_shot
-    return [
-        PlanChunk(
-            MODES[plan.mode],
-            plan.n_patterns,
-            len(slots),
-            first,
-            plan.exposure_ticks,
-            plan.slot_period_ticks,
-            plan.cycle_ticks,
-            plan.block_exposures,
-            plan.cycles_per_object,
-            slots[first : first + MAX_SLOTS_PER_CHUNK],
-        )
-        for first in range(0, len(slots), MAX_SLOTS_PER_CHUNK)
-    ]
+    head: dict[str, Any] = {"mode": MODES[plan.mode], "n_slots": len(slots)}
+    head |= {name: getattr(plan, name) for name in SHARED}
+    starts = range(0, len(slots), MAX_SLOTS_PER_CHUNK)
+    return [PlanChunk(**head, first_slot=first, slots=slots[first : first + MAX_SLOTS_PER_CHUNK]) for first in starts]
 
 
 def plan_commands(plan: Plan) -> list[tuple[Opcode, bytes]]:
@@ -139,23 +130,16 @@ def plan_from_chunks(
     fixed = slots["pattern"][lit & ~adaptive]
     if not lit.any() or not head.n_patterns or (fixed.size and int(fixed.max()) >= head.n_patterns):
         raise MalformedMessage("a plan that shows no pattern, or one that it does not have")
-    if (
-        min(head.exposure_ticks, head.slot_period_ticks, head.cycle_ticks, head.cycles_per_object, head.block_exposures)
-        < 1
-    ):
+    shared: dict[str, Any] = {name: getattr(head, name) for name in SHARED}
+    if min(shared.values()) < 1:
         raise MalformedMessage("a plan with exposures, slots, cycles or blocks of length 0")
     return Plan(
         mode={number: mode for mode, number in MODES.items()}[head.mode],
-        n_patterns=head.n_patterns,
+        **shared,
         slot_offset_ticks=slots["offset_ticks"].astype(np.int64),
         slot_pattern=slots["pattern"].copy(),
         slot_shot=slots["shot"].copy(),
-        exposure_ticks=head.exposure_ticks,
-        slot_period_ticks=head.slot_period_ticks,
-        cycle_ticks=head.cycle_ticks,
         shots_per_cycle=int(slots["shot"][lit].max()) + 1,
-        cycles_per_object=head.cycles_per_object,
-        block_exposures=head.block_exposures,
         exposure_us=head.exposure_ticks * 1e6 / tick_hz,
         automaton=automaton,
         drive="" if automaton is None else "device" if states else "host",
