@@ -4,9 +4,9 @@ In come a profile, a bundle and stream messages; out come a `Plan` (`build_plan`
 output, no clock and no random number, so that a live run, a replay and a simulation give the same decisions bit for bit. Start with
 plan.py, then follower.py (what every core does with a stream) and still.py. Objects in flow are in the package flow.
 
-Gaps: wire/tracker.py finds them, window.py says which windows they break, still.py what becomes of these (flagged, abstained);
-stream_kernels.py is the compiled form of both, so change them together. A bundle is compared with the profile in plan.py, with what the
-device says of itself in link/fit.py.
+plan.py checks that a bundle fits the profile: pattern memory, pixels, levels, mode. follower.py says what happens behind a gap (`step`,
+`_skip_to`): wire/tracker.py only finds it, window.py knows the windows that it broke, still.py flags them and abstains. The kernels
+(stream_kernels.py) never see a gap: they leave the message to `step`.
 
 >>> from importlib.resources import files
 >>> from pans.runtime.bundle import load_bundle

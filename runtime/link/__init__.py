@@ -1,8 +1,8 @@
 """From a device URL to stamped bytes, and a session on them up to arming.
 
 What comes in are URLs (`serial:`, `usb:`, and the schemes of the entry points `pans.devices`), a plan and a bundle; what goes out are
-frames with the time of their arrival. Start with base.py, then connection.py; fit.py checks that plan and bundle
-fit the device (memory, pixels, levels, mode), as core/plan.py did for the profile; what a run does when a device is lost is in live.
+frames with the time of their arrival. Start with base.py, then connection.py. Whether a bundle fits the profile is checked in
+core/plan.py; fit.py repeats that with what the device reports of itself. What a run does when a device is lost is in live.
 
 >>> from pans.runtime.link import open_link
 >>> open_link("nothing")
