@@ -48,7 +48,7 @@ from .settings import WATCHED_FRAMES, FlowLimits, FlowSettings, Q
 MAX_CHANNELS = 64  # bits of a ring word
 MAX_PASSAGES = 64  # of one call of `scan`; it is called again
 ROWS_MORE = 2048  # decisions of one call, beside those of a block
-MOST_BLOCKS = 4096  # whose empty frames have not been told yet: as many as a call keeps times of (turn/rings.py)
+MOST_BLOCKS = 4096  # whose empty frames have not been told yet: as many as a call keeps times of (kernel/state.py)
 _LARGEST = (1 << 62) - 1
 _PART = (1 << Q) - 1
 _GAP, _ABSTAINED, _NOT_FINITE, _AMBIGUOUS = (

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from importlib.metadata import entry_points
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -33,6 +33,8 @@ from pans.runtime.wire.messages import DARK_PATTERN, DeviceState, Opcode
 from pans.runtime.wire.session import COMMAND_WINDOW, HostSession
 
 from .journal import Journal
+
+T = TypeVar("T")
 
 LEASE_MS = 2000  # a host that is away for longer has lost its right to pulse
 PROBE_EVERY_NS = 89_000_000  # odd on purpose, and not that of the instrument that measures
@@ -228,8 +230,8 @@ class GateQueue:
 
     def turn(self, session: HostSession, clock: ClockModel, now_ns: int) -> bool:
         """Note what the device has answered and submit what there is room for; return whether there is something to send at once."""
-        if self.second is not None:
-            self._turn_second(self.second, now_ns)
+        if (second := self.second) is not None:
+            self._ask_second(lambda: second.exchange(now_ns, waits=bool(self._sent)))
         if not self._waiting and not self._sent:
             return False
         target = session if self.second is None else self.second.connection.session
@@ -253,16 +255,10 @@ class GateQueue:
     def finish(self, session: HostSession) -> None:
         """The run is over: what was answered counts, what waits expires, what has no answer was refused as far as is known."""
         if self.second is not None:
-            if not self._lost:
-                try:
-                    self.second.finish()
-                except (LinkError, DeviceError) as error:
-                    self._lose_second(error)
+            self._ask_second(self.second.finish)
             session = self.second.connection.session
         self._collect(session)
-        for _, action in self._sent:
-            self._refuse(action, "no answer before the end of the run")
-        self._sent.clear()
+        self._refuse_sent("no answer before the end of the run")
         while self._waiting:
             self._expire(self._waiting.popleft(), "the run ended")
 
@@ -288,15 +284,11 @@ class GateQueue:
         self, second: SecondInstrument, action: Action, at_ns: int, uncertainty_ns: int, duration_us: float
     ) -> None:
         """Let the second instrument pulse at `at_ns` of the host's clock, which is known to `uncertainty_ns`."""
-        if self._lost:
+        sent = self._ask_second(lambda: second.submit(at_ns, duration_us, action.channel))
+        if sent is None:
             self._refuse(action, self._lost)
             return
-        try:
-            command_id, tick, own_ns = second.submit(at_ns, duration_us, action.channel)
-        except (LinkError, DeviceError) as error:
-            self._lose_second(error)
-            self._refuse(action, self._lost)
-            return
+        command_id, tick, own_ns = sent
         self._session = second.connection.session
         self._sent.append((command_id, action))
         off_ns = uncertainty_ns + own_ns
@@ -304,28 +296,20 @@ class GateQueue:
         facts = {"host_ns": at_ns, "second_tick": tick, "uncertainty_us": off_ns / 1000}
         self._journal.note("gate_sent", decision=action.number, tick=action.tick, **facts)
 
-    def _turn_second(self, second: SecondInstrument, now_ns: int) -> None:
-        if self._lost:
-            return
+    def _ask_second(self, call: Callable[[], T]) -> T | None:
+        """Return what `call` gives; None where the second instrument is gone: the run goes on, and every pulse is refused."""
         try:
-            second.exchange(now_ns, waits=bool(self._sent))
+            return None if self._lost else call()
         except (LinkError, DeviceError) as error:
-            self._lose_second(error)
-
-    def _lose_second(self, error: LinkError | DeviceError) -> None:
-        """The second instrument is gone: the run goes on, and every pulse is refused from here on."""
-        self._lost = f"the second instrument was lost: {error.message}"
+            self._lost = f"the second instrument was lost: {error.message}"
         self._journal.note("actuator_lost", words=self._lost)
-        for _, action in self._sent:
-            self._refuse(action, self._lost)
-        self._sent.clear()
+        self._refuse_sent(self._lost)
+        return None
 
     def _collect(self, session: HostSession) -> None:
         """Match acknowledgements with pulses, in the order of their commands."""
         if self._session is not None and session is not self._session:  # the old session took its answers with it
-            for _, action in self._sent:
-                self._refuse(action, "the link was lost before the device answered")
-            self._sent.clear()
+            self._refuse_sent("the link was lost before the device answered")
         refusals = {}
         while session.refusals:
             refusal = session.refusals.popleft()
@@ -338,6 +322,10 @@ class GateQueue:
                 self.counters.done += 1
         for refusal in refusals.values():
             self._journal.refused(refusal)
+
+    def _refuse_sent(self, why: str) -> None:
+        while self._sent:
+            self._refuse(self._sent.popleft()[1], why)
 
     def _refuse(self, action: Action, why: str) -> None:
         self.counters.refused += 1
