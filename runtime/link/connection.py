@@ -156,10 +156,10 @@ class Connection:
             )
         self.clock = ClockModel(int(welcome.facts["tick_hz"]))
         self.session.submit(Opcode.RESET)
-        self.settle()
+        self.wait_acknowledged()
         return welcome
 
-    def settle(self) -> None:
+    def wait_acknowledged(self) -> None:
         """Wait until every command has been acknowledged."""
         while self.session.in_flight:
             self.pump(SETUP_POLL_S)
@@ -171,7 +171,7 @@ class Connection:
             while not self.session.has_room:
                 self.pump(SETUP_POLL_S)
             self.session.submit(opcode, body)
-        self.settle()
+        self.wait_acknowledged()
 
     def synchronise(self) -> ClockModel:
         """Measure the device clock with a burst of probes and return the model; LinkError when none is answered."""

@@ -92,10 +92,10 @@ class SecondInstrument:
         connection.session.submit(Opcode.LOAD_PATTERN, pack_command(dark))
         for chunk in plan_chunks(plan):
             connection.session.submit(Opcode.LOAD_PLAN, pack_command(chunk))
-        connection.settle()
+        connection.wait_acknowledged()
         connection.synchronise()
         self._arm()
-        connection.settle()
+        connection.wait_acknowledged()
 
     def exchange(self, now_ns: int, *, waits: bool) -> None:
         """Read what came and send what is due; `waits` for an answer: look soon. LinkError when it is gone."""

@@ -135,12 +135,12 @@ def estimate(bench: Bench, observed: Observed, library: Library | None = None, s
 def coarse(bench: Bench, observed: Observed, library: Library, count: int = STARTS) -> list[F64]:
     """Return the `count` best vectors of the search: at every place, light and background are fitted to the means that the clicks tell."""
     lit = observed.lit
-    rows, told = observed.pattern[lit], _told_means(bench, observed)[lit]
+    rows, means = observed.pattern[lit], _means_of_shares(bench, observed)[lit]
     shapes = observed.patterns @ library.appearance.T * bench.photons_per_level
     shapes = shapes[rows]  # (groups, places)
-    weight = observed.exposures[lit] / np.maximum(told, np.median(told) / 10)  # variance of a mean, nearly
-    mean_x, mean_y = weight @ shapes / weight.sum(), weight @ told / weight.sum()
-    x, y = shapes - mean_x, told - mean_y
+    weight = observed.exposures[lit] / np.maximum(means, np.median(means) / 10)  # variance of a mean, nearly
+    mean_x, mean_y = weight @ shapes / weight.sum(), weight @ means / weight.sum()
+    x, y = shapes - mean_x, means - mean_y
     xy, xx = (weight * y) @ x, weight @ (x * x)
     slope = np.maximum(xy, 0.0) / xx
     rest = (weight * y) @ y - slope * xy
@@ -155,7 +155,7 @@ def coarse(bench: Bench, observed: Observed, library: Library, count: int = STAR
     return result
 
 
-def _told_means(bench: Bench, observed: Observed) -> F64:
+def _means_of_shares(bench: Bench, observed: Observed) -> F64:
     """The mean photoelectrons that each group's share of clicks tells by itself, float64 (g,)."""
     grid = np.expm1(np.linspace(0.0, math.log1p(SATURATED), 2000))
     log_miss = bench.model.log_miss(grid)

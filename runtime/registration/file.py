@@ -195,8 +195,8 @@ def in_use(path: Path, bundle: Bundle, profile: Profile, now: datetime, max_age_
 
 def trained_optics(bundle: Bundle) -> Imaging:
     """Return the optics for which `bundle` was trained: the middle of the tolerance that it names, else perfect ones."""
-    told = bundle.provenance.get(TOLERATES)
-    optics = told.get("optics") if isinstance(told, dict) else None
+    tolerates = bundle.provenance.get(TOLERATES)
+    optics = tolerates.get("optics") if isinstance(tolerates, dict) else None
     if not isinstance(optics, str):
         return IDENTITY
     try:

@@ -191,11 +191,11 @@ def telling(bench: Bench, known: Estimate, seed: int, exposures: float, count: i
     counted = np.append(np.ones(DARK), 0.0)  # dark counts are not what is looked for
     chosen = []
     for _ in range(count):
-        told = scaled @ covariance  # (candidates, 13)
-        gain = ((told * told) @ counted) / (1.0 + (told * scaled).sum(axis=1))
+        lowers = scaled @ covariance  # (candidates, 13)
+        gain = ((lowers * lowers) @ counted) / (1.0 + (lowers * scaled).sum(axis=1))
         best = int(np.argmax(gain))
         chosen.append(best)
-        covariance = covariance - np.outer(told[best], told[best]) / (1.0 + told[best] @ scaled[best])
+        covariance = covariance - np.outer(lowers[best], lowers[best]) / (1.0 + lowers[best] @ scaled[best])
     return candidates[chosen]
 
 

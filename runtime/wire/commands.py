@@ -265,6 +265,6 @@ def announced_channels(facts: Mapping[str, Any]) -> int:
 
 def count_announcement(largest: int, channels: int = 1) -> dict[str, int]:
     """Return the keys of WELCOME's map that `announced_counts` and `announced_channels` read; none of a device with neither."""
-    told = {"photon_number_max": largest, "channels_at_once": channels}
-    found = {key: value for key, value in told.items() if value > 1}
+    numbers = {"photon_number_max": largest, "channels_at_once": channels}
+    found = {key: value for key, value in numbers.items() if value > 1}
     return {"count_schema": COUNT_SCHEMA, **found} if found else {}

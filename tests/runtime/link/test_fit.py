@@ -79,7 +79,7 @@ def test_a_device_that_knows_no_automata_is_refused_before_anything_is_sent() ->
         check_automaton(facts, plan)
     assert "fixed patterns" in refused.value.remedy
     connection.session.submit(Opcode.LOAD_STATES, b"", may_be_refused=True)  # and if one were sent all the same
-    connection.settle()
+    connection.wait_acknowledged()
     assert connection.session.refusals[0].status == 1
 
 

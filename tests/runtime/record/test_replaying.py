@@ -83,7 +83,7 @@ def test_what_the_device_answered_is_on_record(tmp_path: Path, capsys: pytest.Ca
 def test_a_refusal_that_ends_the_set_up_is_on_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refused(run: LiveRun) -> None:
         run.connection.session.submit(Opcode.LOAD_PLAN, b"nothing that is a plan")
-        run.connection.settle()
+        run.connection.wait_acknowledged()
 
     path = tmp_path / "run.pansrec"
     with pytest.raises(DeviceError, match="refused command"):
