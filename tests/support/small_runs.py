@@ -48,7 +48,7 @@ def log_sha256(rows: np.ndarray) -> str:
 
 def record_small(
     path: Path,
-    cycles: int = 2400,
+    cycles: int = 1800,
     *,
     faults: str = "",
     seed: int = 4,

@@ -155,9 +155,9 @@ def test_memory_for_the_rates_does_not_grow_with_the_messages(monkeypatch: pytes
     """Four times the messages: the same memory, not four times as much."""
     monkeypatch.setattr(exposures, "EXPOSURES_AT_ONCE", 4000)
     plan = shot_major(N, 2)
-    bodies = list(stream("clicks", 12_000, np.random.default_rng(5)))
+    bodies = list(stream("clicks", 8_000, np.random.default_rng(5)))
     peaks = []
-    for n in (3_000, 12_000):
+    for n in (2_000, 8_000):
         recording = recording_of(bodies[:n])
         tracemalloc.start()
         rates = count_rates(recording, plan, 3)

@@ -95,7 +95,7 @@ def logs(draw: st.DrawFn) -> np.ndarray:
     return np.array(rows, DECISION_DTYPE)
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=60)
 @given(rows=logs(), cuts=st.lists(st.integers(0, 42), max_size=4))
 def test_rows_come_back_and_the_hash_is_theirs_alone(rows: np.ndarray, cuts: list[int]) -> None:
     encoder, reader = LogEncoder(), LogReader()

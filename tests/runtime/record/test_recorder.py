@@ -147,12 +147,11 @@ def test_any_flipped_byte_is_detected(tmp_path: Path) -> None:
     write_recording(path, 2)
     data = path.read_bytes()
     for position in range(len(data)):
-        for flip in (0x01, 0xFF):
-            changed = bytearray(data)
-            changed[position] ^= flip
-            path.write_bytes(changed)
-            with pytest.raises(DamagedFileError):
-                read_recording(path)
+        changed = bytearray(data)
+        changed[position] ^= (0x01, 0xFF)[position % 2]
+        path.write_bytes(changed)
+        with pytest.raises(DamagedFileError):
+            read_recording(path)
 
 
 def test_a_cut_file_reads_up_to_the_last_whole_block(path: Path) -> None:

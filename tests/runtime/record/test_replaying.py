@@ -144,7 +144,7 @@ def test_what_cannot_be_replayed_or_read_is_a_violation(
         use_file("recording", path)
 
 
-@pytest.mark.parametrize("make", [record_run, record_passive, record_flow])
+@pytest.mark.parametrize("make", [record_run, record_passive, pytest.param(record_flow, marks=pytest.mark.slow)])
 def test_the_files_that_are_changed_are_whole_and_decide(make: Callable[[Path], Path], tmp_path: Path) -> None:
     path = make(tmp_path)
     assert verify_file(path).violations == []
