@@ -18,7 +18,7 @@ from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
-from pans.runtime.instrument.channel_health import DarkMonitor
+from pans.runtime.instrument.channel_health import dark_report
 from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.recorder import repeated_setup
@@ -156,7 +156,7 @@ def _whole_row(bundle: Bundle, shots: int, backend: str, quick: bool) -> Row:
     frames, decided = n_visits * plan.slots_per_cycle, n_visits * (plan.shots_per_cycle // shots)
 
     def run(path: Path | None) -> None:
-        core, monitor, rows = StreamCore(plan, decider, shots, 0, streams.SESSION), DarkMonitor(streams.DARK_CLICK), 0
+        core, rows = StreamCore(plan, decider, shots, 0, streams.SESSION), 0
         recorder = None if path is None else Recorder(path, {"simulated": True}, overwrite=True)
         for data in reads:
             for batch in core.feed(data):
@@ -164,7 +164,7 @@ def _whole_row(bundle: Bundle, shots: int, backend: str, quick: bool) -> Row:
                 if recorder is not None:
                     recorder.add_decisions(batch.rows)
             tallies = core.core.windows.tallies
-            monitor.report(int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
+            dark_report(streams.DARK_CLICK, int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
         if recorder is not None:
             recorder.close({"decisions": rows})
         counters = core.core.tracker.counters

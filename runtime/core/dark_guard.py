@@ -25,11 +25,11 @@ from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import (
     LEVELS,
     ChannelHealth,
-    DarkMonitor,
     DarkReport,
     DeadChannelTest,
     Finding,
     Silence,
+    dark_report,
 )
 from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch, WatchSettings
 from pans.runtime.intervals import wilson_interval
@@ -451,8 +451,8 @@ class DarkGuard:
         end of the interval where the expected rate is an estimate.
         """
         watch = self.watch
-        monitor = DarkMonitor(float(watch.high.mean()) if watch.high.max() > FLOOR_RATE else 0.0)
-        judged = monitor.report(watch.exposures * watch.n_channels, int(watch.clicks.sum()))
+        expected = float(watch.high.mean()) if watch.high.max() > FLOOR_RATE else 0.0
+        judged = dark_report(expected, watch.exposures * watch.n_channels, int(watch.clicks.sum()))
         n = self.watch.exposures
         rows = []
         for clicks, expected in zip(self.watch.clicks.tolist(), self.watch.expected.tolist()):

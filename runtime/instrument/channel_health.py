@@ -3,7 +3,7 @@
 `ChannelHealth.take` turns the alarms of cusum.py into `Finding`s: one when a state begins and one when it ends, however often a test passes
 its threshold meanwhile. It tells states apart by which channels differ and how strongly: one channel with most of the excess is *hot*; all
 of them at once, five times or more, is a *burst* (a light leak); all of them by less is a *drift*; fewer clicks than expected is *quiet*
-(none at all: *dead*). With one detector "all" and "one" are the same, and strength alone decides. `DarkMonitor` compares the dark rate of a
+(none at all: *dead*). With one detector "all" and "one" are the same, and strength alone decides. `dark_report` compares the dark rate of a
 whole run with the profile's.
 
 `DeadChannelTest` finds dead channels in exposures with light; in the dark silence is no news for a long time. It has two tests, each with a
@@ -268,28 +268,23 @@ class DarkReport:
     policy: str = "warn"
     findings: tuple[dict[str, Any], ...] = ()  # states of the detector that began or ended, in order
     present: tuple[str, ...] = ()  # those that last, in words
-    channels: tuple[
-        dict[str, float], ...
-    ] = ()  # exposures, clicks, rate and interval by channel, where a guard watched
+    # exposures, clicks, rate and interval by channel, where a guard watched
+    channels: tuple[dict[str, float], ...] = ()
 
 
-class DarkMonitor:
-    """Compares tallied dark clicks with the click probability `expected` of a dark exposure."""
-
-    def __init__(self, expected: float) -> None:
-        self.expected = expected
-
-    def report(self, exposures: int, clicks: int) -> DarkReport:
-        """Return the estimate, its interval and, where the counts contradict the profile, the alarm's sentence ("" if none)."""
-        low, high = wilson_interval(clicks, exposures)
-        rate = clicks / exposures if exposures else 0.0
-        alarm = ""
-        if exposures and binomial_tail(clicks, exposures, self.expected) < ALARM_PROBABILITY:
-            alarm = (
-                f"{clicks} clicks in {exposures} dark exposures, expected are {self.expected * exposures:.3g}: "
-                "look for stray light, a warm detector or a wrong threshold"
-            )
-        return DarkReport(exposures, clicks, rate, low, high, self.expected, alarm)
+def dark_report(expected: float, exposures: int, clicks: int) -> DarkReport:
+    """Return the estimate from tallied dark clicks, its interval, and the alarm's sentence ("" if none) where they contradict `expected`,
+    the click probability of a dark exposure.
+    """
+    low, high = wilson_interval(clicks, exposures)
+    rate = clicks / exposures if exposures else 0.0
+    alarm = ""
+    if exposures and binomial_tail(clicks, exposures, expected) < ALARM_PROBABILITY:
+        alarm = (
+            f"{clicks} clicks in {exposures} dark exposures, expected are {expected * exposures:.3g}: "
+            "look for stray light, a warm detector or a wrong threshold"
+        )
+    return DarkReport(exposures, clicks, rate, low, high, expected, alarm)
 
 
 class Silence(NamedTuple):

@@ -25,7 +25,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
 from pans.runtime.errors import DeviceError, LinkError, RecordingError
-from pans.runtime.instrument.channel_health import DarkMonitor
+from pans.runtime.instrument.channel_health import dark_report
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, link_facts
@@ -227,9 +227,9 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
     device["simulated"] = bool(device["simulated"] or facts.get("simulated"))
     one = float(click_probability(click_law(profile, run.plan.exposure_us), 0.0))
     # an exposure counts when any of several detectors clicks in it; log1p and expm1 hold for tiny rates too
-    dark = DarkMonitor(one if one == 1.0 else -math.expm1(run.plan.channels_at_once * math.log1p(-one)))
+    dark = one if one == 1.0 else -math.expm1(run.plan.channels_at_once * math.log1p(-one))
     tallies, stream = run.core.tallies, run.core.tracker.counters
-    found = dark.report(int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
+    found = dark_report(dark, int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
     guard: DarkGuard | None = getattr(run.core, "guard", None)
     fit = run.connection.known_clock().fit
     return RunResult(

@@ -31,7 +31,7 @@ from pans.runtime.core.dark_guard import (
 from pans.runtime.decide.table import TableDecider
 from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import UsageError
-from pans.runtime.instrument.channel_health import ChannelHealth, DarkMonitor, Finding
+from pans.runtime.instrument.channel_health import ChannelHealth, Finding, dark_report
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.wire.messages import ClickBlock
 
@@ -305,7 +305,7 @@ def test_an_afterpulse_is_no_dark_count() -> None:
             shown = np.resize(plan.slot_pattern, 40)
             events += guard.take(ClickBlock(0, 0, 0, first, 100, 0, shown, bits[first : first + 40]))
         found[afterpulses] = [finding.kind for finding in events]
-        report = guard.report(DarkMonitor(0.01).report(20_000, int(bits[::4].sum())))
+        report = guard.report(dark_report(0.01, 20_000, int(bits[::4].sum())))
         assert bool(report.alarm) != afterpulses
         behind_silence = bits[4::4][bits[3:-1:4] == 0]
         if afterpulses:

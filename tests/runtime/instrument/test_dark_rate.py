@@ -8,7 +8,7 @@ from math import comb
 import mpmath
 import pytest
 
-from pans.runtime.instrument.channel_health import DarkMonitor
+from pans.runtime.instrument.channel_health import dark_report
 from pans.runtime.intervals import binomial_tail, wilson_interval
 
 
@@ -48,8 +48,6 @@ def test_wilson_interval_is_the_root_of_its_definition() -> None:
 
 
 def test_alarm_only_when_the_profile_is_contradicted() -> None:
-    monitor = DarkMonitor(1e-4)
-    assert monitor.report(10_000, 3).alarm == ""
-    assert monitor.report(0, 0).alarm == ""
-    assert "30 clicks in 10000 dark exposures" in monitor.report(10_000, 30).alarm
-    assert DarkMonitor(0.0).report(100, 1).alarm
+    assert dark_report(1e-4, 10_000, 3).alarm == dark_report(1e-4, 0, 0).alarm == ""
+    assert "30 clicks in 10000 dark exposures" in dark_report(1e-4, 10_000, 30).alarm
+    assert dark_report(0.0, 100, 1).alarm
