@@ -11,7 +11,7 @@ import threading
 import time
 import types
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import EntryPoint
@@ -369,22 +369,19 @@ class FifoPort:
     url = "fifo"
 
     def __init__(self, name: str) -> None:
-        os.mkfifo(f"{name}.in")
-        os.mkfifo(f"{name}.out")
-        self._in = os.open(f"{name}.in", os.O_RDWR | os.O_NONBLOCK)
-        self._out = os.open(f"{name}.out", os.O_RDWR | os.O_NONBLOCK)
+        for end in ("in", "out"):
+            os.mkfifo(f"{name}.{end}")
+        self._in, self._out = (os.open(f"{name}.{end}", os.O_RDWR | os.O_NONBLOCK) for end in ("in", "out"))
 
     def read(self) -> bytes:
-        try:
+        with suppress(BlockingIOError):
             return os.read(self._in, 1 << 16)
-        except BlockingIOError:
-            return b""
+        return b""
 
     def write(self, data: bytes) -> int:
-        try:
+        with suppress(BlockingIOError):
             return os.write(self._out, data)
-        except BlockingIOError:
-            return 0
+        return 0
 
     def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
         return bool(select.select([self._in], [self._out] if wants_to_write else [], [], timeout_s)[0])
