@@ -123,18 +123,18 @@ def test_a_thousand_still_objects_per_second(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("drive", "exposure_us", "host_turn_us", "seconds"),
-    [("host", 100.0, 900.0, 60), ("device", 10.0, None, 10)],
+    ("drive", "exposure_us", "turn_us", "seconds"),
+    [("host", 100.0, 900.0, 60), ("device", 10.0, 0.0, 10)],
     ids=["host at 1 kHz", "device at 100 kHz"],
 )
 def test_an_automaton_loses_no_exposure(
-    drive: str, exposure_us: float, host_turn_us: float | None, seconds: float, tmp_path: Path
+    drive: str, exposure_us: float, turn_us: float, seconds: float, tmp_path: Path
 ) -> None:
     bundle, _ = load_bundle("fashion-adaptive")
-    slot_profile(
-        bundle, exposure_us, tmp_path / "walks.toml", {} if host_turn_us is None else {"host_turn_us": host_turn_us}
-    )
-    summary, gaps = measured("fashion-adaptive", tmp_path / "walks.toml", seconds, "--drive", drive)
+    path = tmp_path / "walks.toml"
+    slot_profile(bundle, exposure_us, path)
+    path.write_text(path.read_text().replace("host_turn_us = 1000.0", f"host_turn_us = {turn_us}"))
+    summary, gaps = measured("fashion-adaptive", path, seconds, "--drive", drive)
     report(f"{drive} drives", summary, gaps)
     assert summary["lost"] == 0
-    assert summary["stream"]["exposures"] * (exposure_us + (host_turn_us or 0)) >= 0.95e6 * seconds
+    assert summary["stream"]["exposures"] * (exposure_us + turn_us) >= 0.95e6 * seconds
