@@ -129,8 +129,8 @@ def test_a_tape_is_read_as_well_as_the_exact_optimum(tmp_path: Path, capsys: pyt
 
 
 def test_a_tape_that_is_faster_than_said_is_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    summary, _ = run_tape(tmp_path, capsys, dark=-1, bars_per_s=50_500.0, more="track = 3\n", seconds="0.06")
-    assert summary["passages"]["alone"] > 3000
+    summary, _ = run_tape(tmp_path, capsys, dark=-1, bars_per_s=50_500.0, more="track = 3\n", seconds="0.03")
+    assert summary["passages"]["alone"] > 1400
     assert summary["accuracy"] > 0.995  # not followed it is lost within 50 bars
     assert summary["flow"]["bars_per_s"] == pytest.approx(50_500.0, rel=0.005)
     assert json_of(capsys, "replay", tmp_path / "run.pansrec")["identical"]

@@ -351,7 +351,7 @@ def test_what_one_of_several_detectors_does_in_the_dark_is_told_of_it_alone(
     runs: Path, tmp_path: Path, change: str, policy: str, kind: str, level: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     device = f"sim:dmd-four-snspd?scene={runs / 'tiny.npz'}&seed=5&pace=fast&changes={change}:channel=1"
-    words = ("--dark-slots", 2, "--decisions", 600, "--trials", 20, "--on-dark", policy, "--out", tmp_path)
+    words = ("--dark-slots", 2, "--decisions", 400, "--trials", 20, "--on-dark", policy, "--out", tmp_path)
     summary = json_of(capsys, "run", runs / "walk.pans", "--device", device, *words, code=None)
     dark = summary["dark"]
     found = [finding for finding in dark["findings"] if finding["state"] == kind]
