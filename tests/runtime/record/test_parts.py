@@ -7,6 +7,7 @@ import shutil
 from collections import Counter
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,17 @@ def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> No
     assert "part_deleted" in {event["kind"] for event in result.events}
     paths[0].unlink()
     assert f"{paths[0].name} is missing" in " ".join(verify_parts(tmp_path)[-1].violations)
+
+
+def test_a_disk_that_is_nearly_full_keeps_the_last_closed_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=1 << 40, used=1 << 40, free=0))
+    record_small(tmp_path / "run.pansrec", 3000, limits=SMALL)
+    assert len(check_each(tmp_path)) > 0
+    closed, last = parts_in(tmp_path)
+    assert closed.stat().st_size >= SMALL.rotate_bytes
+    found = part_of(read_recording(last))
+    assert found is not None
+    assert found["deleted"]["parts"] == found["number"] - 2 > 0
 
 
 def test_a_part_that_is_missing_is_found_wherever_it_was(parts: Path, tmp_path: Path) -> None:
