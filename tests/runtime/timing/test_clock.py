@@ -191,5 +191,7 @@ def test_a_narrow_counter_is_extended_over_its_wraps(bits: int) -> None:
         latest = unwrap_tick(true % (1 << bits), latest, bits)
         assert latest == true
         assert unwrap_tick((true - 1) % (1 << bits), latest, bits) == max(true - 1, (true - 1) % (1 << bits))
+    half = 1 << (bits - 1)
+    assert unwrap_tick(half, 3 << bits, bits) == (3 << bits) - half  # as far ahead as behind: an old value
     with pytest.raises(ValueError, match="does not fit"):
         unwrap_tick(1 << bits, 0, bits)
