@@ -91,8 +91,8 @@ class Core(Follower):
             return []
         block = ClickBlock(0, 0, 0, first, 0, self.windows.position[2], stamps, bits)
         events = self.guard.take(block)
-        measured = rows[rows["flags"] & _NOT_MEASURED == 0]
-        self.guard.take_objects(measured["clicks"][:, None] > 0, measured["object"])
+        measured = rows["flags"] & _NOT_MEASURED == 0
+        self.guard.take_objects(rows["clicks"][measured, None] > 0, rows["object"][measured])
         return events
 
     def watch_frames(self, words: NDArray[np.uint8], heads: NDArray[np.void]) -> list[Finding]:

@@ -229,8 +229,8 @@ class Kernel:
     def heads(self, kind: MessageType, dtype: npt.DTypeLike) -> tuple[I64, npt.NDArray[np.void]]:
         """Return the spans of the messages of one kind, in order, and what each begins with: rows of `dtype`, BLOCK_DTYPE or MARK_DTYPE."""
         spans = self.messages[self.messages[:, ring.WHAT] == int(kind)]
-        places = spans[:, : ring.END] + np.arange(np.dtype(dtype).itemsize)
-        return spans, self.kept[places].view(dtype)[:, 0]
+        kept, size = self.rings.kept.data, np.dtype(dtype).itemsize
+        return spans, np.frombuffer(b"".join([kept[at : at + size] for at in spans[:, ring.BEGIN].tolist()]), dtype)
 
     def marks(self) -> npt.NDArray[np.void]:
         """Return the marks among `messages`, MARK_DTYPE (n,), in order."""

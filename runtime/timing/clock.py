@@ -137,11 +137,11 @@ class ClockModel:
         """Return the host times of `ticks` and their uncertainties, int64 (n,) ns, as `to_host_ns` does."""
         fit = self._ready()
         elapsed = ticks - fit.reference_tick
-        away = np.clip(np.rint(elapsed * fit.ns_per_tick), -LARGEST_NS, LARGEST_NS).astype(np.int64)
-        rate = fit.ns_per_tick * fit.rate_uncertainty
-        bounds = [bound + np.abs(elapsed - at) * rate for at, bound in fit.anchors]
-        unsure = np.minimum(np.minimum.reduce(bounds), LARGEST_NS - 1).astype(np.int64) + 1
-        return np.clip(fit.reference_host_ns + away, -LARGEST_NS, LARGEST_NS), unsure
+        away = np.minimum(np.maximum(np.rint(elapsed * fit.ns_per_tick), -LARGEST_NS), LARGEST_NS).astype(np.int64)
+        at, bounds = np.array(fit.anchors).T[:, :, None]
+        unsure = (bounds + np.abs(elapsed - at) * (fit.ns_per_tick * fit.rate_uncertainty)).min(axis=0)
+        host_ns = np.minimum(np.maximum(fit.reference_host_ns + away, -LARGEST_NS), LARGEST_NS)
+        return host_ns, np.minimum(unsure, LARGEST_NS - 1).astype(np.int64) + 1
 
     def to_tick(self, host_ns: int) -> int:
         """Return the device tick at a host time (for commands with absolute ticks)."""

@@ -6,6 +6,7 @@ Latencies count from the device's tick, not from when the host got around to loo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,13 +28,7 @@ class LatencyHistogram:
 
     def add_many(self, durations_ns: I64, counts: I64 | int = 1) -> None:
         """Count durations below 2^53 ns, int64 (n,), each `counts` times; negative ones (clock uncertainty) count as 0."""
-        if not len(durations_ns):
-            return
-        values = np.maximum(durations_ns, 0)
-        shift = np.maximum(np.frexp(values.astype(np.float64))[1] - SUB_BITS - 1, 0)
-        np.add.at(self.counts, (shift << SUB_BITS) + (values >> shift), counts)
-        self.total += int(np.sum(np.broadcast_to(counts, values.shape)))
-        self.max_ns = max(self.max_ns, int(values.max()))
+        count_each([self], durations_ns[None], np.broadcast_to(counts, durations_ns.shape))
 
     def quantile_ns(self, q: float) -> int:
         """Return the upper edge of the bucket that holds quantile `q` (never above the exact maximum); 0 without data."""
@@ -46,6 +41,19 @@ class LatencyHistogram:
         """Return {p50, p99, p999, max} in microseconds."""
         edges = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
         return {name: self.quantile_ns(q) / 1000 for name, q in edges.items()} | {"max": self.max_ns / 1000}
+
+
+def count_each(histograms: Sequence[LatencyHistogram], durations_ns: I64, counts: I64) -> None:
+    """Count durations int64 (histograms, n) in a histogram each, `counts` int64 (n,) times: see `LatencyHistogram.add_many`."""
+    if not len(counts):
+        return
+    values = np.maximum(durations_ns, 0)
+    shift = np.maximum(np.frexp(values)[1] - (SUB_BITS + 1), 0)
+    buckets, total = (shift << SUB_BITS) + (values >> shift), int(counts.sum())
+    for histogram, places, largest in zip(histograms, buckets, values.max(axis=1).tolist()):
+        np.add.at(histogram.counts, places, counts)
+        histogram.total += total
+        histogram.max_ns = max(histogram.max_ns, largest)
 
 
 def upper_edge(bucket: int) -> int:
@@ -81,8 +89,7 @@ class TimingLedger:
         """
         steps = np.diff(marks_ns, axis=1)
         latency = marks_ns[:, 3] - marks_ns[:, 0]
-        for histogram, durations in zip((*self.stages.values(), self.total), (*steps.T, latency)):
-            histogram.add_many(durations, counts)
+        count_each([*self.stages.values(), self.total], np.vstack((steps.T, latency)), counts)
         self.worst_uncertainty_ns = max(self.worst_uncertainty_ns, int(uncertainty_ns.max(initial=0)))
         late: NDArray[np.bool_] = latency - uncertainty_ns > self.deadline_ns
         self.late += int(counts[late].sum())
