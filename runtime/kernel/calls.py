@@ -19,6 +19,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.stream_kernels import DecisionTables
 from pans.runtime.decide.verdict import Decider
+from pans.runtime.wire import wire_kernels as place
 from pans.runtime.wire.framing import CHUNK_BYTES, Frame, FrameDecoder, Messages, unpack_body
 from pans.runtime.wire.messages import MessageType
 from pans.runtime.wire.schema import MARK_DTYPE
@@ -117,12 +118,15 @@ class Kernel:
         """Name the states of walks by `drive` from here on."""
         self._drive = drive
 
-    def run(self, fd: int = -1, limits: Limits = NO_LIMITS) -> int:
-        """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY)."""
-        return self._call(self._nothing, fd, limits)
+    def run(self, fd: int = -1, limits: Limits = NO_LIMITS, *, more: bool = False) -> int:
+        """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY).
 
-    def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits) -> int:
-        self._prepare(fd, limits)
+        With `more` what comes is added to what the last call brought, of which the core has done nothing yet.
+        """
+        return self._call(self._nothing, fd, limits, more)
+
+    def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits, more: bool = False) -> int:
+        self._prepare(fd, limits, more)
         ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
         self._n_rows = int(self.state[core_kernels.N_ROWS])
         self.counts = Counts(*self.control[ring.ERRNO :].tolist())
@@ -130,14 +134,18 @@ class Kernel:
             self.steps.store()
         return int(ended)
 
-    def _prepare(self, fd: int, limits: Limits) -> None:
+    def _prepare(self, fd: int, limits: Limits, more: bool) -> None:
         control, steps = self.control, self.steps
         if fd >= 0:
             control[ring.FD] = fd
         control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
         control[ring.FLOOR_NS] = limits.floor_ns
         control[ring.OPEN] = steps.takes
-        steps.load()
+        control[ring.ADDS] = more
+        if more:  # what came before is stored
+            self.state[place.MESSAGES] = self.state[place.EXPOSURES] = 0
+        else:
+            steps.load()
 
     def feed(self, chunks: Sequence[tuple[int, Bytes]]) -> int:
         """Take what was read elsewhere: one read or more, each with the time at which it came.
@@ -174,6 +182,11 @@ class Kernel:
     def arrival_ns(self) -> int:
         """When the bytes were read that were decoded last."""
         return int(self.control[ring.ARRIVAL_NS])
+
+    @property
+    def odd_type(self) -> int:
+        """The type of the message that ended the call."""
+        return int(self._decoder.buffer[self._decoder.bodies[int(self.control[ring.PLACE]), 0]])
 
     def take_odd(self) -> Frame:
         """Return the message that ended the call as a frame; the next call begins behind it."""

@@ -194,7 +194,9 @@ def _next_read(fed, reads, decoder, control):  # type: ignore[no-untyped-def]
 
 @inner
 def _begin(walk, control):  # type: ignore[no-untyped-def]
-    """Nothing has come in this call yet."""
+    """Nothing has come in this call yet, unless it adds to the last one."""
+    if control[ring.ADDS]:
+        return
     for column in range(ring.ERRNO, ring.N_CONTROL):
         control[column] = 0
     control[ring.FIRST_ID], control[ring.URGENT] = control[ring.NEXT_ID], 0

@@ -25,9 +25,10 @@ PLACE, N_BODIES, ARRIVAL_NS, BLOCK_NS, NEXT_ID, OLDEST_ID, OLDEST_NS, SENT_EXPOS
 NEXT_READ, READ_AT = range(21, 23)
 # the id of the first command that this call may send; whether a pulse is asked for, so that the call ends with the bytes read so far
 FIRST_ID, URGENT = range(23, 25)
+ADDS = 25  # set by the caller: the rings are filled behind what the last call brought
 # what a call reports: errno, bytes of the last command that were not sent, when anything of the session came last, and up to where each
 # ring is used
-ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(25, 36)
+ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(26, 37)
 
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)

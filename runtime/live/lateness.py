@@ -51,6 +51,14 @@ class Lateness:
         """Note that the stream goes on."""
         self.block_ns, self._asked = arrival_ns, False
 
+    def ask_if_overdue(self, connection: Connection, block_ns: int, now_ns: int) -> bool:
+        """Probe the link, once in a silence, where the block behind that of `block_ns` is overdue; return whether that was done."""
+        overdue = not self._asked and now_ns >= block_ns + self._patience_ns
+        if overdue:
+            connection.session.probe(now_ns)
+            self._asked = True
+        return overdue
+
     def lost(self, gap: Gap, connection: Connection, now_ns: int) -> Attribution:
         """Return the verdict on exposures that never came."""
         counters = connection.decoder.counters
@@ -61,8 +69,7 @@ class Lateness:
 
     def settled(self, connection: Connection, now_ns: int, *, idle: bool) -> Attribution | None:
         """Do what is due after a turn that brought something, or nothing (`idle`); return a verdict that is ready."""
-        if idle and not self._asked and now_ns >= self.block_ns + self._patience_ns:
-            connection.session.probe(now_ns)  # is the link open while the block is overdue?
-            self._asked = True
+        if idle:
+            self.ask_if_overdue(connection, self.block_ns, now_ns)
         self.evidence.read_if_stale(now_ns)
         return self.incidents.verdict(now_ns)

@@ -39,6 +39,10 @@ if TYPE_CHECKING:
 I64 = npt.NDArray[np.int64]
 
 GATHERED_BYTES = 1 << 18
+OWN_BOOKS = {
+    MessageType.PONG,
+    MessageType.ACK,
+}  # what they say is no matter of what a call has brought: settled before it
 EAGER_NS = 200_000  # as link/reader.py: an answer that was asked for is waited for awake
 LEAST_NS = 100_000
 CALL_NS = 20_000_000  # a call returns at least so often: signals, the watchdog's heartbeat, other threads' wishes
@@ -110,6 +114,8 @@ class Receiver:
                 asked = connection.send_due()
                 self._load(kernel)
                 ended = self._sent(kernel, kernel.run(self._fd, self._limits(eager=asked)))
+                while self._goes_on(kernel, ended, outputs):
+                    ended = self._sent(kernel, kernel.run(self._fd, self._limits(eager=False), more=True))
             finally:
                 connection.reader.take_back()
             self._settle(kernel, outputs)
@@ -125,6 +131,17 @@ class Receiver:
         if not outputs:
             connection.raise_failure()
         return outputs
+
+    def _goes_on(self, kernel: Kernel, ended: int, outputs: list[Output]) -> bool:
+        """Do what has nothing to do with the blocks of the call that ended; return whether that was all there is to do."""
+        if ended == ring.ODD and kernel.odd_type in OWN_BOOKS and not kernel.control[ring.DRIVES]:
+            self._take_odd(kernel, outputs)
+            return True
+        run, connection, block_ns = self._run, self._run.connection, int(kernel.control[ring.BLOCK_NS])
+        if ended != ring.DUE or not run.lateness.ask_if_overdue(connection, block_ns, run.now_ns()):
+            return False
+        connection.flush()
+        return True
 
     def last(self, poll_s: float) -> None:
         """Receive while the device stops: no state is named any more."""

@@ -120,8 +120,8 @@ def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest
     for owner, name in ((HostSession, "probe"), (Connection, "flush"), (Kernel, "run")):
         original = getattr(owner, name)
 
-        def noted(*arguments: Any, name: str = name, original: Any = original) -> Any:
-            found = original(*arguments)
+        def noted(*arguments: Any, name: str = name, original: Any = original, **options: Any) -> Any:
+            found = original(*arguments, **options)
             if name != "flush" or found:  # something was sent
                 told.append(name)
             return found
