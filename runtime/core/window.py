@@ -47,7 +47,7 @@ class Walks(NamedTuple):
 class WindowArrays(NamedTuple):
     """The open windows of one visit (arrays of window.DecisionWindows) and the kernel's scratch.
 
-    `offsets` int64 (slots of a cycle,) are the ticks at which exposures begin, from plausible.py's rules.
+    `offsets` int64 (slots of a cycle,) are the ticks at which exposures begin, as core/follower.py's rules have them.
     `lanes` uint64 (ceil(d_f / 8),) counts eight channels each, a byte per channel; `whole` int64 (d_f,) is one window's counts.
     `stamps` uint16 and `bits` uint8 (65535,) are the patterns shown and the clicks of the latest CLICKS block.
     """

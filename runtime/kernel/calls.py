@@ -33,7 +33,7 @@ Bytes = bytes | bytearray | memoryview | U8
 
 
 class Limits(NamedTuple):
-    """When a call ends though all is ordinary: see rings.py's control for the columns."""
+    """When a call ends though all is ordinary: see state.py's control for the columns."""
 
     due_ns: int = NO_END
     patience_ns: int = 0
@@ -43,7 +43,7 @@ class Limits(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What a call reports, in the order of rings.py's control."""
+    """What a call reports, in the order of state.py's control."""
 
     errno: int
     unsent: int
@@ -60,7 +60,7 @@ class Counts(NamedTuple):
 class Steps(Protocol):
     """The compiled steps of a core (core.kernel_state.CoreState, flow.core.FlowCore): they lend its state to kernels and take it back.
 
-    `walk` is a tuple of arrays of its own class, for which kinds.py has the kernels; its `state` begins with the columns of
+    `walk` is a tuple of arrays of its own class, for which receive.py chooses the kernel; its `state` begins with the columns of
     core/stream_kernels.py, its `rows` are decisions. `block_rows` are most of one block. `takes`: messages may be
     taken now; `decides`: the kernel gives each label at once.
     """
@@ -202,12 +202,12 @@ class Kernel:
 
     @property
     def blocks(self) -> I64:
-        """When each block came, was decoded, decided and kept, and what had come up to it: rings.py's steps (n, N_STEP)."""
+        """When each block came, was decoded, decided and kept, and what had come up to it: state.py's steps (n, N_STEP)."""
         return self.rings.steps[: self.counts.steps]
 
     @property
     def messages(self) -> I64:
-        """Where the stream messages of the call stand in `kept`: rings.py's spans (n, 4)."""
+        """Where the stream messages of the call stand in `kept`: state.py's spans (n, 4)."""
         return self.rings.messages[: self.counts.messages]
 
     @property
@@ -222,7 +222,7 @@ class Kernel:
 
     @property
     def notes(self) -> I64:
-        """The waits for bytes: rings.py's notes (n, 4)."""
+        """The waits for bytes: state.py's notes (n, 4)."""
         return self.rings.notes[: self.counts.notes]
 
     @property

@@ -113,7 +113,7 @@ _LIMIT, _SCHEMA = np.int64(MAX_FRAME_BYTES), np.int64(SCHEMA)  # plain numbers a
 def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
     """Take what is decoded, then read and take until something is due or not ordinary; return why it ended (rings.WHY).
 
-    decoder Decoder, walk of a class that kinds.py knows, drive Drive, rings Rings, control int64 (N_CONTROL,), scratch int64 (4,). Rings
+    decoder Decoder, walk of a class that `taking` knows, drive Drive, rings Rings, control int64 (N_CONTROL,), scratch int64 (4,). Rings
     are filled from their beginning. Where there are `reads`, nothing is read but `fed` uint8, read by read: `reads` int64 (n, 2) are their
     bytes and the times of their arrival, control[NEXT_READ] and control[READ_AT] say which one comes next, and where it begins; ALL_TAKEN
     behind the last one.

@@ -157,7 +157,7 @@ class RunResult:
     ended: str
     link_lost: bool
     reconnects: int = 0
-    late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (blame.CAUSES)
+    late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (causes.CAUSES)
     lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
     contradictions: dict[str, int] = field(default_factory=dict)  # messages that are excluded, by what is wrong
     late_slots: int = 0  # that stayed dark because the host named no state in time

@@ -286,7 +286,7 @@ def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
 
 @inner
 def mark_fits(buffer, payload, place, n_classes):  # type: ignore[no-untyped-def]
-    """Whether a MARK's truth is one of `n_classes` or unknown, and its exposure near the stream's place, as core/plausible.py asks."""
+    """Whether a MARK's truth is one of `n_classes` or unknown, and its exposure near the stream's place, as core/follower.py asks."""
     away = np.int64(load8(buffer, payload + _U(12))) - place[NEXT_EXPOSURE]
     near = -MAX_GAP_EXPOSURES <= away <= MAX_GAP_EXPOSURES
     return near and -1 <= mark_truth(buffer, payload) < n_classes

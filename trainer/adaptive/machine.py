@@ -371,7 +371,7 @@ class Aim:
 
     Prices are in nats, of a photoelectron and of an exposure (saved where a walk ends early). Of the loss `decide` is the part that
     counts wrong decisions, `WRONG` nats each; the rest is the log loss. `spread` times the mean over exposures of how concentrated
-    the light is (model/concentration.py) is added.
+    the light is (model/encoders.py) is added.
     """
 
     price: float

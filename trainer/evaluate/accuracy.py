@@ -120,8 +120,8 @@ def row_of(measured: Any) -> dict[str, Any]:
 class Light:
     """What reaches the detector: photoelectrons per exposure, float64 (objects, d_f), and the law that turns them to clicks.
 
-    `probability` holds afterpulses and crosstalk in the mean, where the profile states them; word by word afterpulses are in chain.py. Of
-    photon numbers it is the mean number.
+    `probability` holds afterpulses and crosstalk in the mean, where the profile states them; word by word afterpulses are in
+    runtime/detector/afterpulses.py. Of photon numbers it is the mean number.
     """
 
     photoelectrons: F64

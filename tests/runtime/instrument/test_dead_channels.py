@@ -157,6 +157,17 @@ def test_many_windows_at_once_are_found_dead_as_one_by_one() -> None:
     assert all(one == findings[0] for one in findings)
 
 
+def test_a_channel_that_clicks_again_is_judged_as_soon_as_before() -> None:
+    """A silence that a change of scene explains is looked at later and later; the next one, of a channel that has clicked, is not."""
+    rows = objects(32, 4000)
+    rows[2000:2400] = objects(33, 400, SHARES[1:])
+    rows[2000:2400, 1] = 0
+    rows[3000:, 1] = 0
+    _, found = watched(rows)
+    assert [one for _, one in found] == [1]
+    assert 3000 < found[0][0] < 3100
+
+
 def test_a_channel_that_returns_is_alive() -> None:
     rows = objects(30, 4000)
     rows[2000:2500, 1] = 0

@@ -1,6 +1,6 @@
 """Golden bytes written by hand from docs/reference/protocol.md, and the framing's hard cases.
 
-Both ends share wire.py, so a round trip proves little alone: the golden frames below were assembled from the specification with
+Both ends share these modules, so a round trip proves little alone: the golden frames below were assembled from the specification with
 COBS groups and CRC-32 worked out independently of the code under test.
 """
 
