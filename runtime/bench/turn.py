@@ -290,7 +290,7 @@ def _read_and_fed(turn: Kernel, link: Link, n: int) -> Iterator[NDArray[np.int64
         data = link.read(WAIT_NS / NS_PER_S)
         ended = turn.feed([(link.now_ns(), data)])
         if ended == ring.BROKEN:
-            link.write(turn.bytes_of(turn.shows[-1])[-turn.counts.unsent :])
+            link.write(turn.bytes_of(turn.shows[-1])[-turn.end.unsent :])
         elif ended != ring.ALL_TAKEN or not data:
             raise LinkError(f"round trips over {link.name}: {ring.WHY[ended]} after {done}")
         blocks = turn.blocks

@@ -22,7 +22,7 @@ from .plan import Plan
 from .stream_kernels import DecisionTables, FrameWalkArrays, IdleArrays, MarkArrays, WalkArrays
 from .window import DecisionWindows, WindowArrays
 
-ROWS_PER_CALL = 65536  # decisions of one call, beside those of a block; a megabyte per 18 000
+ROWS_PER_CALL = 1 << 17  # decisions of one call, beside those of a block; a megabyte per 18 000
 COUNTS_PER_CALL = 1 << 21  # counts of theirs that a back end is asked for: 16 MiB
 WORD_FEATURES = 24  # of tables by word: what stream_kernels.py looks up at once
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
@@ -89,18 +89,18 @@ class CoreState:
         self._marks.objects[slot], self._marks.truths[slot] = mark.object_index, mark.truth
         self._marks.photons[slot] = mark.photons
 
-    def photons_of(self, objects: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
-        """Return the expected photoelectrons of one shot on each object, float32 (n,), NaN where no mark told them."""
-        slots = objects.astype(np.int64) % kernels.MARK_SLOTS
-        return np.where(self._marks.objects[slots] == objects, self._marks.photons[slots], np.float32(np.nan))
+    def photons_of(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+        """Return the expected photoelectrons of one shot on each of objects (n,), float32 (n,), NaN where no mark told them."""
+        slots = numbers & (kernels.MARK_SLOTS - 1)  # a power of two
+        return np.where(self._marks.objects[slots] == numbers, self._marks.photons[slots], np.float32(np.nan))
 
-    def rows(self, n: int) -> Rows:
-        """Return the first `n` rows; those that the kernel could not decide get their verdicts here, all at once."""
-        rows = self._rows[:n]
-        if self.decides or not n:
+    def rows(self, first: int, stop: int) -> Rows:
+        """Return the rows from `first` to `stop`; those that the kernel could not decide get their verdicts here, all at once."""
+        rows = self._rows[first:stop]
+        if self.decides or not len(rows):
             return rows
         whole = np.flatnonzero(rows["flags"] == 0)
-        labels, probabilities = _finite(*verdicts_of(self._decider, self._counts[whole], self._shots))
+        labels, probabilities = _finite(*verdicts_of(self._decider, self._counts[first + whole], self._shots))
         rows["label"][whole], rows["probability"][whole] = labels, probabilities
         silent = labels == NO_LABEL
         why = np.where(probabilities > 0, int(DecisionFlag.AMBIGUOUS), int(DecisionFlag.NOT_FINITE))
@@ -158,7 +158,7 @@ class IdleSteps:
         self.walk.state[kernels.SESSION] = session
         return self
 
-    def rows(self, n: int) -> Rows:
+    def rows(self, first: int, stop: int) -> Rows:
         """Return no rows."""
         return self.walk.rows[:0]
 

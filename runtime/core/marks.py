@@ -54,6 +54,11 @@ class Marks:
             return None
         return mark_of(self._rows[found[-1]])
 
+    def photons_of(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+        """Return the expected photoelectrons of one shot on each of objects (n,), float32 (n,), NaN where no mark is remembered."""
+        marks = [self.get(number) for number in numbers.tolist()]
+        return np.array([np.nan if mark is None else mark.photons for mark in marks], np.float32)
+
     def latest(self) -> list[Mark]:
         """Return the marks that are remembered, the oldest first."""
         return [mark_of(row) for row in self._latest()]

@@ -11,14 +11,14 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.layers import Int8Head, Layer, read_layers, reference_scores
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
 
 from . import kernels
-from .verdict import ScoredDecider, Verdict, Verdicts, demand_golden
+from .verdict import ScoredDecider, Verdict, Verdicts, checked_counts, demand_golden
 
 GOLDEN_EXPOSURES_MAX = 16
 GROUP_BITS = (5, 4, 3)  # fewer save nothing: few patterns click
@@ -51,6 +51,11 @@ class _KernelDecider(ScoredDecider):
     def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
         """Return labels and probabilities of click counts, int64 (n, d_f), that are known to be 0..shots * largest."""
         return Verdicts(*self._decide_all(counts, shots * self.largest)[1:])
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """Return the labels, int64 (n,), of click counts, integers (n, d_f)."""
+        checked = checked_counts(counts, shots * self.largest, self.n_features)
+        return self.verdicts(checked, shots).labels.astype(np.int64)
 
     def _scores(self, counts: NDArray[np.int64], exposures: int) -> NDArray[np.float32]:
         return self._decide_all(counts, exposures)[0]

@@ -100,6 +100,10 @@ class PictureDecider(ScoredDecider):
         """Return pictures cut to [0, 1], float32 (n, height, width), of click counts (n, d_f)."""
         return self.scores_batch(counts, shots).clip(0.0, 1.0).reshape(-1, *self.picture_shape)
 
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """Return label 0, int64 (n,), for click counts (n, d_f)."""
+        return np.zeros(len(np.asarray(counts)), np.int64)
+
     def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
         """Return label 0 and probability 1, or 0 where the pixels are not finite, for click counts, int64 (n, d_f)."""
         whole = np.asarray(np.isfinite(self._scores(counts, shots)).all(axis=1), np.float32)

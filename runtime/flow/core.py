@@ -201,9 +201,9 @@ class FlowCore(Follower):
         """Whether it gives the labels, too: with a table, and where nothing else has a say. Else `account` asks the back end."""
         return bool(self.walk.tables.labels.size)
 
-    def rows(self, n: int) -> npt.NDArray[np.void]:
-        """Return the first `n` rows."""
-        return self.walk.rows[:n]
+    def rows(self, first: int, stop: int) -> npt.NDArray[np.void]:
+        """Return the rows from `first` to `stop`."""
+        return self.walk.rows[first:stop]
 
     def load(self) -> None:
         """Copy what the core and its tracker know into the kernel's state."""

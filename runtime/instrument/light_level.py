@@ -106,24 +106,31 @@ class LightWatch:
 
     def _compare(self, totals: list[int], base: Baseline) -> int:
         """Compare batches with the baseline until a change is found; return how many were compared."""
-        mean, slack, threshold, since = base.mean, base.slack, base.threshold, self._since
-        decisions, batches, clicks = self.decisions, self._batches, self._total
-        fall, rise, done = self._sums["fall"], self._sums["rise"], 0
-        for total in totals:
-            done, decisions, batches, clicks = done + 1, decisions + self.batch, batches + 1, clicks + total
-            fall = fall - (total - mean) - slack
-            rise = rise + (total - mean) - slack
+        (fall, rise), threshold, done, fell, rose = self._sums.values(), base.threshold, 0, -1, -1
+        moved = np.array(totals) - base.mean
+        for done, (less, more) in enumerate(zip((moved + base.slack).tolist(), (moved - base.slack).tolist())):
+            fall -= less
+            rise += more
             if fall <= 0.0:
-                fall, since["fall"] = 0.0, (decisions, batches, clicks)
-            if rise <= 0.0:
-                rise, since["rise"] = 0.0, (decisions, batches, clicks)
-            if fall >= threshold or rise >= threshold:
+                fall, fell = 0.0, done
+            elif fall >= threshold:
                 break
-        self.decisions, self._batches, self._total = decisions, batches, clicks
+            if rise <= 0.0:
+                rise, rose = 0.0, done
+            elif rise >= threshold:
+                break
+        for side, at in (("fall", fell), ("rise", rose)):  # the batch with which a sum was 0 last
+            if at >= 0:
+                self._since[side] = self._after(totals[: at + 1])
+        self.decisions, self._batches, self._total = self._after(totals[: done + 1])
         self._sums = {"fall": fall, "rise": rise}
         if max(fall, rise) >= threshold:
             self._report_change("fall" if fall >= threshold else "rise", base)
-        return done
+        return done + 1
+
+    def _after(self, totals: list[int]) -> tuple[int, int, int]:
+        """Return decisions, batches and clicks with these batches."""
+        return self.decisions + self.batch * len(totals), self._batches + len(totals), self._total + sum(totals)
 
     def _report_change(self, side: str, base: Baseline) -> None:
         """Note the change, and begin a new baseline: from here on clicks are compared with the new mean."""

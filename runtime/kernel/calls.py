@@ -43,7 +43,7 @@ class Limits(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What a call reports, in the order of state.py's control."""
+    """What a call reports, in the order of state.py's control; `rows` of decisions beside it."""
 
     errno: int
     unsent: int
@@ -55,6 +55,7 @@ class Counts(NamedTuple):
     notes: int
     arrivals: int
     kept: int
+    rows: int
 
 
 class Steps(Protocol):
@@ -81,23 +82,26 @@ class Steps(Protocol):
 
     def store(self) -> None: ...
 
-    def rows(self, n: int) -> npt.NDArray[np.void]: ...
+    def rows(self, first: int, stop: int) -> npt.NDArray[np.void]: ...
 
 
 NO_LIMITS = Limits()
-_NOTHING = Counts(*[0] * len(Counts._fields))
+_NOTHING = Counts._make([0] * len(Counts._fields))
 
 
 class Kernel:
-    """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming."""
+    """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming.
+
+    What came is looked at from `begin` to `end`: all that a call brought, unless it adds to the call before. Then it lies behind, until
+    `look`; `done` moves on to it.
+    """
 
     def __init__(self, steps: Steps, decoder: FrameDecoder, drive: Drive | None = None) -> None:
         from .receive import turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
         self.rings: Rings = make_rings()
-        self.counts = _NOTHING
-        self._n_rows = 0
+        self.said = self.begin = self.end = _NOTHING
         self._kernel = turn
         self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
         self._drive = no_drive() if drive is None else drive
@@ -121,18 +125,33 @@ class Kernel:
     def run(self, fd: int = -1, limits: Limits = NO_LIMITS, *, more: bool = False) -> int:
         """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY).
 
-        With `more` what comes is added to what the last call brought, of which the core has done nothing yet.
+        With `more` what comes is added to what the last call brought, and nothing of that moves.
         """
         return self._call(self._nothing, fd, limits, more)
 
     def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits, more: bool = False) -> int:
         self._prepare(fd, limits, more)
         ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
-        self._n_rows = int(self.state[core_kernels.N_ROWS])
-        self.counts = Counts(*self.control[ring.ERRNO :].tolist())
-        if self.counts.messages:
+        self.said = Counts._make((*self.control[ring.ERRNO :].tolist(), int(self.state[core_kernels.N_ROWS])))
+        if not more:
+            self.begin, self.end = _NOTHING, self.said
+        if self.said.messages:
             self.steps.store()
         return int(ended)
+
+    def look(self) -> Counts:
+        """Look at all that came behind `begin`, and return it."""
+        self.end = self.said
+        return self.end
+
+    def done(self) -> None:
+        """All that was looked at is done with."""
+        self.begin = self.end
+
+    @property
+    def holds(self) -> bool:
+        """Whether something came that is not done with: the next call must add to it."""
+        return (self.said.kept, self.said.arrivals) > (self.begin.kept, self.begin.arrivals)
 
     def _prepare(self, fd: int, limits: Limits, more: bool) -> None:
         control, steps = self.control, self.steps
@@ -198,37 +217,42 @@ class Kernel:
     @property
     def rows(self) -> npt.NDArray[np.void]:
         """The decisions of the call, DECISION_DTYPE (n,), in order."""
-        return self.steps.rows(self._n_rows)
+        return self.steps.rows(self.begin.rows, self.end.rows)
+
+    @property
+    def rows_by_block(self) -> I64:
+        """How many decisions each of `blocks` gave, int64 (n,)."""
+        return np.diff(self.blocks[:, ring.ROWS], prepend=self.begin.rows)
 
     @property
     def blocks(self) -> I64:
         """When each block came, was decoded, decided and kept, and what had come up to it: state.py's steps (n, N_STEP)."""
-        return self.rings.steps[: self.counts.steps]
+        return self.rings.steps[self.begin.steps : self.end.steps]
 
     @property
     def messages(self) -> I64:
         """Where the stream messages of the call stand in `kept`: state.py's spans (n, 4)."""
-        return self.rings.messages[: self.counts.messages]
+        return self.rings.messages[self.begin.messages : self.end.messages]
 
     @property
     def answers(self) -> I64:
         """Where the acknowledgements stand in `kept`."""
-        return self.rings.answers[: self.counts.answers]
+        return self.rings.answers[self.begin.answers : self.end.answers]
 
     @property
     def shows(self) -> I64:
         """Where the commands stand in `kept` that were sent."""
-        return self.rings.shows[: self.counts.shows]
+        return self.rings.shows[self.begin.shows : self.end.shows]
 
     @property
     def notes(self) -> I64:
         """The waits for bytes: state.py's notes (n, 4)."""
-        return self.rings.notes[: self.counts.notes]
+        return self.rings.notes[self.begin.notes : self.end.notes]
 
     @property
     def arrivals(self) -> I64:
         """When bytes were read, int64 (n,)."""
-        return self.rings.arrivals[: self.counts.arrivals]
+        return self.rings.arrivals[self.begin.arrivals : self.end.arrivals]
 
     @property
     def kept(self) -> U8:

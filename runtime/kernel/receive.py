@@ -156,14 +156,15 @@ def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no
             due = min(due, max(control[ring.BLOCK_NS] + control[ring.PATIENCE_NS], began_ns + LEAST_WAIT_NS))
         overdue = now >= due  # what is there is read once even then
         over = overdue or control[ring.N_MESSAGES] >= control[ring.BUDGET]
-        if control[ring.STOP] or (over and control[ring.N_ARRIVALS]):
+        if control[ring.STOP] or (over and control[ring.N_ARRIVALS] > control[ring.FIRST_ARRIVAL]):
             return ring.DUE
         if control[ring.N_ARRIVALS] == rings.arrivals.size or control[ring.N_NOTES] == rings.notes.shape[0]:
             return ring.FULL
         awake = now < began_ns + control[ring.EAGER_NS]
         if not awake:
             ready = wait_for(control[ring.FD], due - now, np.bool_(False), scratch)
-            _note_wait(rings.notes, control, now, due, now_ns(scratch))
+            if due > now:
+                _note_wait(rings.notes, control, now, due, now_ns(scratch))
             if ready < 0:
                 return _failed(control, ready)
             if ready == 0 and overdue:
@@ -195,12 +196,12 @@ def _next_read(fed, reads, decoder, control):  # type: ignore[no-untyped-def]
 @inner
 def _begin(walk, control):  # type: ignore[no-untyped-def]
     """Nothing has come in this call yet, unless it adds to the last one."""
-    if control[ring.ADDS]:
-        return
-    for column in range(ring.ERRNO, ring.N_CONTROL):
-        control[column] = 0
-    control[ring.FIRST_ID], control[ring.URGENT] = control[ring.NEXT_ID], 0
-    walk.state[core.N_ROWS] = 0
+    if not control[ring.ADDS]:
+        for column in range(ring.ERRNO, ring.N_CONTROL):
+            control[column] = 0
+        control[ring.FIRST_ID], control[ring.URGENT] = control[ring.NEXT_ID], 0
+        walk.state[core.N_ROWS] = 0
+    control[ring.FIRST_NOTE], control[ring.FIRST_ARRIVAL] = control[ring.N_NOTES], control[ring.N_ARRIVALS]
 
 
 @inner
@@ -236,7 +237,7 @@ def _failed(control, found):  # type: ignore[no-untyped-def]
 def _note_wait(notes, control, began, asked, ended):  # type: ignore[no-untyped-def]
     """Keep a wait for bytes; one that follows at once on a wait that ended in time is the same one (timing/causes.py)."""
     n = control[ring.N_NOTES]
-    if n:
+    if n > control[ring.FIRST_NOTE]:
         before = notes[n - 1]
         if before[2] - before[1] < OVERSLEPT_NS and began - min(before[1], before[2]) < control[ring.FLOOR_NS]:
             before[1], before[2] = asked, ended

@@ -26,9 +26,11 @@ NEXT_READ, READ_AT = range(21, 23)
 # the id of the first command that this call may send; whether a pulse is asked for, so that the call ends with the bytes read so far
 FIRST_ID, URGENT = range(23, 25)
 ADDS = 25  # set by the caller: the rings are filled behind what the last call brought
+# where the rings of waits and of arrivals stood when the call began: those before may have been looked at
+FIRST_NOTE, FIRST_ARRIVAL = range(26, 28)
 # what a call reports: errno, bytes of the last command that were not sent, when anything of the session came last, and up to where each
 # ring is used
-ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(26, 37)
+ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(28, 39)
 
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)

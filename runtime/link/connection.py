@@ -82,7 +82,7 @@ class Connection:
         began_ns = self.link.now_ns()
         chunks = self.reader.wait(timeout_s, eager=asked)
         if self.evidence is not None:
-            self.evidence.waited(began_ns, timeout_s, self.link.now_ns())
+            self.evidence.waited(began_ns, began_ns + int(timeout_s * 1e9), self.link.now_ns())
             for chunk in chunks:
                 self.evidence.arrived(chunk.arrival_ns)
         return chunks

@@ -163,4 +163,5 @@ class DarkRun:
 def _measured_clicks(decisions: Sequence[Decision]) -> NDArray[np.integer]:
     """Return the clicks of the decisions that were measured as planned."""
     rows = decisions.rows if isinstance(decisions, RowDecisions) else np.array(decisions, DECISION_DTYPE)
-    return np.asarray(rows["clicks"][rows["flags"] & np.uint32(NOT_MEASURED) == 0])
+    clicks, flags = rows["clicks"], rows["flags"]
+    return np.asarray(clicks[flags & np.uint32(NOT_MEASURED) == 0] if flags.any() else clicks)

@@ -20,6 +20,7 @@ from pans.runtime.wire.schema import BLOCK_DTYPE, HEADER
 
 from .gates import Actuator, SecondInstrument
 from .receiver import Receiver
+from .tally import unknown_photons
 
 if TYPE_CHECKING:
     from .run import LiveRun
@@ -98,14 +99,14 @@ class FlowReceiver(Receiver):
     _outputs: Sequence[Output] = ()
 
     def _settle_marks(self, kernel: Kernel) -> None:
-        if not kernel.counts.steps:
+        if not len(kernel.blocks):
             super()._settle_marks(kernel)
 
     def _record(self, kernel: Kernel) -> None:
         """Record decisions, too, and send the pulses that they ask for: before all else, since their time runs."""
         super()._record(kernel)
         run, steps = self._run, kernel.steps
-        if not kernel.counts.steps:
+        if not len(kernel.blocks):
             return
         assert isinstance(steps, FlowCore)
         if not steps.decides:
@@ -117,18 +118,19 @@ class FlowReceiver(Receiver):
             run.gates.take(pulses)
             run.pulse()
 
-    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:
         run, blocks, rows, steps = self._run, kernel.blocks, kernel.rows, kernel.steps
         assert isinstance(steps, FlowCore)
         for output in settled_blocks(kernel) if steps.decides else self._outputs:
             for event in output.events:
                 run.journal.take(event)
             outputs.append(output)
+        yield
         self._ends_of(kernel)
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
         if len(rows):
-            run.tally.add_rows(rows, np.full(len(rows), np.nan, np.float32))  # a passage's number is no mark's
-            block_of = np.repeat(np.arange(len(blocks)), np.diff(blocks[:, ring.ROWS], prepend=0))
+            run.tally.add_rows(rows, unknown_photons)  # a passage's number is no mark's
+            block_of = np.repeat(np.arange(len(blocks)), kernel.rows_by_block)
             ends_ns, unsure_ns = run.connection.known_clock().to_host_ns_many(steps.leave_ticks(len(rows)))
             stamps = blocks[block_of, : ring.RECORDED + 1]
             run.account_times(int(rows["index"][0]), np.ones(len(rows), np.int64), ends_ns, unsure_ns, stamps)
@@ -144,7 +146,7 @@ def settled_blocks(kernel: Kernel) -> Iterator[Output]:
     empty = {told[0]: told for told in core.told_empty()}
     places = np.flatnonzero(kernel.messages[:, ring.WHAT] == int(MessageType.MARK)).tolist()
     marks, row = deque(zip(places, map(mark_of, kernel.marks()))), 0
-    decided = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
+    decided = kernel.rows_by_block > 0
     some = decided | np.isin(behind, list(empty)) | by_block
     decided[-1] = some[-1] = True
     columns = blocks[:, ring.END_TICK : ring.MESSAGES + 1].tolist()

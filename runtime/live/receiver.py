@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,6 +77,9 @@ class Receiver:
         self._fd: int | None = None
         self._stamps_itself = True  # whether the kernel's times are the link's
         self._asked = False  # what Python sent of a call is about to be answered
+        self._goes_between = False  # whether the kernel is called between the parts of the settling, too
+        self._following = 0  # the exposure behind what is settled
+        self._told = (0, 0)  # of the answers and commands of a call, those that the session knows of
         self._gives_up = False  # nothing is sent any more
 
     def next_id(self) -> int:
@@ -113,14 +117,11 @@ class Receiver:
             try:
                 asked = connection.send_due()
                 self._load(kernel)
-                ended = self._sent(kernel, kernel.run(self._fd, self._limits(eager=asked)))
-                while self._goes_on(kernel, ended, outputs):
-                    ended = self._sent(kernel, kernel.run(self._fd, self._limits(eager=False), more=True))
+                limits = self._limits(eager=asked)
+                ended = self._run_on(kernel, limits, outputs, more=kernel.holds)
+                ended = self._settle(kernel, outputs, ended)
             finally:
                 connection.reader.take_back()
-            self._settle(kernel, outputs)
-            if kernel.counts.notes or kernel.counts.arrivals:
-                self._note(kernel)
             self._continue(kernel, ended, outputs, kernel.run)
             if ended == ring.GONE:
                 self._ask_why(kernel)
@@ -156,10 +157,16 @@ class Receiver:
         if kernel is None or self._attached is not run.connection or run.connection is not run.armed:
             run.connection.rest()
             return
+        self.finish([])
         if chunks := run.connection.reader.rest():
             self._gives_up = True
             self._feed(kernel, chunks, [])
             self._gives_up = False
+
+    def finish(self, outputs: list[Output]) -> None:
+        """Settle what came while something else was settled."""
+        if self._kernel is not None:
+            self._settle(self._kernel, outputs, ring.ALL_TAKEN)
 
     # -- before a call -------------------------------------------------------------------------------------------------
 
@@ -177,7 +184,9 @@ class Receiver:
         next_id, oldest_id, oldest_ns, waiting = run.connection.session.window
         drives = driver is not None and not run.stops and not run.is_broken and not self._gives_up
         control[ring.DRIVES : ring.WAITING + 1] = (drives, waiting)
-        control[ring.BLOCK_NS : ring.OLDEST_NS + 1] = (run.lateness.block_ns, next_id, oldest_id, oldest_ns)
+        control[ring.NEXT_ID : ring.OLDEST_NS + 1], control[ring.FIRST_ID] = (next_id, oldest_id, oldest_ns), next_id
+        if not kernel.holds:
+            control[ring.BLOCK_NS], self._told = run.lateness.block_ns, (0, 0)
         if driver is not None:
             control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1] = driver.sent
         self._core.steps(run.connection.session.nonce)
@@ -193,24 +202,28 @@ class Receiver:
             return chunks
         left = run.messages_granted - count_delimiters(chunks[0].data)
         more = connection.reader.ahead(poll_s, left, GATHERED_BYTES, run.due_ns)
-        began_ns = chunks[-1].arrival_ns
-        for arrival_ns, _ in more:
-            run.lateness.evidence.waited(began_ns, poll_s, arrival_ns)
-            run.lateness.evidence.arrived(arrival_ns)
-            began_ns = arrival_ns
-        if link.now_ns() > began_ns:
-            run.lateness.evidence.waited(began_ns, poll_s, link.now_ns())  # the read that brought nothing
+        evidence, arrivals_ns = run.lateness.evidence, [chunks[-1].arrival_ns, *(arrival_ns for arrival_ns, _ in more)]
+        evidence.arrived(*arrivals_ns[1:])
+        if link.now_ns() > arrivals_ns[-1]:
+            arrivals_ns.append(link.now_ns())  # the read that brought nothing
+        began_ns, poll_ns = arrivals_ns[0], int(poll_s * NS_PER_S)
+        for begin_ns, end_ns in pairwise(arrivals_ns):
+            if end_ns - begin_ns > poll_ns:  # one wait each; those that end in time are one
+                if begin_ns > began_ns:
+                    evidence.waited(began_ns, begin_ns, begin_ns)
+                evidence.waited(begin_ns, begin_ns + poll_ns, end_ns)
+                began_ns = end_ns
+        if arrivals_ns[-1] > began_ns:
+            evidence.waited(began_ns, arrivals_ns[-1], arrivals_ns[-1])
         return [*chunks, *more]
 
     # -- after a call --------------------------------------------------------------------------------------------------
 
     def _feed(self, kernel: Kernel, chunks: Sequence[tuple[int, bytes]], outputs: list[Output]) -> None:
         """Take what Python has read."""
+        self.finish(outputs)
         self._load(kernel)
-        ended = self._sent(kernel, kernel.feed(chunks))
-        self._settle(kernel, outputs)
-        if not self._run.connection.link.virtual:
-            self._note(kernel)
+        ended = self._settle(kernel, outputs, self._sent(kernel, kernel.feed(chunks)))
         self._continue(kernel, ended, outputs, kernel.feed_on)
 
     def _continue(self, kernel: Kernel, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
@@ -220,8 +233,7 @@ class Receiver:
                 self._take_odd(kernel, outputs)
             self._load(kernel)
             self._run.report(outputs)  # before the rings are filled anew
-            ended = self._sent(kernel, again())
-            self._settle(kernel, outputs)
+            ended = self._settle(kernel, outputs, self._sent(kernel, again()))
 
     def _take_odd(self, kernel: Kernel, outputs: list[Output]) -> None:
         """Let Python take one message that is not ordinary."""
@@ -234,10 +246,19 @@ class Receiver:
         elif connection.sort(frame, arrival_ns):
             run.take_frame(arrival_ns, frame, outputs)
 
+    def _run_on(self, kernel: Kernel, limits: Limits, outputs: list[Output], *, more: bool) -> int:
+        """Let the kernel read until `limits`; return why it ended."""
+        assert self._fd is not None
+        ended = self._sent(kernel, kernel.run(self._fd, limits, more=more))
+        while self._goes_on(kernel, ended, outputs):
+            limits = limits._replace(patience_ns=self._run.lateness.patience_ns, eager_ns=0)
+            ended = self._sent(kernel, kernel.run(self._fd, limits, more=True))
+        return ended
+
     def _sent(self, kernel: Kernel, ended: int) -> int:
         """Send what is left of a command that the kernel could not send whole, all of it without a descriptor; return `ended`."""
         if ended == ring.BROKEN:
-            last, unsent = kernel.shows[-1], kernel.counts.unsent
+            last, unsent = kernel.rings.shows[kernel.said.shows - 1], kernel.said.unsent
             try:
                 self._run.connection.link.write(kernel.bytes_of(last)[-unsent:])
                 last[ring.TIME], self._asked = self._run.now_ns(), True
@@ -249,7 +270,7 @@ class Receiver:
 
     def _ask_why(self, kernel: Kernel) -> None:
         """The descriptor says that the other end is gone: the link says it in its words."""
-        link, errno = self._run.connection.link, kernel.counts.errno
+        link, errno = self._run.connection.link, kernel.said.errno
         try:
             self._run.connection.reader.wait(0.0)
             raise LinkError(f"{link.name} went away: {os.strerror(errno) if errno else 'closed by the other end'}")
@@ -266,27 +287,51 @@ class Receiver:
             if asked < 0:
                 evidence.worked(INFERENCE, began, ended)
             else:
-                evidence.waited(began, (asked - began) / NS_PER_S, ended)
+                evidence.waited(began, asked, ended)
         evidence.arrived(*kernel.arrivals.tolist())
 
-    def _settle(self, kernel: Kernel, outputs: list[Output]) -> None:
-        """Account for what a call took and sent: session, driver, marks, recording, decisions."""
-        run, counts = self._run, kernel.counts
-        if not counts.kept:
-            return
-        connection = run.connection
-        connection.session.heard_ns = counts.heard_ns or connection.session.heard_ns
-        connection.delivered += counts.messages
-        connection.answers += counts.answers
-        run.taken_here += counts.messages
-        if kernel.control[ring.DRIVES] and (counts.shows or counts.answers):
+    def _settle(self, kernel: Kernel, outputs: list[Output], ended: int) -> int:
+        """Account for what a call took and sent, which is over because of `ended`; return why the latest one is.
+
+        Settling takes longer than a block. Between its parts the kernel takes what has come meanwhile, where it is the kernel that reads
+        and decides: that is settled with the next call, and with this one if it is not ordinary.
+        """
+        while True:
+            for _ in self._parts(kernel, outputs):
+                if self._goes_between and self._fd is not None and ended == ring.DUE:
+                    ended = self._run_on(kernel, self._glance(), outputs, more=True)
+            if ended == ring.DUE or not kernel.holds:
+                break
+        if self._told != (kernel.said.answers, kernel.said.shows):
             self._settle_commands(kernel)
-        self._stamp(kernel)
-        if counts.messages > counts.steps:
-            self._settle_marks(kernel)
-        self._record(kernel)
-        if counts.steps:
-            self._settle_blocks(kernel, outputs)
+        return ended
+
+    def _glance(self) -> Limits:
+        """Return the limits of a call that takes what is there and waits for nothing."""
+        run = self._run
+        return Limits(run.now_ns() - QUIET_NS, 0, 0, max(run.messages_granted, 1), run.lateness.evidence.floor_ns)
+
+    def _parts(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:
+        """Settle what has come up to now, in parts: session, driver, marks, recording, decisions."""
+        run, begin, end = self._run, kernel.begin, kernel.look()
+        self._following = self._core.tracker.next_exposure
+        if end.kept > begin.kept:
+            connection = run.connection
+            connection.session.heard_ns = end.heard_ns or connection.session.heard_ns
+            connection.delivered += end.messages - begin.messages
+            connection.answers += end.answers - begin.answers
+            run.taken_here += end.messages - begin.messages
+            self._settle_commands(kernel)
+            self._stamp(kernel)
+            if end.messages - begin.messages > end.steps - begin.steps:
+                self._settle_marks(kernel)
+            self._record(kernel)
+            yield
+            if end.steps > begin.steps:
+                yield from self._settle_blocks(kernel, outputs)
+        if not run.connection.link.virtual and (end.notes > begin.notes or end.arrivals > begin.arrivals):
+            self._note(kernel)
+        kernel.done()
 
     def _stamp(self, kernel: Kernel) -> None:
         """Set the times of the blocks where the kernel has another clock than the link; in virtual time none passes in between."""
@@ -298,13 +343,11 @@ class Receiver:
 
     def _record(self, kernel: Kernel) -> None:
         """Record what a call took and sent."""
-        recorder, counts = self._run.recorder, kernel.counts
+        recorder = self._run.recorder
         if recorder is not None:
             recorder.add_stamped(Kind.MESSAGES, kernel.kept, kernel.messages)
-            if counts.answers:
-                recorder.add_stamped(Kind.ANSWERS, kernel.kept, kernel.answers)
-            if counts.shows:
-                recorder.add_stamped(Kind.COMMANDS, kernel.kept, kernel.shows)
+            recorder.add_stamped(Kind.ANSWERS, kernel.kept, kernel.answers)
+            recorder.add_stamped(Kind.COMMANDS, kernel.kept, kernel.shows)
 
     def _settle_marks(self, kernel: Kernel) -> None:
         """Let the core know of the marks of a call."""
@@ -312,22 +355,26 @@ class Receiver:
 
     def _settle_commands(self, kernel: Kernel) -> None:
         """Bring the session and the driver to where the kernel has them."""
-        run, control, shows = self._run, kernel.control, kernel.shows
+        run, control, (n_answers, n_shows) = self._run, kernel.control, self._told
+        self._told = kernel.said.answers, kernel.said.shows
+        if self._told == (n_answers, n_shows):
+            return
+        answers, shows = kernel.rings.answers[n_answers : self._told[0]], kernel.rings.shows[n_shows : self._told[1]]
         first = int(control[ring.NEXT_ID]) - len(shows)
         open_since = max(int(control[ring.OLDEST_ID]), first)
         sent = [(number, kernel.bytes_of(shows[number - first])) for number in range(open_since, first + len(shows))]
         session = run.connection.session
         session.continue_from(int(control[ring.OLDEST_ID]), int(control[ring.OLDEST_NS]), sent, Opcode.SHOW)
         session.next_id = first + len(shows)
-        for span in kernel.answers[kernel.answers[:, ring.WHAT] == ring.REFUSAL]:
+        for span in answers[answers[:, ring.WHAT] == ring.REFUSAL]:
             ack = decode_ack(kernel.bytes_of(span)[HEADER.size :])
             session.refusals.append(Refusal(ack.refused_id, ack.status, ack.text, Opcode.SHOW))
         if run.driver is not None:
             exposure, state = control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1].tolist()
             run.driver.account((exposure, state), shows[:, ring.TIME] - shows[:, ring.WHAT])
 
-    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
-        """Account for the blocks of a call and their decisions."""
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:
+        """Account for the blocks of a call and their decisions, in parts."""
         raise NotImplementedError
 
     def _ends_of(self, kernel: Kernel) -> tuple[I64, I64]:
@@ -351,11 +398,12 @@ class StillReceiver(Receiver):
             self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
 
     def _warm_up(self, kernel: Kernel) -> None:
+        self._goes_between = kernel.steps.decides and not self._prompt
         unpack_blocks(kernel.kept, kernel.messages, self._stamps, self._bits)
         if self._run.recorder is not None:
             self._run.recorder.add_stamped(Kind.MESSAGES, kernel.kept, kernel.messages)
 
-    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:
         run, blocks, steps = self._run, kernel.blocks, kernel.steps
         assert isinstance(steps, CoreState)
         rows = kernel.rows  # a back end that is not the kernel's decides here
@@ -364,17 +412,20 @@ class StillReceiver(Receiver):
         events = self._watch(kernel, rows)
         for event in events:
             run.journal.take(event)
+        yield
         ends_ns, unsure_ns = self._ends_of(kernel)
         if len(rows):
-            run.tally.add_rows(rows, steps.photons_of(rows["object"]))
+            run.tally.add_rows(rows, steps.photons_of)
+            yield
             if run.recorder is not None:
                 run.recorder.add_decisions(rows)
-            counts = np.diff(blocks[:, ring.ROWS], prepend=0)
+            counts = kernel.rows_by_block
             some = counts > 0
             stamps = blocks[some, : ring.RECORDED + 1]
             run.account_times(int(rows["index"][0]), counts[some], ends_ns[some], unsure_ns[some], stamps)
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
-        outputs.append(Output(RowDecisions(rows), events, self._still.last_tick))
+        outputs.append(Output(RowDecisions(rows), events, int(blocks[-1, ring.END_TICK])))
+        yield
 
     def _watch(self, kernel: Kernel, rows: npt.NDArray[np.void]) -> list[Any]:
         """Let the guard of the dark counts see the exposures of a call."""
@@ -385,7 +436,7 @@ class StillReceiver(Receiver):
             spans, heads = kernel.heads(MessageType.FRAMES, BLOCK_DTYPE)
             return core.watch_frames(_words_of(kernel.kept, spans, heads), heads)
         n = int(unpack_blocks(kernel.kept, kernel.messages, self._stamps, self._bits))
-        return core.watch_blocks(self._stamps[:n], self._bits[:n], core.tracker.next_exposure - n, rows)
+        return core.watch_blocks(self._stamps[:n], self._bits[:n], self._following - n, rows)
 
 
 def _words_of(kept: npt.NDArray[np.uint8], spans: I64, heads: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:

@@ -38,7 +38,7 @@ from .gates import GateQueue
 from .journal import Journal
 from .lateness import Lateness
 from .run_options import RunOptions
-from .tally import RunTally
+from .tally import RunTally, unknown_photons
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
@@ -65,6 +65,8 @@ class Receives(Protocol):
     def last(self, poll_s: float) -> None: ...
 
     def rest(self) -> None: ...
+
+    def finish(self, outputs: list[Output]) -> None: ...
 
     def next_id(self) -> int: ...
 
@@ -267,7 +269,7 @@ class LiveRun:
             self.journal.clock(self.connection)
             self.recorder.flush()
             self._flush_due_ns = now_ns + FLUSH_EVERY_NS
-        self._turn_page(now_ns)
+        self._turn_page(now_ns, outputs)
         self.ended = self._why_ended(now_ns, looked_ns, idle=idle)
 
     def report(self, outputs: list[Output]) -> None:
@@ -392,8 +394,7 @@ class LiveRun:
             return
         self.gates.take(output.actions)
         rows = np.array(output.decisions, DECISION_DTYPE)
-        marks = [None if output.passages else self.core.marks.get(number) for number in rows["object"].tolist()]
-        self.tally.add_rows(rows, np.array([np.nan if mark is None else mark.photons for mark in marks], np.float32))
+        self.tally.add_rows(rows, unknown_photons if output.passages else self.core.marks.photons_of)
         if self.recorder is not None:
             self.recorder.add_decisions(rows)
         if output.block_end_tick is None:
@@ -426,13 +427,16 @@ class LiveRun:
                 begin_ns, arrival_ns, _, decided_ns, _ = marks_ns[at].tolist()
                 self.lateness.incidents.late(LateWork(number, begin_ns, arrival_ns, decided_ns))
 
-    def _turn_page(self, now_ns: int) -> None:
+    def _turn_page(self, now_ns: int, outputs: list[Output]) -> None:
         """Go on in the recording's next part when this one is full and no window is open."""
         recorder = self.recorder
         if recorder is None or recorder.limits is None:
             return
         for event in recorder.news():
             self.journal.note(**event)
+        if recorder.wants_part:
+            self.receiver.finish(outputs)  # belongs to this part
+            self.report(outputs)
         if recorder.wants_part and (place := self.core.part()) is not None:
             recorder.next_part(place.facts(), self._setup, now_ns)
             recorder.add_clock(self.connection.known_clock().history())

@@ -7,6 +7,7 @@ having measured only these objects. `RunTally.figures` returns the figures of th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,8 +18,15 @@ from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.timing.ledger import TimingLedger
 
+I64 = npt.NDArray[np.int64]
+PhotonsOf = Callable[[I64], npt.NDArray[np.float32]]  # object numbers (n,) -> NaN where it is not known
 _ABSTAINED, _AMBIGUOUS = int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
+
+
+def unknown_photons(numbers: I64) -> npt.NDArray[np.float32]:
+    """Return NaN for each object."""
+    return np.full(len(numbers), np.nan, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,39 +65,45 @@ class RunTally:
         self._objects: dict[int, list[int]] = {}  # object -> [decided, right]
         self._past = [0.0, 0.0, 0.0]  # objects that are summed up: how many, accuracies, their squares
 
-    def add_rows(self, rows: npt.NDArray[np.void], photons_per_shot: npt.NDArray[np.float32]) -> None:
-        """Count decisions, rows of DECISION_DTYPE (n,); `photons_per_shot` (n,) is NaN where the instrument does not know it."""
-        labels, truths = rows["label"].astype(np.int64), rows["truth"].astype(np.int64)
-        lit, n_classes = ~np.isnan(photons_per_shot), len(self.confusion)
-        silent = (rows["flags"] & _ABSTAINED != 0) | (labels == NO_LABEL)
+    def add_rows(self, rows: npt.NDArray[np.void], photons_of: PhotonsOf) -> None:
+        """Count decisions, rows of DECISION_DTYPE (n,), n > 0; `photons_of` gives the photons of one shot on each of some objects."""
+        labels, truths, flags = rows["label"].astype(np.int64), rows["truth"].astype(np.int64), rows["flags"]
+        numbers, n_classes = rows["object"], len(self.confusion)
+        begins = np.append(0, np.flatnonzero(numbers[1:] != numbers[:-1]) + 1)  # of each object
+        numbers, counts = numbers[begins].astype(np.int64), np.diff(begins, append=len(rows))
+        photons = photons_of(numbers)
+        lit, silent = ~np.isnan(photons), labels == NO_LABEL
+        if flags.any():
+            silent |= flags & _ABSTAINED != 0
+            self.unsure += int(np.count_nonzero(silent & (flags & _AMBIGUOUS != 0)))
         self.decisions += len(rows)
         self.clicks += int(rows["clicks"].sum(dtype=np.int64))
         self.exposures += int(rows["exposures"].sum(dtype=np.int64))
-        self.photons += float(photons_per_shot[lit].sum(dtype=np.float64)) * self.shots
-        self.photons_known += int(lit.sum())
-        self.abstained += int(silent.sum())
-        self.unsure += int((silent & (rows["flags"] & _AMBIGUOUS != 0)).sum())
-        known = (truths >= 0) & (truths < n_classes)
+        self.photons += float((photons[lit] * counts[lit]).sum(dtype=np.float64)) * self.shots
+        self.photons_known += int(counts[lit].sum())
+        self.abstained += int(np.count_nonzero(silent))
+        known, right = truths.view(np.uint64) < n_classes, labels == truths  # -1 is a large number, too
+        right &= known
         if not known.any():
             return
-        labels, truths, right = labels[known], truths[known], (labels == truths)[known]
-        self.known += len(right)
-        self.right += int(right.sum())
-        cells = (truths * n_classes + labels)[labels != NO_LABEL]
-        self.confusion += np.bincount(cells, minlength=n_classes**2).reshape(n_classes, n_classes)
-        trials = rows["shot"][known] // self.shots
+        decided, well = np.add.reduceat(known, begins, dtype=np.int64), np.add.reduceat(right, begins, dtype=np.int64)
+        self.known += int(decided.sum())
+        self.right += int(well.sum())
+        self._add_objects(numbers[decided > 0], decided[decided > 0], well[decided > 0])
+        cells, trials = truths * n_classes + labels, rows["shot"] if self.shots == 1 else rows["shot"] // self.shots
+        told = known & (labels != NO_LABEL)
+        self.confusion += np.bincount(cells[told], minlength=n_classes**2).reshape(n_classes, n_classes)
         while trials.max() >= len(self._trials):  # twice as long each time; a visit has at most 2^24 exposures
             self._trials = np.concatenate([self._trials, np.zeros_like(self._trials)])
-        self._trials[:, 0] += np.bincount(trials, minlength=len(self._trials))
+        self._trials[:, 0] += np.bincount(trials[known], minlength=len(self._trials))
         self._trials[:, 1] += np.bincount(trials[right], minlength=len(self._trials))
-        self._add_objects(rows["object"][known].astype(np.int64), right)
 
-    def _add_objects(self, numbers: npt.NDArray[np.int64], right: npt.NDArray[np.bool_]) -> None:
-        """Count decisions on objects; one that is shown again keeps its number."""
+    def _add_objects(self, numbers: I64, decided: I64, right: I64) -> None:
+        """Count decisions on objects, and how many of them are right; one that is shown again keeps its number."""
         which = numbers % self.distinct if self.distinct else numbers
-        begins = np.flatnonzero(np.diff(which, prepend=which[0] - 1))
-        decided, well = np.diff(begins, append=len(which)), np.add.reduceat(right.astype(np.int64), begins)
-        for index, n_decided, n_right in zip(which[begins].tolist(), decided.tolist(), well.tolist()):
+        begins = np.append(0, np.flatnonzero(which[1:] != which[:-1]) + 1)
+        decided, right = np.add.reduceat(decided, begins), np.add.reduceat(right, begins)
+        for index, n_decided, n_right in zip(which[begins].tolist(), decided.tolist(), right.tolist()):
             if index not in self._objects and len(self._objects) >= MAX_OBJECTS:
                 self._sum_up(next(iter(self._objects)))
             sums = self._objects.setdefault(index, [0, 0])

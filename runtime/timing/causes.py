@@ -275,11 +275,10 @@ class Evidence:
             cpu_ns = -1 if self._virtual else time.thread_time_ns() - self._cpu_mark_ns
             self._spans.append(Span(kind, begin_ns, end_ns, cpu_ns))
 
-    def waited(self, begin_ns: int, asked_s: float, end_ns: int) -> None:
-        """Note a wait for bytes of at most `asked_s`; one that lasts longer by OVERSLEPT_NS or more is the machine's delay."""
+    def waited(self, begin_ns: int, asked_ns: int, end_ns: int) -> None:
+        """Note a wait for bytes until `asked_ns` at most; one that lasts longer by OVERSLEPT_NS or more is the machine's delay."""
         if not self._virtual:
             self._cpu_mark_ns = time.thread_time_ns()
-        asked_ns = begin_ns + int(asked_s * NS_PER_S)
         last = self._spans[-1] if self._spans else None
         if last is not None and last.kind == IDLE and begin_ns - last.end_ns < self.floor_ns:
             self._spans.pop()  # nothing of note was done in between

@@ -223,7 +223,7 @@ def test_another_thread_can_stop_a_call_between_messages() -> None:
         streamed.turn.stop()
         theirs.send(b"".join(clean))
         assert ring.WHY[streamed.turn.run(ours.fileno(), Limits(due_ns=0))] == "due"
-        assert streamed.turn.counts.messages == 0  # nothing was read
+        assert streamed.turn.end.messages == 0  # nothing was read
 
 
 def test_the_other_end_goes() -> None:
@@ -233,7 +233,7 @@ def test_the_other_end_goes() -> None:
         theirs.send(clean[0] + clean[1][:10])
         theirs.close()
         assert ring.WHY[streamed.turn.run(ours.fileno())] == "gone"
-        assert (streamed.turn.counts.messages, streamed.decoder.arrays[2][HELD]) == (1, 10)
+        assert (streamed.turn.end.messages, streamed.decoder.arrays[2][HELD]) == (1, 10)
     leader, follower = os.openpty()
     tty.setraw(follower)
     os.close(leader)

@@ -18,7 +18,7 @@ def decision(obj: int, trial: int, label: int, truth: int, clicks: int = 4, flag
 
 
 def add(tally: RunTally, one: Decision, photons: float) -> None:
-    tally.add_rows(np.array([one], DECISION_DTYPE), np.array([photons], np.float32))
+    tally.add_rows(np.array([one], DECISION_DTYPE), lambda numbers: np.full(len(numbers), photons, np.float32))
 
 
 def test_spreads_over_trials_and_objects_are_different_things() -> None:
@@ -96,12 +96,14 @@ def test_many_rows_count_as_one_by_one() -> None:
     rows["flags"] = rng.choice(
         [0, int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED)], n
     )
-    photons = np.where(rng.random(n) < 0.2, np.nan, rng.random(n)).astype(np.float32)
+    photons = np.where(rng.random(90) < 0.2, np.nan, rng.random(90)).astype(np.float32)  # of each object
     one, many = RunTally(4, shots, distinct=50), RunTally(4, shots, distinct=50)
-    for row, light in zip(rows, photons):
-        one.add_rows(row[None], light[None])
-    for part, light in zip(np.split(rows, [700, 701, 2000]), np.split(photons, [700, 701, 2000])):
-        many.add_rows(part, light)
+    for row in rows:
+        one.add_rows(row[None], photons.__getitem__)
+    for part in np.split(rows, [700, 701, 2000]):
+        many.add_rows(part, photons.__getitem__)
+    known = photons[rows["object"]]
+    assert many.figures().photons_mean == pytest.approx(shots * np.nanmean(known.astype(np.float64)), rel=1e-12)
     assert many.figures() == replace(one.figures(), photons_mean=pytest.approx(one.figures().photons_mean, rel=1e-12))
     assert many.confusion.tolist() == one.confusion.tolist()
     assert (many.unsure, many.exposures, many.known, many.right) == (one.unsure, one.exposures, one.known, one.right)

@@ -215,9 +215,9 @@ def test_a_real_collection_is_seen_with_its_length() -> None:
 
 def test_waits_that_end_on_time_are_idle_and_others_overslept() -> None:
     evidence = Evidence(lambda: 0, MS, virtual=True)
-    evidence.waited(0, 0.02, 20 * MS)
-    evidence.waited(20 * MS, 0.02, 90 * MS)
-    evidence.waited(90 * MS, 0.02, 90 * MS + 10)
+    evidence.waited(0, 20 * MS, 20 * MS)
+    evidence.waited(20 * MS, 20 * MS + 20 * MS, 90 * MS)
+    evidence.waited(90 * MS, 90 * MS + 20 * MS, 90 * MS + 10)
     assert evidence.facts(0, 0, 100 * MS).spans == (
         Span(IDLE, 0, 40 * MS),  # two waits with nothing of note between them
         Span(OVERSLEPT, 40 * MS, 90 * MS),
