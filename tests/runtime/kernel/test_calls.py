@@ -226,6 +226,35 @@ def test_another_thread_can_stop_a_call_between_messages() -> None:
         assert streamed.turn.end.messages == 0  # nothing was read
 
 
+def test_what_comes_while_something_is_settled_lies_behind_it() -> None:
+    """Three calls in one filling of the rings: each block is looked at once, with its own rows, whatever has come since."""
+    found: list[list[Any]] = []
+    for parts in (
+        ((0, 6),),
+        ((0, 3), (3, 4), (4, 6)),
+    ):  # at once, and in three calls; what else there is is not ordinary
+        streamed, clean = streaming()
+        turn, (ours, theirs) = streamed.turn, socket.socketpair()
+        rows, blocks = list[Any](), list[Any]()
+        with ours, theirs:
+            for number, (first, stop) in enumerate(parts):
+                theirs.send(b"".join(clean[first:stop]))
+                before = turn.end
+                assert turn.run(ours.fileno(), Limits(due_ns=0), more=number > 0) == ring.DUE
+                if number:
+                    assert turn.end is before  # what is settled does not grow meanwhile
+                    turn.done()
+                assert turn.holds
+                turn.look()
+                rows += turn.rows.tolist()
+                blocks += [*zip(turn.blocks[:, [ring.ROWS, ring.MESSAGES]].tolist(), turn.rows_by_block.tolist())]
+            turn.done()
+            assert not turn.holds
+        found.append([rows, blocks])
+    assert found[0] == found[1]
+    assert len(found[0][0]) == sum(n for _, n in found[0][1]) > 0
+
+
 def test_the_other_end_goes() -> None:
     streamed, clean = streaming()
     ours, theirs = socket.socketpair()
