@@ -192,7 +192,7 @@ class Afterpulses:
         The columns are those after a silent slot and after a click.
         """
         found, memory = np.zeros((len(rates), 2)), np.zeros(2)
-        for _ in range(rounds):
+        for _ in range(rounds if self else 0):
             for slot, rate in enumerate(np.minimum(rates, 1 - 1e-9).tolist()):
                 mean = max(0.0, -math.log1p(-rate) - float(self.sight(memory)))
                 both = np.stack([self.after(mean, memory, clicked) for clicked in (0, 1)], axis=1)

@@ -43,9 +43,9 @@ def by_turn(core: FlowCore, data: bytes, cuts: list[int]) -> Output:
     for first, stop in zip([0, *cuts], [*cuts, len(data)]):
         ended = turn.feed([(1, data[first:stop])])
         while True:
-            for came in settled_blocks(turn) if turn.counts.steps else ():
+            for came in settled_blocks(turn) if len(turn.blocks) else ():
                 output = joined(output, came)
-            if not turn.counts.steps:
+            if not len(turn.blocks):
                 core.remember_rows(turn.marks())
             if ended == ring.ALL_TAKEN:
                 break

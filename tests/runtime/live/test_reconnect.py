@@ -166,7 +166,7 @@ class Strict(Instrument):
         super()._execute(command)
 
 
-@pytest.mark.parametrize("mode", ["sequential", "parallel", "device-driven", "host-driven"])
+@pytest.mark.parametrize("mode", ["parallel", "host-driven"])
 def test_an_arm_is_sent_again_at_real_pace(tmp_path: Path, mode: str) -> None:
     profile, _, _ = small_setup(mode)
     clock = DeviceClock(profile.clock.tick_hz)
