@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -23,12 +22,11 @@ from heads import head_bundle, random_layers
 from inner_kernels import called
 from plans import shot_major
 from streams import SESSION, click_frames
-from tree import ROOT
 
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.kernel import answer, receive
+from pans.runtime.kernel import answer
 from pans.runtime.kernel import state as ring
 from pans.runtime.kernel.calls import Kernel, Limits, StreamCore
 from pans.runtime.live.drive import HostDriver, WalkPlace
@@ -161,21 +159,6 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
         command = decode_command(frame.payload)
         assert (frame.session, command.command_id, command.opcode) == (SESSION, 5, Opcode.SHOW)
         assert unpack_command(Show, command.body)[:2] == (int(plan.slot_pattern[0] == DARK_PATTERN), 0)
-
-
-def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:
-    """After this module's runs: the turn once for each kind of walk. A fresh process finds it in the cache, though it calls libc."""
-    kinds = [kind for one in receive.turn.signatures for kind in re.findall(r"\b(?:Frame)?WalkArrays\b", str(one))]
-    assert sorted(kinds) == ["FrameWalkArrays", "WalkArrays"]
-    code = (
-        "import test_calls as t; s, c = t.streaming(); n = sum(len(b.rows) for b in s.feed(b''.join(c)));"
-        "print(n, sum(t.receive.turn.stats.cache_hits.values()), sum(t.receive.turn.stats.cache_misses.values()))"
-    )
-    here = Path(__file__).parent
-    paths = [here, *(ROOT / "tests" / name for name in ("support", "oracles", "sessions", "independent"))]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=True)
-    assert done.stdout.split() == ["4", "1", "0"]
 
 
 def test_nothing_is_compiled_once_the_light_is_on(tmp_path: Path) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +15,7 @@ import numpy as np
 import pytest
 from fault_grid import MODES, run_case
 from links import served
+from tree import ROOT
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
@@ -19,6 +24,7 @@ from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
+from pans.runtime.kernel import receive
 from pans.runtime.kernel.calls import Kernel
 from pans.runtime.link.base import open_link
 from pans.runtime.link.connection import Connection
@@ -147,3 +153,19 @@ def test_a_core_alone_leaves_the_same(mode: str, acts: bool, tmp_path: Path, mon
 def test_runs_under_all_faults_are_sound(seed: int) -> None:
     """The quick form of the fault grid: every kind of plan for objects that stand still, judged from outside."""
     assert run_case("all", seed, 1200).violations == []
+
+
+def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:
+    """After this module's runs: the turn once for each kind of walk. A fresh process finds it in the cache, though it calls libc."""
+    kinds = [kind for one in receive.turn.signatures for kind in re.findall(r"\b(?:Frame)?WalkArrays\b", str(one))]
+    assert sorted(kinds) == ["FrameWalkArrays", "WalkArrays"]
+    code = (
+        "import test_calls as t; from pans.runtime.kernel.receive import turn;"
+        "s, c = t.streaming(); n = sum(len(b.rows) for b in s.feed(b''.join(c)));"
+        "print(n, sum(turn.stats.cache_hits.values()), sum(turn.stats.cache_misses.values()))"
+    )
+    here = Path(__file__).parent
+    paths = [here, *(ROOT / "tests" / name for name in ("support", "oracles", "sessions", "independent"))]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=True)
+    assert done.stdout.split() == ["4", "1", "0"]
