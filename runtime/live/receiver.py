@@ -441,8 +441,9 @@ class StillReceiver(Receiver):
 
 def _words_of(kept: npt.NDArray[np.uint8], spans: I64, heads: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:
     """Return the words of all FRAMES of a call behind one another, uint8 (frames, bytes), as wide as the narrowest."""
-    bodies = [kept[begin:end] for begin, end in (spans[:, : ring.END + 1] + [BLOCK_DTYPE.itemsize, 0]).tolist()]
-    width = int(heads["width"].min())
+    data, width = kept.data, int(heads["width"].min())
+    bodies = [data[begin:end] for begin, end in (spans[:, : ring.END + 1] + [BLOCK_DTYPE.itemsize, 0]).tolist()]
     if width == heads["width"].max():
-        return np.concatenate(bodies).reshape(-1, width)
-    return np.concatenate([body.reshape(-1, wide)[:, :width] for body, wide in zip(bodies, heads["width"].tolist())])
+        return np.frombuffer(b"".join(bodies), np.uint8).reshape(-1, width)
+    wide = zip(bodies, heads["width"].tolist())
+    return np.concatenate([np.frombuffer(body, np.uint8).reshape(-1, n)[:, :width] for body, n in wide])

@@ -29,6 +29,11 @@ def unknown_photons(numbers: I64) -> npt.NDArray[np.float32]:
     return np.full(len(numbers), np.nan, np.float32)
 
 
+def _some(values: I64, where: npt.NDArray[np.bool_]) -> I64:
+    """Return `values` (n,) where `where` holds; no copy where that is everywhere."""
+    return values if where.all() else values[where]
+
+
 @dataclass(frozen=True, slots=True)
 class TallyFigures:
     """What decisions add up to; None where it is not known. Clicks and photons are per decision."""
@@ -90,12 +95,14 @@ class RunTally:
         self.known += int(decided.sum())
         self.right += int(well.sum())
         self._add_objects(numbers[decided > 0], decided[decided > 0], well[decided > 0])
-        cells, trials = truths * n_classes + labels, rows["shot"] if self.shots == 1 else rows["shot"] // self.shots
+        cells, trials = truths * n_classes + labels, rows["shot"].astype(np.int64)
+        if self.shots > 1:
+            trials //= self.shots
         told = known & (labels != NO_LABEL)
-        self.confusion += np.bincount(cells[told], minlength=n_classes**2).reshape(n_classes, n_classes)
+        self.confusion += np.bincount(_some(cells, told), minlength=n_classes**2).reshape(n_classes, n_classes)
         while trials.max() >= len(self._trials):  # twice as long each time; a visit has at most 2^24 exposures
             self._trials = np.concatenate([self._trials, np.zeros_like(self._trials)])
-        self._trials[:, 0] += np.bincount(trials[known], minlength=len(self._trials))
+        self._trials[:, 0] += np.bincount(_some(trials, known), minlength=len(self._trials))
         self._trials[:, 1] += np.bincount(trials[right], minlength=len(self._trials))
 
     def _add_objects(self, numbers: I64, decided: I64, right: I64) -> None:
