@@ -40,10 +40,6 @@ if TYPE_CHECKING:
 I64 = npt.NDArray[np.int64]
 
 GATHERED_BYTES = 1 << 18
-OWN_BOOKS = {
-    MessageType.PONG,
-    MessageType.ACK,
-}  # what they say is no matter of what a call has brought: settled before it
 EAGER_NS = 200_000  # as link/reader.py: an answer that was asked for is waited for awake
 LEAST_NS = 100_000
 CALL_NS = 20_000_000  # a call returns at least so often: signals, the watchdog's heartbeat, other threads' wishes
@@ -135,9 +131,11 @@ class Receiver:
 
     def _goes_on(self, kernel: Kernel, ended: int, outputs: list[Output]) -> bool:
         """Do what has nothing to do with the blocks of the call that ended; return whether that was all there is to do."""
-        if ended == ring.ODD and kernel.odd_type in OWN_BOOKS and not kernel.control[ring.DRIVES]:
-            self._take_odd(kernel, outputs)
-            return True
+        if ended == ring.ODD:
+            kind, drives = kernel.odd_type, kernel.control[ring.DRIVES]  # where it drives, the kernel counts commands, too
+            if kind == MessageType.PONG or (kind == MessageType.ACK and not drives):
+                self._take_odd(kernel, outputs)
+                return True
         run, connection, block_ns = self._run, self._run.connection, int(kernel.control[ring.BLOCK_NS])
         if ended != ring.DUE or not run.lateness.ask_if_overdue(connection, block_ns, run.now_ns()):
             return False
