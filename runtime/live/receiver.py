@@ -132,8 +132,8 @@ class Receiver:
     def _goes_on(self, kernel: Kernel, ended: int, outputs: list[Output]) -> bool:
         """Do what has nothing to do with the blocks of the call that ended; return whether that was all there is to do."""
         if ended == ring.ODD:
-            kind, drives = kernel.odd_type, kernel.control[ring.DRIVES]  # where it drives, the kernel counts commands, too
-            if kind == MessageType.PONG or (kind == MessageType.ACK and not drives):
+            kind = kernel.odd_type
+            if kind == MessageType.PONG or (kind == MessageType.ACK and not kernel.control[ring.DRIVES]):
                 self._take_odd(kernel, outputs)
                 return True
         run, connection, block_ns = self._run, self._run.connection, int(kernel.control[ring.BLOCK_NS])
