@@ -148,10 +148,14 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class AutomatonOptions:
-    """What to train. `photons` or `clicks` is the budget of one decision, on average; 0 exposures or states stand for defaults."""
+    """What to train. `photons` or `clicks`, `illumination`, or one of each are the budget of one decision, on average.
+
+    0 exposures or states stand for defaults.
+    """
 
     photons: float | None = option(None, "photoelectrons per decision to aim for", range=BUDGET)
     clicks: float | None = option(None, "clicks per decision to aim for", range=BUDGET)
+    illumination: float | None = option(None, "photoelectrons to send per decision", range=LIGHT, metavar="L")
     exposures: int = option(
         0, "exposures per decision (default: by the budget)", range=Range(0, SLOTS_MAX, whole=True), metavar="T"
     )
@@ -162,7 +166,7 @@ class AutomatonOptions:
     batch: int = option(250, "objects per step", range=BATCH)
     grow_epochs: int = 2
     candidates: int = 6
-    first_price: float = 0.2  # nats per photoelectron of the first exposure, halved every `half` levels
+    first_price: float = 0.2  # nats per photoelectron detected of the first exposure, halved every `half` levels
     half: float = 6.0
     tune_epochs: int | None = None  # of grey patterns; None: 3, or 0 through optics, where they brought nothing
     epochs: int = option(6, "of the patterns as they are displayed", range=EPOCHS)

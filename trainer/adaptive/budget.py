@@ -18,8 +18,14 @@ from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import AutomatonOptions, check_optics
 from pans.trainer.tasks.registry import Task
 
-PHOTONS_PER_CLICK = 1.85  # of a trained automaton, about; only to choose defaults for a budget of clicks
-# of an excess over the budget while growing: without it 56 levels through optics spent 31 of 12 photons
+from .machine import Aim, Spent
+from .tune import SENT, Price, Prices
+
+SENT_PER_PHOTON = 3.5  # of an automaton that is trained for light sent, about: 3.2 to 4.3 were measured
+# photoelectrons detected, about, for each that a budget counts: only to choose defaults and the first price
+DETECTED_PER = {"photons": 1.0, "clicks": 1.85, SENT: 1 / SENT_PER_PHOTON}
+# of an excess over the budget while growing: without it 56 levels through optics spent 31 of 12 photons, and 48 held to light sent 461 of
+# 305 units
 DEARER_POWER, DEARER_MAX = 2.0, 100.0
 PRICE_AT_10 = 0.02  # nats per photoelectron at which training spends about 10 of them on the public sets
 PRICE_POWER = 1.6  # how the price falls with the budget
@@ -31,11 +37,30 @@ COPIES_OF = {"mnist": 20}
 SOFT_OF = {"fashion-mnist": 0.5}
 
 
+def budgets_of(options: AutomatonOptions) -> dict[str, float]:
+    """Return the budgets that were given: fields of `Spent`."""
+    return {kind: budget for kind in Spent._fields if (budget := getattr(options, kind)) is not None}
+
+
 def photons_wanted(options: AutomatonOptions) -> float:
-    """Return the budget in photoelectrons, about, whether it was given in photons or clicks."""
-    if options.photons is not None:
-        return options.photons
-    return DEFAULT_PHOTONS if options.clicks is None else PHOTONS_PER_CLICK * options.clicks
+    """Return the budget in photoelectrons detected, about, however it was given; of two the smaller one."""
+    return min((budget * DETECTED_PER[kind] for kind, budget in budgets_of(options).items()), default=DEFAULT_PHOTONS)
+
+
+def first_prices(options: AutomatonOptions) -> Prices:
+    """Return the prices at which training spends about the budgets of `options`; each of two begins with half of it."""
+    budgets = budgets_of(options)
+    return Prices(
+        [
+            Price(kind, price_of(budget * DETECTED_PER[kind]) * _share(kind, len(budgets)), budget)
+            for kind, budget in budgets.items()
+        ]
+    )
+
+
+def _share(kind: str, budgets: int) -> float:
+    """Which part of the price of a photoelectron detected one of this kind costs, where there are so many budgets."""
+    return 1.0 / (budgets * (SENT_PER_PHOTON if kind == SENT else 1.0))
 
 
 def states_at_most(exposures: int, states: int, outcomes: int = 2) -> int:
@@ -69,15 +94,21 @@ def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int
     return exposures, states
 
 
-def price_at(options: AutomatonOptions, level: int, excess: float = 0.0) -> float:
-    """Return the price of light in a level that grows: dear at first, when every photon is spent on all objects.
+def aim_at(options: AutomatonOptions, level: int, levels: int, spent: Spent) -> Aim:
+    """Return the prices of light in one of `levels` that grow: dear at first, when every photon is spent on all objects.
 
-    Through optics it is dearer where more was spent than the share of the levels so far: `excess` times as much. A level of several
-    channels counts as so many: else half of the budget was left when two had grown, and tuning overshot it.
+    `spent` is what the levels before it took. Light sent, and all light through optics, is dearer where more was spent than their share
+    of the budget. A level of several channels counts as so many: else half of the budget was left when two had grown, and tuning
+    overshot it.
     """
-    last = GROWN_PRICE * price_of(photons_wanted(options))
-    price = last + (max(last, options.first_price) - last) * 0.5 ** (level * options.channels / options.half)
-    return price if options.optics is None else price * min(DEARER_MAX, max(1.0, excess**DEARER_POWER))
+    prices, part = first_prices(options), level / levels
+    for price in prices.all:
+        last = GROWN_PRICE * price.value
+        first = max(last, options.first_price * _share(price.kind, len(prices.all)))
+        excess = price.excess(spent, part) if price.kind == SENT or options.optics is not None else 0.0
+        price.value = last + (first - last) * 0.5 ** (level * options.channels / options.half)
+        price.value *= min(DEARER_MAX, max(1.0, excess**DEARER_POWER))
+    return prices.aim()
 
 
 def for_task(options: AutomatonOptions, task: str) -> AutomatonOptions:
@@ -135,9 +166,14 @@ def started_from(
 def check_automaton_options(options: AutomatonOptions, task: Task, profile: Profile) -> None:
     """Raise UsageError or PlanError for what cannot be trained for this task on this profile."""
     check_ranges(options)
-    if (options.photons is None) == (options.clicks is None):
+    if options.photons is not None and options.clicks is not None:
         raise UsageError(
-            "an automaton is trained for one budget, --photons or --clicks", remedy="give exactly one of them"
+            "an automaton is trained for --photons or --clicks, not for both", remedy="leave one of them out"
+        )
+    if not budgets_of(options):
+        raise UsageError(
+            "an automaton is trained for a budget of light",
+            remedy="give --photons or --clicks, --illumination, or one of the first two with --illumination",
         )
     if options.optics is not None:
         check_optics(options.optics)

@@ -18,7 +18,7 @@ from pans.runtime.instrument.profile import Profile
 from .grow import sum_of
 from .machine import Bits, Machine, Sight, forward
 from .objects import Block
-from .tune import Price, figures
+from .tune import Prices, figures
 
 F64 = NDArray[np.float64]
 SMOOTHINGS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # pseudo-objects of every class
@@ -148,22 +148,19 @@ def to_grid(machine: Machine, grid: Grid) -> None:
 
 
 def meet_budget(
-    machine: Machine, price: Price, grid: Grid | None, sight: Callable[[], Sight], drawn: list[Block]
+    machine: Machine, prices: Prices, grid: Grid | None, sight: Callable[[], Sight], drawn: list[Block]
 ) -> None:
-    """Dim or brighten all patterns alike until the objects `drawn` take 99 % of the budget; a few percent at most.
+    """Dim or brighten all patterns alike until the objects `drawn` take 99 % of the budget, of two that of which they take more.
 
     They are drawn from those that were fitted. A large automaton learns a little of their light by heart: one of 72 exposures for MNIST
     took 4 % more of test images, small ones no more.
     """
-    if price.budget is None:
-        return
     bits = [level.light for level in machine.levels if isinstance(level.light, Bits)]
     exact = [light.log_light.clone() for light in bits]  # before it is rounded to whole steps, which raises the darkest
     for _ in range(DIMMINGS):
         if grid is not None:
             to_grid(machine, grid)
-        found = figures(machine, sight(), drawn)
-        wanted = UNDER_BUDGET * price.budget / (found.clicks if price.of_clicks else found.photons)
+        wanted = UNDER_BUDGET / prices.excess(figures(machine, sight(), drawn))
         if 0.995 <= wanted <= 1.0:
             return
         for light, before in zip(bits, exact):

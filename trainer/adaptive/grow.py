@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pans.trainer.options import AutomatonOptions
 
-from .machine import COUNT_FLOOR, Grey, Level, Machine, Sight, children
+from .machine import COUNT_FLOOR, Aim, Grey, Level, Machine, Sight, Spent, children, sent_by
 from .objects import Block
 from .outcomes import by_row, by_state, channels_of, clicks_of, mean_reading, readings, slope_of
 
@@ -49,18 +49,18 @@ class Growth:
         self.channels, self.clicks = channels_of(sight.law), clicks_of(sight.law)
         self.alphas = [torch.ones(1, len(block)) for block in blocks]
         self.levels: list[Level] = []
-        self.spent = 0.0, 0.0  # photons and clicks of an object so far
+        self.spent = Spent()  # on an object so far
         self.counts = self._class_counts()
 
     def _class_counts(self) -> Tensor:
         return sum_of(alpha @ block.one_hot.T for alpha, block in zip(self.alphas, self.blocks))
 
-    def grow(self, price: float) -> None:
-        """Add a level whose light costs `price` per photoelectron."""
-        roots = self._best_candidates(price).clamp(min=GLOW).sqrt()
+    def grow(self, aim: Aim) -> None:
+        """Add a level whose light has the prices of `aim`."""
+        roots = self._best_candidates(aim).clamp(min=GLOW).sqrt()
         light = Grey(roots, self.top)
         light.settle()
-        self._train(light, price)
+        self._train(light, aim)
         self._branch(light)
 
     def follow(self, levels: list[Level]) -> None:
@@ -78,7 +78,7 @@ class Growth:
 
     # ---- a level ----
 
-    def _best_candidates(self, price: float) -> Tensor:
+    def _best_candidates(self, aim: Aim) -> Tensor:
         tried = min(TRIED_BLOCKS, len(self.blocks))
         means, masses = self._class_means(tried)
         best = torch.full((len(masses),), torch.inf)
@@ -86,7 +86,7 @@ class Growth:
         chosen = torch.zeros(len(rows[0]), means.shape[2])
         for _ in range(self.options.candidates):
             patterns = self._candidate(*rows)
-            cost = self._cost_of(patterns, tried, price)
+            cost = self._cost_of(patterns, tried, aim)
             better = cost < best
             best[better] = cost[better]
             of_better = by_row(better, self.channels)
@@ -120,20 +120,21 @@ class Growth:
         low, high = limits
         return low + (high - low) * torch.rand(states, 1, generator=self.random)
 
-    def _cost_of(self, patterns: Tensor, tried: int, price: float) -> Tensor:
+    def _cost_of(self, patterns: Tensor, tried: int, aim: Aim) -> Tensor:
         """What every state's pattern leaves unknown of the class, and the price of its light, (states,)."""
         spent, whole = torch.zeros(len(self.counts)), torch.zeros_like(self.counts)
+        sent = aim.sent_price * by_state(patterns.sum(dim=1, keepdim=True), self.channels).squeeze(1)
         parts = [torch.zeros_like(whole) for _ in self.clicks[1:]]
         for alpha, block in zip(self.alphas[:tried], self.blocks[:tried]):
             light = self.sight.light(patterns, block.grey)
             for part, chance in zip(parts, readings(light, self.sight.law)[0]):
                 part += (alpha * chance) @ block.one_hot.T
             whole += alpha @ block.one_hot.T
-            spent += (alpha * by_state(light, self.channels)).sum(dim=1)
+            spent += aim.price * (alpha * by_state(light, self.channels)).sum(dim=1) + alpha.sum(dim=1) * sent
         unknown = sum_of(mass_entropy(part) for part in [*parts, remainder(whole, parts).clamp(min=0)])
-        return unknown + price * spent
+        return unknown + spent
 
-    def _train(self, light: Grey, price: float) -> None:
+    def _train(self, light: Grey, aim: Aim) -> None:
         """Adam on the children's expected cross-entropy under running class counts."""
         options = self.options
         optimiser = torch.optim.Adam([light.root], lr=RATE, fused=True)
@@ -150,8 +151,10 @@ class Growth:
                 chances, falls = readings(self.sight.light(mask, block.grey), self.sight.law)
                 arrived = [(alpha * chance) @ block.one_hot.T for chance in chances]
                 slope = slope_of(falls, _gains(parts, whole, block), self.sight.law)
-                slope.neg_().add_(price).mul_(by_row(alpha, self.channels)).mul_(1.0 / len(block))
-                light.set_gradients(self.sight.mask_slope(slope, block.grey, light), None)
+                slope.neg_().add_(aim.price).mul_(by_row(alpha, self.channels)).mul_(1.0 / len(block))
+                mask_slope = self.sight.mask_slope(slope, block.grey, light)
+                mask_slope += by_row(alpha.mean(dim=1, keepdim=True), self.channels) * aim.sent_price
+                light.set_gradients(mask_slope, None)
                 optimiser.param_groups[0]["lr"] = RATE * (1 - done / steps) + 1e-4
                 optimiser.step()
                 light.settle()
@@ -184,15 +187,16 @@ class Growth:
     def _carry(self, light: Grey, successors: Tensor, n_nodes: int) -> None:
         """Carry the probabilities of all objects over one level, and add up its light and clicks."""
         mask, _ = light.displayed()
-        photons = clicks = 0.0
+        sums = torch.zeros(3, dtype=torch.float64)
+        sent = by_state(sent_by(light), self.channels)
         for index, block in enumerate(self.blocks):
             alpha, brought = self.alphas[index], self.sight.light(mask, block.grey)
             chances, _ = readings(brought, self.sight.law)
-            photons += float((alpha * by_state(brought, self.channels)).sum())
-            clicks += float((alpha * mean_reading(chances, self.clicks)).sum())
+            each = mean_reading(chances, self.clicks), by_state(brought, self.channels), sent
+            sums += torch.stack([(alpha * one).sum() for one in each]).double()
             self.alphas[index] = children(alpha, chances, successors, n_nodes)
         n = sum(len(block) for block in self.blocks)
-        self.spent = self.spent[0] + photons / n, self.spent[1] + clicks / n
+        self.spent = Spent(*(torch.tensor(self.spent, dtype=torch.float64) + sums / n).tolist())
 
 
 def remainder(whole: Tensor, parts: list[Tensor]) -> Tensor:

@@ -8,8 +8,10 @@ Tensors stand as (states, objects): rows are moved whole along the edges. For a 
 of no click and beta the expected loss from there on:
 
     alpha'(n) = sum over the edges (s, k) into n of alpha(s) q_k(s)
-    beta(s) = sum_k q_k(s) beta'(successor_k(s)) + price * light(s)
+    beta(s) = sum_k q_k(s) beta'(successor_k(s)) + price * light(s) + sent_price * sent(s)
     d loss / d light(s) = alpha(s) * (sum_k q_k'(s) beta'(successor_k(s)) + price)
+
+light(s) is what the object lets through and the detector finds; sent(s), the sum of what is shown, has no object in it.
 
 The logarithm of a leaf's posterior is its loss; the class counts behind it are running means, whose own gradient vanishes at the
 optimum (envelope theorem). A loss that counts wrong decisions has a gradient too: the probability of the leaves changes.
@@ -22,7 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -287,12 +289,13 @@ class Sight:
 class Step:
     """One level of a pass: probability of the states, light by rows, chances of all outcomes but the last, and how fast these fall.
 
-    `whole` is the light of a state, all its channels together.
+    `whole` is the light of a state, all its channels together, and `sent` (states, 1) what it would be of a clear object.
     """
 
     alpha: Tensor
     light: Tensor
     whole: Tensor
+    sent: Tensor
     chances: tuple[Tensor, ...]
     falls: tuple[Tensor, ...]
 
@@ -312,6 +315,10 @@ class Pass:
         """Return the expected photoelectrons of every object."""
         return torch.stack([(step.alpha * step.whole).sum(dim=0) for step in self.steps]).sum(dim=0)
 
+    def illumination(self) -> Tensor:
+        """Return the expected light sent to every object, in photoelectrons of a clear one."""
+        return torch.stack([(step.alpha * step.sent).sum(dim=0) for step in self.steps]).sum(dim=0)
+
     def clicks(self) -> Tensor:
         """Return the expected clicks of every object: photons counted, where they are."""
         counted = [(step.alpha * mean_reading(step.chances, self.numbers)).sum(dim=0) for step in self.steps]
@@ -323,6 +330,13 @@ def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
     mask, scale = light.displayed()
     result = sight.light(mask, grey, light.full(mask) if sight.dark_pixels else None)
     return result if scale is None else result.mul_(scale)
+
+
+def sent_by(light: Light) -> Tensor:
+    """Return the light that the patterns of `light` send, (rows, 1)."""
+    mask, scale = light.displayed()
+    sent = mask.sum(dim=1, keepdim=True)
+    return sent if scale is None else sent * scale
 
 
 def children(alpha: Tensor, chances: tuple[Tensor, ...], successors: Tensor, n_nodes: int) -> Tensor:
@@ -354,7 +368,8 @@ def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
         chances, falls = readings(light, sight.law)
         if memory is not None:
             chances, falls = memory.step(alpha, chances, falls, level.successors, machine.n_nodes(number))
-        result.steps.append(Step(alpha, light, by_state(light, channels), chances, falls))
+        whole, sent = by_state(light, channels), by_state(sent_by(level.light), channels)
+        result.steps.append(Step(alpha, light, whole, sent, chances, falls))
         nodes = children(alpha, chances, level.successors, machine.n_nodes(number))
     result.leaves.append(nodes)
     return result
@@ -365,16 +380,25 @@ def leaf_losses(counts: Tensor, one_hot: Tensor) -> Tensor:
     return -torch.log(counts / counts.sum(dim=1, keepdim=True)) @ one_hot
 
 
+class Spent(NamedTuple):
+    """What a decision takes: clicks or photons counted, photoelectrons detected, and photoelectrons sent, those of a clear object."""
+
+    clicks: float = 0.0
+    photons: float = 0.0
+    illumination: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """What training makes small, the mean of loss + price * photons + exposure_price * exposures.
+    """What training makes small, the mean of loss + price * photons + sent_price * illumination + exposure_price * exposures.
 
-    Prices are in nats, of a photoelectron and of an exposure (saved where a walk ends early). Of the loss `decide` is the part that
-    counts wrong decisions, `WRONG` nats each; the rest is the log loss. `spread` times the mean over exposures of how concentrated
-    the light is (model/encoders.py) is added.
+    Prices are in nats, of a photoelectron detected or sent, and of an exposure (saved where a walk ends early). `decide` is the part of the
+    loss that counts wrong decisions, `WRONG` nats each; the rest is the log loss. `spread` times the mean over exposures of how
+    concentrated the light is (model/encoders.py) is added.
     """
 
     price: float
+    sent_price: float = 0.0
     exposure_price: float = 0.0
     decide: float = 0.0
     spread: float = 0.0
@@ -404,6 +428,11 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         mask_slope = sight.mask_slope(slope, grey, level.light)
         scale = level.light.scale()
         light_slope = None if scale is None else slope.mul_(step.light).sum(dim=1, keepdim=True)
+        if aim.sent_price:
+            cost = by_row(step.alpha.sum(dim=1, keepdim=True), channels).to(slope.dtype).mul_(share * aim.sent_price)
+            mask_slope += cost
+            if light_slope is not None:
+                light_slope += cost * sent_by(level.light)
         mask_slope = mask_slope if scale is None else mask_slope.mul_(scale)
         if aim.spread:
             mass = step.alpha.sum(dim=1, keepdim=True).mul_(aim.spread * share / len(machine.levels))
@@ -413,8 +442,7 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         for chance, gain in zip(step.chances[1:], gains[1:]):
             beta.addcmul_(chance, gain)
         beta.add_(after_last).add_(step.whole, alpha=aim.price)
-        if aim.exposure_price:
-            beta += aim.exposure_price
+        beta += aim.exposure_price + aim.sent_price * step.sent
         if number and len(machine.counts[number - 1]):
             beta = torch.cat([beta, aim.at_leaves(machine.counts[number - 1], one_hot)])
 

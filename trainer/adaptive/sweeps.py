@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .grow import sum_of
-from .machine import BRIGHTNESS_MIN, COUNT_FLOOR, Bits, Grey, Light, Machine, Sight, forward, leaf_losses
+from .machine import BRIGHTNESS_MIN, COUNT_FLOOR, Aim, Bits, Grey, Light, Machine, Sight, forward, leaf_losses, sent_by
 from .objects import Block
 from .outcomes import by_state, channels_of, readings
 
@@ -59,17 +59,17 @@ class Sweep:
         costs, arrived, squares = (sum_of(part).unflatten(0, by_outcome) for part in zip(*parts))
         return costs, arrived, LOSS_SPREAD * squares.sqrt()
 
-    def step_back(self, number: int, price: float, exposure_price: float) -> None:
+    def step_back(self, number: int, aim: Aim) -> None:
         """Replace the expected losses behind level `number` by those before it, under its present successors."""
-        level = self.machine.levels[number]
+        level, channels = self.machine.levels[number], channels_of(self.sight.law)
+        fixed = aim.exposure_price + aim.sent_price * by_state(sent_by(level.light), channels)
         for index, (kept, block) in enumerate(zip(self.kept, self.blocks)):
             light = kept[number][1].float()
             beta = self.betas[index]
             before = after = beta[level.successors[-1]]
             for chance, outcome in zip(readings(light, self.sight.law)[0], level.successors):
                 before = before + chance * (beta[outcome] - after)
-            before = before + price * by_state(light, channels_of(self.sight.law))
-            before += exposure_price
+            before = before + aim.price * by_state(light, channels) + fixed
             if number and len(self.machine.counts[number - 1]):
                 before = torch.cat([before, leaf_losses(self.machine.counts[number - 1], block.one_hot)])
             self.betas[index] = before
@@ -84,10 +84,10 @@ class Sweep:
         return torch.cat([*parts, rest])
 
 
-def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, exposure_price: float = 0.0) -> int:
-    """Move the edges of `machine` to better nodes, by the objects in `blocks`, and return how many; `price` is that of a photoelectron.
+def reroute(machine: Machine, sight: Sight, blocks: list[Block], aim: Aim) -> int:
+    """Move the edges of `machine` to better nodes, by the objects in `blocks` and the prices of `aim`, and return how many.
 
-    With an `exposure_price` an edge may end the walk: it goes to a new leaf where to decide at once costs less than what follows.
+    Where an exposure has a price, an edge may end the walk: it goes to a new leaf where to decide at once costs less than what follows.
     """
     with torch.no_grad():
         sweep = Sweep(machine, sight, blocks)
@@ -100,10 +100,10 @@ def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, e
             better = least < now - SURE * error
             level.successors = torch.where(better, best, level.successors)
             moved += int(better.sum())
-            if exposure_price and number + 1 < len(machine.levels):
+            if aim.exposure_price and number + 1 < len(machine.levels):
                 moved += _stop(sweep, number, torch.minimum(now, least), arrived, error)
             _revive(sweep, number, arrived)
-            sweep.step_back(number, price, exposure_price)
+            sweep.step_back(number, aim)
     return moved
 
 
@@ -277,12 +277,10 @@ class _Pool:
     factors: Tensor
 
 
-def choose_patterns(
-    machine: Machine, sight: Sight, blocks: list[Block], price: float, exposure_price: float = 0.0
-) -> int:
+def choose_patterns(machine: Machine, sight: Sight, blocks: list[Block], aim: Aim) -> int:
     """Let every state show the pattern of the pool, and have the brightness, that cost the objects in `blocks` least.
 
-    Returns how many states changed. `price` is that of a photoelectron. From the last level to the first, so that the expected cost
+    Returns how many states changed. Light has the prices of `aim`. From the last level to the first, so that the expected cost
     falls with every change. Only the first of the blocks are taken where all are too many for memory. Patterns that nothing shows
     afterwards become copies of those that are shown most, and take half of their states.
     """
@@ -298,8 +296,8 @@ def choose_patterns(
         for number in range(len(lights) - 1, -1, -1):
             alphas = torch.cat([kept[number][0] for kept in sweep.kept], dim=1).float()
             reached.append(alphas.sum(dim=1))
-            changed += _choose(pooled[number], number, sweep, alphas, pool, price)
-            sweep.step_back(number, price, exposure_price)
+            changed += _choose(pooled[number], number, sweep, alphas, pool, aim)
+            sweep.step_back(number, aim)
         _use_all(pooled, reached[::-1])
     return changed
 
@@ -324,13 +322,13 @@ def nearest(vectors: Tensor, count: int) -> Tensor:
     return torch.cat(found)
 
 
-def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool, price: float) -> int:
+def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool, aim: Aim) -> int:
     """Choose for all states of one level, reached with `alphas` (states, objects); returns how many changed."""
     assert light.rows is not None
     to = sweep.machine.levels[number].successors
     rest = [beta[to[-1]] for beta in sweep.betas]  # below: what each other outcome costs more than the last
     gains = [torch.cat([beta[one] - last for beta, last in zip(sweep.betas, rest)], dim=1) for one in to[:-1]]
-    glare = max(GLARE * price, GLARE_MIN)
+    glare = aim.sent_price + max(GLARE * aim.price, GLARE_MIN)
     changed, before = 0, light.scale().flatten().clone()
     for state in range(len(light.rows)):
         some = (alphas[state] > HARDLY).nonzero().flatten()
@@ -347,7 +345,7 @@ def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool,
         sent = glare * pool.lit[candidates].unsqueeze(1) * bright * alpha.sum()
         chances, _ = readings(lights, sweep.sight.law)
         expected = sum_of(chance @ (alpha * gain[state, some]) for chance, gain in zip(chances, gains))
-        costs = expected + price * (lights @ alpha) + sent
+        costs = expected + aim.price * (lights @ alpha) + sent
         best = int(costs.argmin())
         if costs.flatten()[best] < costs[0, len(pool.factors) // 2] - SURE_OF_PATTERN * alpha.sum():
             light.rows[state] = candidates[best // len(pool.factors)]

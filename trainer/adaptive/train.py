@@ -30,22 +30,34 @@ from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
 from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write_targets
 
 from .budget import (
+    aim_at,
     check_automaton_options,
+    first_prices,
     for_task,
     patterns_at_most,
-    photons_wanted,
-    price_at,
-    price_of,
     tune_epochs_of,
     with_defaults,
 )
 from .finish import Finished, Posteriors, bit_grid, calibrated, finished, meet_budget, node_counts, set_top, to_grid
 from .grow import Growth
-from .machine import COUNT_FLOOR, Bits, Grey, Machine, Sight, as_bits, forward, machine_from, machine_of, machine_state
+from .machine import (
+    COUNT_FLOOR,
+    Aim,
+    Bits,
+    Grey,
+    Machine,
+    Sight,
+    Spent,
+    as_bits,
+    forward,
+    machine_from,
+    machine_of,
+    machine_state,
+)
 from .objects import Block, TrainingObjects
 from .outcomes import by_row, law_of
 from .sweeps import choose_patterns, reroute, share_patterns
-from .tune import Figures, Price, Progress, Tuning, figures, masses, mean_objects
+from .tune import Figures, Progress, Tuning, figures, masses, mean_objects
 
 KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
 REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reached
@@ -62,7 +74,7 @@ FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch rep
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainedAutomaton:
-    """The arrays of a bundle, and figures of the held-back objects; `price` is nats per photoelectron in the end."""
+    """The arrays of a bundle, and figures of the held-back objects; `prices` are nats per photoelectron detected and sent in the end."""
 
     arrays: Finished
     machine: Machine
@@ -70,7 +82,7 @@ class TrainedAutomaton:
     sight: Sight
     grey: Callable[[Objects], torch.Tensor]  # grey values as the machine takes them, float64 (objects, pixels)
     held_back: Figures
-    price: float
+    prices: tuple[float, float]
     options: AutomatonOptions
 
     def chances(self, objects: Objects) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -140,8 +152,7 @@ class _Run:
         self.exposures, self.states = with_defaults(options, profile)
         self.stage, self.epoch = "grow", 0
         self.machine = Machine([], [])
-        budget = options.photons if options.clicks is None else options.clicks
-        self.price = Price(price_of(photons_wanted(options)), budget, options.clicks is not None)
+        self.prices = first_prices(options)
         self.tuning: Tuning | None = None
         self.saved_tuning: dict[str, Any] | None = None
         self.products = product_dtype()
@@ -151,6 +162,9 @@ class _Run:
     def steps(self) -> int:
         """Levels to grow and epochs to tune."""
         return self.exposures + tune_epochs_of(self.options) + self.options.epochs
+
+    def _prices(self) -> tuple[float, float]:
+        return self.prices.detected, self.prices.sent
 
     # ---- the instrument ----
 
@@ -190,10 +204,10 @@ class _Run:
         if self.answers is None and file is not None and file.exists():
             self.answers = read_targets(file, taught, self.objects.n_classes)
         if self.answers is None:
-            epochs, price = self.options.teacher_epochs, self.price.value
+            epochs, prices = self.options.teacher_epochs, self._prices()
 
             def report(epoch: int, loss: float) -> None:
-                self.report(Progress(NETWORK, epoch + 1, epochs, loss, math.nan, 0.0, 0.0, price))
+                self.report(Progress(NETWORK, epoch + 1, epochs, loss, math.nan, *Spent(), *prices))
 
             self.answers = soft_targets(self.objects.fitted, self.objects.n_classes, epochs, report)
             if file is not None:
@@ -211,23 +225,20 @@ class _Run:
             growth = Growth(blocks, sight, random, self.options, self.states, self._highest_top())
             growth.follow(self.machine.levels)
             while len(growth.levels) < self.exposures:
-                level = len(growth.levels)
-                excess = self.price.excess(growth.spent, level / self.exposures)
-                growth.grow(price_at(self.options, level, excess))
+                aim = aim_at(self.options, len(growth.levels), self.exposures, growth.spent)
+                growth.grow(aim)
                 self.machine = growth.machine()
-                self.report(self._grown(growth))
+                self.report(self._grown(growth, aim))
                 if len(growth.levels) % KEPT_EVERY == 0:
                     keep()
         self.stage, self.epoch = "grey", 0
 
-    def _grown(self, growth: Growth) -> Progress:
-        photons, clicks = growth.spent
+    def _grown(self, growth: Growth, aim: Aim) -> Progress:
         counts = growth.counts
         known, n = counts / counts.sum(dim=1, keepdim=True).clamp(min=1e-9), float(counts.sum())
         loss = -float(torch.special.xlogy(counts, known).sum()) / n
-        price = price_at(self.options, len(growth.levels) - 1)
         right = float(counts.amax(dim=1).sum()) / n
-        return Progress("grow", len(growth.levels), self.steps, loss, right, clicks, photons, price)
+        return Progress("grow", len(growth.levels), self.steps, loss, right, *growth.spent, aim.price, aim.sent_price)
 
     def _some_blocks(self) -> list[Block]:
         """Some of the objects, by which it is judged how often a state is reached."""
@@ -280,7 +291,7 @@ class _Run:
             for _ in range(CHOICES):
                 self._choose_patterns()
             # the price would else rise for a whole epoch until the brightness has followed it
-            meet_budget(self.machine, self.price, None, self.sight, self._drawn())
+            meet_budget(self.machine, self.prices, None, self.sight, self._drawn())
 
     def tune(self, stage: str, epochs: int, rate: float, keep: Callable[[], None]) -> None:
         """Train all levels together for the rest of a stage's epochs."""
@@ -289,7 +300,7 @@ class _Run:
         size = self.options.batch
         steps = max(1, epochs * -(-self.objects.n_fit // size))
         if self.tuning is None:
-            self.tuning = Tuning(self.machine, self.sight(self.products), self.price, rate, steps)
+            self.tuning = Tuning(self.machine, self.sight(self.products), self.prices, rate, steps)
             self.tuning.exposure_price, self.tuning.spread = self.options.exposure_price, self.options.spread
             if self.saved_tuning is not None:
                 self.tuning.restore(self.saved_tuning)
@@ -301,14 +312,14 @@ class _Run:
             self.tuning.decide = self.options.decide if stage == "shown" and self.epoch else 0.0
             if stage == "shown" and 1 <= self.epoch <= min(self.options.reroutes, epochs - 2):
                 sight, blocks = self.tuning.sight, self._sweep_blocks()
-                reroute(self.machine, sight, blocks, self.price.value, self.options.exposure_price)
+                reroute(self.machine, sight, blocks, self.prices.aim(self.options.exposure_price))
             if stage == "shown" and 1 <= self.epoch <= epochs - 2:
                 self._choose_patterns()
             blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
             means = self.tuning.epoch(blocks)
             self.epoch += 1
             before = self.exposures + (tune_epochs_of(self.options) if stage == "shown" else 0)
-            self.report(Progress(stage, before + self.epoch, self.steps, *means, self.price.value))
+            self.report(Progress(stage, before + self.epoch, self.steps, *means, *self._prices()))
             keep()
 
     def _choose_top(self) -> None:
@@ -334,7 +345,7 @@ class _Run:
         if isinstance(light, Bits) and light.rows is not None:
             sight = self.sight(self.products)
             blocks = self._sweep_blocks()[:CHOICE_BLOCKS]
-            choose_patterns(self.machine, sight, blocks, self.price.value, self.options.exposure_price)
+            choose_patterns(self.machine, sight, blocks, self.prices.aim(self.options.exposure_price))
 
     # ---- the end ----
 
@@ -342,7 +353,7 @@ class _Run:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
         grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
-        meet_budget(self.machine, self.price, grid, self.sight, self._drawn())
+        meet_budget(self.machine, self.prices, grid, self.sight, self._drawn())
         if grid is not None:
             to_grid(self.machine, grid)
         sight = self.sight()
@@ -350,7 +361,7 @@ class _Run:
         measured = figures(self.machine, sight, held_back)
         arrays = finished(self.machine, posteriors, self.profile, grid)
         return TrainedAutomaton(
-            arrays, self.machine, posteriors, sight, self.objects.wide, measured, self.price.value, self.options
+            arrays, self.machine, posteriors, sight, self.objects.wide, measured, self._prices(), self.options
         )
 
     def _drawn(self) -> list[Block]:
@@ -372,7 +383,7 @@ class _Run:
         return {
             "stage": self.stage,
             "epoch": self.epoch,
-            "price": self.price.value,
+            "prices": [price.value for price in self.prices.all],
             "machine": machine_state(self.machine),
             "tuning": None if self.tuning is None else self.tuning.state(),
             "answers": None if self.answers is None else torch.from_numpy(self.answers),
@@ -380,7 +391,9 @@ class _Run:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from `state`."""
-        self.stage, self.epoch, self.price.value = state["stage"], state["epoch"], state["price"]
+        self.stage, self.epoch = state["stage"], state["epoch"]
+        for price, value in zip(self.prices.all, state["prices"]):
+            price.value = value
         self.machine = machine_from(state["machine"])
         self.saved_tuning = state["tuning"]
         self.answers = None if state["answers"] is None else state["answers"].numpy()

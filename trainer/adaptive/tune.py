@@ -13,12 +13,12 @@ from typing import Any
 import torch
 
 from .grow import sum_of
-from .machine import COUNT_FLOOR, Aim, Machine, Sight, backward, forward
+from .machine import COUNT_FLOOR, Aim, Machine, Sight, Spent, backward, forward
 from .objects import Block
-from .outcomes import by_state, channels_of
 
 COUNT_SHARE = 0.02  # of a step in the running class counts
 PRICE_MIN, PRICE_MAX = 1e-6, 10.0
+SENT = "illumination"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,9 @@ class Progress:
     accuracy: float
     clicks: float
     photons: float
-    price: float
+    illumination: float
+    price: float  # nats per photoelectron detected
+    sent_price: float  # and sent
 
 
 def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:
@@ -52,11 +54,6 @@ def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:
     sums, n = torch.zeros(6, dtype=torch.float64), sum(len(block) for block in blocks)
     with torch.no_grad():
         posteriors = [counts / counts.sum(dim=1, keepdim=True) for counts in machine.counts]
-        whole = []
-        for level in machine.levels:
-            mask, scale = level.light.displayed()
-            shown = mask.sum(dim=1, keepdim=True) if scale is None else mask.sum(dim=1, keepdim=True) * scale
-            whole.append(by_state(shown, channels_of(sight.law)).squeeze(1))
         for block in blocks:
             passed = forward(machine, sight, block.grey)
             loss = right = 0.0
@@ -66,10 +63,9 @@ def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:
                 arrived = (leaves @ block.one_hot.T).double()
                 loss -= float((arrived * posterior.double().log()).sum())
                 right += float(arrived.gather(1, posterior.argmax(dim=1, keepdim=True)).sum())
-            illumination = sum(float(step.alpha.sum(dim=1) @ light) for step, light in zip(passed.steps, whole))
             exposures = sum(float(step.alpha.sum()) for step in passed.steps)
             sums += torch.tensor(
-                [loss, right, passed.clicks().sum(), passed.photons().sum(), illumination, exposures],
+                [loss, right, passed.clicks().sum(), passed.photons().sum(), passed.illumination().sum(), exposures],
                 dtype=torch.float64,
             )
     return Figures(*(sums / n).tolist())
@@ -94,42 +90,71 @@ def mean_objects(machine: Machine, sight: Sight, blocks: list[Block]) -> Iterato
 
 @dataclass(slots=True)
 class Price:
-    """Price of a photoelectron, in nats; with a `budget` it follows what is spent: photons, or clicks where `of_clicks`."""
+    """Price of a photoelectron, in nats; it follows what is spent of a `budget` of `kind`: a field of `Spent`."""
 
+    kind: str
     value: float
-    budget: float | None = None
-    of_clicks: bool = False
+    budget: float
     rate: float = 0.05  # of the logarithm, per step and relative excess
     most: float = 0.02  # change of the logarithm in one step
 
-    def excess(self, spent: tuple[float, float], part: float) -> float:
-        """Return how many times that `part` of the budget was spent, of (photons, clicks); 0 where there is no budget or part."""
-        return spent[self.of_clicks] / (self.budget * part) if self.budget and part else 0.0
+    def excess(self, spent: Spent | Figures, part: float = 1.0) -> float:
+        """Return how many times that `part` of the budget was spent."""
+        return float(getattr(spent, self.kind)) / (self.budget * part) if part else 0.0
 
-    def follow(self, spent: float) -> None:
+    def follow(self, spent: Spent) -> None:
         """Raise the price where more was spent than the budget allows, else lower it."""
-        if self.budget is not None:
-            change = self.rate * (spent / self.budget - 1)
-            wanted = self.value * math.exp(min(self.most, max(-self.most, change)))
-            self.value = min(PRICE_MAX, max(PRICE_MIN, wanted))
+        change = self.rate * (self.excess(spent) - 1)
+        wanted = self.value * math.exp(min(self.most, max(-self.most, change)))
+        self.value = min(PRICE_MAX, max(PRICE_MIN, wanted))
+
+
+@dataclass(slots=True)
+class Prices:
+    """The prices of one training, of each budget one: of light detected (photons or clicks), of light sent, or of both."""
+
+    all: list[Price]
+
+    @property
+    def detected(self) -> float:
+        """Nats per photoelectron detected."""
+        return sum(price.value for price in self.all if price.kind != SENT)
+
+    @property
+    def sent(self) -> float:
+        """Nats per photoelectron sent."""
+        return sum(price.value for price in self.all if price.kind == SENT)
+
+    def aim(self, exposure_price: float = 0.0, decide: float = 0.0, spread: float = 0.0) -> Aim:
+        """Return what training makes small at these prices; see Aim."""
+        return Aim(self.detected, self.sent, exposure_price, decide, spread)
+
+    def excess(self, spent: Spent | Figures) -> float:
+        """Return how many times the budget was spent, the one of which most was."""
+        return max(price.excess(spent) for price in self.all)
+
+    def follow(self, spent: Spent) -> None:
+        """Let each price follow its budget."""
+        for price in self.all:
+            price.follow(spent)
 
 
 class Tuning:
     """A machine and its optimiser; `epoch` passes once over blocks of objects. The rate falls to 0 over `steps` steps."""
 
-    def __init__(self, machine: Machine, sight: Sight, price: Price, rate: float, steps: int) -> None:
-        self.machine, self.sight, self.price, self.rate, self.steps = machine, sight, price, rate, steps
+    def __init__(self, machine: Machine, sight: Sight, prices: Prices, rate: float, steps: int) -> None:
+        self.machine, self.sight, self.prices, self.rate, self.steps = machine, sight, prices, rate, steps
         self.exposure_price = self.decide = self.spread = 0.0  # see Aim; they may change from epoch to epoch
         self.done = 0
         self.optimiser = torch.optim.Adam(machine.parameters(), lr=rate, fused=True)
 
-    def epoch(self, blocks: list[Block]) -> tuple[float, float, float, float]:
-        """Pass over `blocks` once; return the means over their objects of loss, accuracy, clicks and photons."""
-        sums, n = torch.zeros(4, dtype=torch.float64), sum(len(block) for block in blocks)
+    def epoch(self, blocks: list[Block]) -> tuple[float, float, float, float, float]:
+        """Pass over `blocks` once; return the means over their objects of loss, accuracy and the fields of `Spent`."""
+        sums, n = torch.zeros(5, dtype=torch.float64), sum(len(block) for block in blocks)
         for block in blocks:
             sums += self.step(block, n)
-        loss, accuracy, clicks, photons = (sums / n).tolist()
-        return loss, accuracy, clicks, photons
+        loss, accuracy, clicks, photons, illumination = (sums / n).tolist()
+        return loss, accuracy, clicks, photons, illumination
 
     def state(self) -> dict[str, Any]:
         """Return what `restore` needs to continue."""
@@ -141,11 +166,11 @@ class Tuning:
         self.done = state["done"]
 
     def step(self, block: Block, n: int) -> torch.Tensor:
-        """One step of Adam; returns the sums over the block: loss, right decisions, clicks, photons."""
+        """One step of Adam; returns the sums over the block: loss, right decisions, what is spent."""
         machine = self.machine
         with torch.no_grad():
             passed = forward(machine, self.sight, block.grey)
-            aim = Aim(self.price.value, self.exposure_price, self.decide, self.spread)
+            aim = self.prices.aim(self.exposure_price, self.decide, self.spread)
             backward(machine, self.sight, block.grey, block.one_hot, passed, aim)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.rate * max(0.0, 1 - self.done / self.steps) + 1e-5
@@ -164,6 +189,6 @@ class Tuning:
                 counts.mul_(1 - COUNT_SHARE).add_(arrived, alpha=COUNT_SHARE * n / len(block)).add_(
                     COUNT_SHARE * COUNT_FLOOR
                 )
-            clicks, photons = float(passed.clicks().sum()), float(passed.photons().sum())
-            self.price.follow((clicks if self.price.of_clicks else photons) / len(block))
-        return torch.tensor([loss, right, clicks, photons], dtype=torch.float64)
+            spent = [float(each.sum()) for each in (passed.clicks(), passed.photons(), passed.illumination())]
+            self.prices.follow(Spent(*(each / len(block) for each in spent)))
+        return torch.tensor([loss, right, *spent], dtype=torch.float64)

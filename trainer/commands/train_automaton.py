@@ -60,7 +60,7 @@ class AutomatonTraining:
             if step.stage != "network":
                 words = (
                     f"{step.stage} {step.done}/{step.steps}: loss {step.loss:.3f}, accuracy {100 * step.accuracy:.1f} %, "
-                    f"{step.clicks:.2f} clicks, {step.photons:.2f} photons"
+                    f"{step.clicks:.2f} clicks, {step.photons:.2f} photons, illumination {step.illumination:.1f}"
                 )
             show(words, 100 * step.accuracy, step.done, step.steps, step.stage != "grow" or step.done % 8 == 0)
 
@@ -95,7 +95,8 @@ class AutomatonTraining:
             "states": automaton.n_states,
             "patterns": bundle.n_patterns,
             "exposures": automaton.n_slots,
-            "price": trained.price,
+            "price": trained.prices[0],
+            "sent_price": trained.prices[1],
             "budget_off": off,
         }
         lines = [
@@ -113,11 +114,15 @@ class AutomatonTraining:
 def budget_off(options: AutomatonOptions, found: MeasuredWalks) -> tuple[float, list[str]]:
     """Return by which part of the budget the held-out objects get more light or clicks (negative for less), and a line where it is missed.
 
-    The price was found on training objects, and dwell times have steps.
+    The price was found on training objects, and dwell times have steps. Of two budgets it is the one of which more was spent: the other
+    need not be used up.
     """
-    name = "clicks" if options.photons is None else "photons"
-    wanted, got = getattr(options, name), getattr(found, f"{name}_mean")
-    off = got / wanted - 1
+    spent = {"photons": found.photons_mean, "clicks": found.clicks_mean, "illumination": found.illumination}
+    off, name, wanted = max(
+        (got / wanted - 1, name, wanted)
+        for name, got in spent.items()
+        if (wanted := getattr(options, name)) is not None
+    )
     again = f"--{name} {wanted / (1 + off):.4g}" if off > -1 else f"a larger --{name}"
-    words = f"budget missed by {off:+.1%}: {got:.3g} {name} on all held-out objects, asked for {wanted:g}; "
+    words = f"budget missed by {off:+.1%}: {name} {spent[name]:.3g} on all held-out objects, asked for {wanted:g}; "
     return off, [f"{words}to come closer, train with {again}"] if abs(off) > BUDGET_TOLERANCE else []

@@ -34,7 +34,12 @@ TRAINING_OBJECTS = 5000  # by which the accuracy on training objects is judged: 
 FIRST = 200
 STEPS_SHOWN = 8
 PATTERNS_SHOWN = 8
-QUANTITIES = (("loss", "loss"), ("clicks", "clicks per decision"), ("photons", "photons per decision"))
+QUANTITIES = (
+    ("loss", "loss"),
+    ("clicks", "clicks per decision"),
+    ("photons", "photons per decision"),
+    ("illumination", "illumination per decision"),
+)
 
 
 class History:
@@ -81,7 +86,7 @@ def write_course(
 
 
 def draw_curves(path: Path, reports: Sequence[Any], *, force: bool = False) -> None:
-    """Draw loss, clicks and photons over the epochs (of an automaton: levels, then epochs), one line per restart."""
+    """Draw loss, clicks, photons and illumination over the epochs (of an automaton: levels, then epochs), one line per restart."""
     figure, axes = new_figure(width=12.0, height=3.6, panels=len(QUANTITIES))
     for axis, (name, label) in zip(axes, QUANTITIES):
         restarts = [getattr(report, "restart", 0) for report in reports]

@@ -9,7 +9,7 @@ from trainings import bars_task
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.grow import Growth, merged
-from pans.trainer.adaptive.machine import Sight, forward
+from pans.trainer.adaptive.machine import Aim, Sight, forward
 from pans.trainer.adaptive.objects import TrainingObjects
 from pans.trainer.adaptive.outcomes import WordLaw
 from pans.trainer.options import AutomatonOptions
@@ -41,7 +41,7 @@ def test_growing_counts_every_object_once_and_spends_what_a_pass_finds():
     with torch.no_grad():
         growth = Growth(blocks, sight, random, options, 6)
         for _ in range(3):
-            growth.grow(0.02)
+            growth.grow(Aim(0.02, 0.005))
         passes = [forward(growth.machine(), sight, block.grey) for block in blocks]
     n = sum(len(block) for block in blocks)
     assert [level.successors.shape[0] for level in growth.levels] == [4, 4, 4]
@@ -49,4 +49,5 @@ def test_growing_counts_every_object_once_and_spends_what_a_pass_finds():
     assert float(growth.counts.sum()) == pytest.approx(n, rel=1e-5)
     photons = sum(float(one.photons().sum()) for one in passes) / n
     clicks = sum(float(one.clicks().sum()) for one in passes) / n
-    assert growth.spent == pytest.approx((photons, clicks), rel=1e-5)
+    sent = sum(float(one.illumination().sum()) for one in passes) / n
+    assert growth.spent == pytest.approx((clicks, photons, sent), rel=1e-5)

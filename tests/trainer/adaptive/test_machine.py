@@ -1,5 +1,6 @@
 """The exact forward pass and its gradient: against all outcome words one by one, and against differences of the loss."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -114,7 +115,7 @@ def test_forward_keeps_tiny_and_nearly_certain_chances(light):
 
 def loss_of(machine, sight, aim, grey=GREY):
     passed = forward(machine, sight, grey)
-    total = aim.price * float(passed.photons().mean())
+    total = aim.price * float(passed.photons().mean()) + aim.sent_price * float(sent_of(machine, sight, grey).mean())
     total += aim.exposure_price * sum(float(step.alpha.sum()) for step in passed.steps) / len(grey)
     for counts, leaves in zip(machine.counts, passed.leaves):
         log = torch.log(counts / counts.sum(dim=1, keepdim=True))
@@ -134,7 +135,15 @@ def assert_gradients(machine, sight, aim, grey=GREY):
         assert_slope(tensor, lambda: loss_of(machine, sight, aim, grey))
 
 
-AIMS = [Aim(0.07), Aim(0.07, decide=1.0), Aim(0.05, 0.03, 0.6)]
+def sent_of(machine, sight, grey):
+    """The light sent to each object: what its walk would detect of a clear one, (objects,)."""
+    clear = replace(sight, gain=1.0, floor=0.0, dark_pixels=False)
+    ones = torch.ones(1, grey.shape[1] - sight.dark_pixels, dtype=torch.float64)
+    steps = zip(forward(machine, sight, grey).steps, forward(machine, clear, ones).steps)
+    return sum((step.alpha * alone.whole).sum(dim=0) for step, alone in steps)
+
+
+AIMS = [Aim(0.07), Aim(0.07, decide=1.0), Aim(0.05, 0.0, 0.03, 0.6), Aim(0.0, 0.04), Aim(0.03, 0.02, decide=0.5)]
 
 
 @pytest.mark.parametrize("law", LAWS, ids=str)
@@ -162,7 +171,7 @@ def test_the_gradient_through_optics_holds_the_light_of_dark_pixels(bits):
     mask, scale = light.displayed()
     scale = torch.ones(len(mask), 1) if scale is None else scale
     torch.testing.assert_close(brought(light, sight, grey), scale * (mask @ GREY.T + light.full(mask) * leak) / 255)
-    assert_gradients(machine, sight, Aim(0.07), grey)
+    assert_gradients(machine, sight, Aim(0.07, 0.02), grey)
 
 
 def test_figures_are_means_over_the_objects():
@@ -176,9 +185,7 @@ def test_figures_are_means_over_the_objects():
         for i in range(3)
         if int(counts[leaf].argmax()) == int(ONE_HOT[:, i].argmax())
     )
-    clear = forward(machine, wide(ClickLaw(0.02), gain=1.0), torch.ones(1, 5, dtype=torch.float64))
-    shown = [step.light[:, 0] for step in clear.steps]
-    walked = sum(float(step.alpha.mean(dim=1) @ light) for step, light in zip(passed.steps, shown))
+    walked = float(sent_of(machine, sight, GREY).mean())
     wanted = [right / 3, float(passed.clicks().mean()), float(passed.photons().mean()), walked]
     assert [found.accuracy, found.clicks, found.photons, found.illumination] == pytest.approx(wanted)
 

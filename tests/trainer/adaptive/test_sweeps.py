@@ -8,7 +8,7 @@ from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import sweeps as module
 from pans.trainer.adaptive.grow import Growth
-from pans.trainer.adaptive.machine import Bits, Sight, as_bits, brought, forward, leaf_losses
+from pans.trainer.adaptive.machine import Aim, Bits, Sight, as_bits, brought, forward, leaf_losses
 from pans.trainer.adaptive.objects import TrainingObjects
 from pans.trainer.adaptive.sweeps import choose_patterns, reroute, share_patterns
 from pans.trainer.adaptive.tune import figures, masses, mean_objects
@@ -26,7 +26,7 @@ def grow(levels):
     with torch.no_grad():
         growth = Growth(blocks, sight, torch.Generator().manual_seed(0), options, 8)
         for _ in range(levels):
-            growth.grow(PRICE)
+            growth.grow(Aim(PRICE))
     return growth.machine(), sight, blocks
 
 
@@ -62,7 +62,7 @@ def test_edges_spoiled_are_put_right(grown, monkeypatch):
     monkeypatch.setattr(module, "SURE", 0.0)
     for _ in range(3):
         before = cost(machine, sight, blocks)
-        assert reroute(machine, sight, blocks, PRICE) > 0
+        assert reroute(machine, sight, blocks, Aim(PRICE)) > 0
         after = cost(machine, sight, blocks)
         # the light is kept in bfloat16, and revived leaves are counted anew by the caller
         assert after <= before + 2e-3
@@ -73,7 +73,7 @@ def test_nodes_without_an_edge_are_revived(grown, monkeypatch):
     machine, sight, blocks = grown
     monkeypatch.setattr(module, "SURE", 1e9)  # so that no other edge moves
     machine.levels[3].successors[:] = 0
-    assert reroute(machine, sight, blocks, PRICE) == 0
+    assert reroute(machine, sight, blocks, Aim(PRICE)) == 0
     used = torch.bincount(machine.levels[3].successors.flatten(), minlength=8)
     assert bool((used > 0).all())
 
@@ -86,7 +86,7 @@ def test_walks_end_where_exposures_cost_more_than_they_bring(grown, monkeypatch)
         return cost(machine, sight, blocks) + DEAR * figures(machine, sight, blocks).exposures
 
     before, all_of_them = dear(), figures(machine, sight, blocks).exposures
-    reroute(machine, sight, blocks, PRICE, DEAR)
+    reroute(machine, sight, blocks, Aim(PRICE, exposure_price=DEAR))
     assert all_of_them == pytest.approx(6.0, abs=1e-4)
     assert figures(machine, sight, blocks).exposures < 5.5
     assert before - dear() > 0.01
@@ -139,10 +139,10 @@ def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
         level.light.rows = torch.zeros_like(level.light.rows)
     spoiled = cost(machine, sight, blocks)
     for _ in range(3):
-        choose_patterns(machine, sight, blocks, PRICE)
+        choose_patterns(machine, sight, blocks, Aim(PRICE))
     assert cost(machine, sight, blocks) < spoiled - 0.05
     before = cost(machine, sight, blocks)
-    choose_patterns(machine, sight, blocks, PRICE)
+    choose_patterns(machine, sight, blocks, Aim(PRICE))
     assert cost(machine, sight, blocks) <= before + 2e-3  # what the sweep keeps is rounded to bfloat16
     level = machine.levels[-1]  # behind it stands nothing but leaves: by hand, over all patterns and 200 brightnesses
     steps = [forward(machine, sight, block.grey).steps[-1] for block in blocks]

@@ -56,6 +56,18 @@ def test_learns_the_bars_within_its_budget(task, trained):
     assert found.expected_calibration_error < 0.1
 
 
+@pytest.mark.parametrize(("photons", "illumination"), [(None, 16.0), (4.0, 9.0), (3.0, 60.0)])
+def test_light_sent_has_a_price_of_its_own(task, photons, illumination):
+    """Alone, and beside one for light detected: both hold, and the one that is met first holds the other below its own."""
+    done = train_automaton(task, IDEAL, replace(SMALL, photons=photons, illumination=illumination))
+    found = measure_walks(export_bundle(done, task), task.test, IDEAL)
+    spent = [found.illumination / illumination, *([found.photons_mean / photons] if photons else [])]
+    assert max(spent) == pytest.approx(1.0, abs=0.07)
+    assert found.accuracy_mean > 0.5
+    if photons:
+        assert (done.prices[0] > done.prices[1]) == (spent[1] > spent[0])
+
+
 def export_bundle(trained, task, profile=IDEAL):
     return bundle_of(trained, task, profile, "bars", {})
 
@@ -137,8 +149,8 @@ TWO = {"channels": 2}
     ("changes", "name", "error", "words"),
     [
         ({}, "wdm-snspd", PlanError, "sequential"),
-        ({"photons": None}, "ideal", UsageError, "one budget"),
-        ({"clicks": 2.0}, "ideal", UsageError, "one budget"),
+        ({"photons": None}, "ideal", UsageError, "a budget of light"),
+        ({"clicks": 2.0}, "ideal", UsageError, "not for both"),
         ({"photons": float("nan")}, "ideal", UsageError, "--photons is nan"),
         ({"exposures": 2000}, "ideal", UsageError, "--exposures is 2000"),
         ({"batch": 1}, "ideal", UsageError, "--batch is 1"),
