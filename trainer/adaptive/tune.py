@@ -118,12 +118,12 @@ class Prices:
     @property
     def detected(self) -> float:
         """Nats per photoelectron detected."""
-        return sum(price.value for price in self.all if price.kind != SENT)
+        return sum((price.value for price in self.all if price.kind != SENT), 0.0)
 
     @property
     def sent(self) -> float:
         """Nats per photoelectron sent."""
-        return sum(price.value for price in self.all if price.kind == SENT)
+        return sum((price.value for price in self.all if price.kind == SENT), 0.0)
 
     def aim(self, exposure_price: float = 0.0, decide: float = 0.0, spread: float = 0.0) -> Aim:
         """Return what training makes small at these prices; see Aim."""
