@@ -45,7 +45,7 @@ def test_trains_exports_and_reports(images, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ([*SHORT, "--as-is"], "one budget"),
+        ([*SHORT, "--as-is"], "a budget of light"),
         ([*SHORT, "--photons", "3", "--features", "4", "--head", "conv"], "--features, --head: not of an automaton"),
         (["--features", "3", "--states", "4"], "--states belongs to an automaton"),
         (["--features", "3", "--start", "fashion-adaptive"], "--start belongs to an automaton"),
