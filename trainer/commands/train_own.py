@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -98,33 +98,42 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
 def finish(
     args: argparse.Namespace, task: Task, profile: Profile, figures: Mapping[str, Any]
 ) -> tuple[dict[str, Any], str]:
-    """Warn of a missed budget, compare with direct imaging at equal photons, name the next commands: keys of the answer, and words."""
+    """Warn of a missed budget, compare with direct imaging at equal photons and at equal illumination, name the next commands.
+
+    Returns keys of the answer, and words.
+    """
     photons = figures["photons_mean"]
     if args.encoder != AUTOMATON:  # whose own words tell it
         warn_of_budget(args, figures["clicks_mean"], photons, figures["illumination"])
     words: list[str] = []
     payload: dict[str, Any] = {}
     if task.light == "transmission" and photons >= LEAST_PHOTONS:
-        direct = compared(task, photons, args.seed or 0)
-        payload = {"direct_imaging": direct}
-        words.append(
-            "SIMULATED direct imaging, the exact posterior of an ideal camera at the same photons: "
-            f"{100 * direct['accuracy_mean']:.2f} %  (error from the objects {100 * direct['accuracy_se_objects']:.2f} points, "
-            f"illumination {direct['illumination']:.1f})"
-        )
+        direct = compared(task, [photons], args.seed or 0)[0]
+        sent = photons * figures["illumination"] / direct["illumination"]  # of a camera both rise together
+        gentle = compared(task, [max(sent, LEAST_PHOTONS)], args.seed or 0)[0]
+        payload = {"direct_imaging": direct, "direct_imaging_as_illuminated": gentle}
+        words.append("SIMULATED direct imaging, the exact posterior of an ideal camera:")
+        words += [_beside(direct, "the same photons"), _beside(gentle, "the same illumination")]
     return payload, "\n".join([*words, next_commands(args, profile.name)])
 
 
-def compared(task: Task, photons: float, seed: int) -> dict[str, Any]:
-    """Return what direct imaging decides at that many photons, by its exact posterior: accuracy, its error, photons, illumination."""
+def _beside(direct: Mapping[str, float], same: str) -> str:
+    """One line on a camera."""
+    return (
+        f"  at {same}: {100 * direct['accuracy_mean']:.2f} %  (error from the objects {100 * direct['accuracy_se_objects']:.2f} points, "
+        f"photons {direct['photons_mean']:.2f}, illumination {direct['illumination']:.1f})"
+    )
+
+
+def compared(task: Task, photons: Sequence[float], seed: int) -> list[dict[str, Any]]:
+    """Return what direct imaging decides at these photons, by its exact posterior: accuracy, its error, photons, illumination."""
     from pans.trainer.baselines.rows import baseline_rows
     from pans.trainer.options import BaselineOptions
 
     options = BaselineOptions("direct", "bayes", trials=BASELINE_TRIALS, seed=seed)
-    row = next(iter(baseline_rows(task, options, [photons], lambda _what, _done: None)))
-    return {
-        key: row[key] for key in ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
-    }
+    wanted = "accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination"
+    rows = baseline_rows(task, options, list(photons), lambda _what, _done: None)
+    return [{key: row[key] for key in wanted} for row in rows]
 
 
 def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float, illumination: float) -> None:

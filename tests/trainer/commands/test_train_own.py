@@ -79,6 +79,8 @@ def test_the_course_of_an_automaton_is_written_and_the_answer_holds_direct_imagi
     answer = json.loads(capsys.readouterr().out)
     assert answer["direct_imaging"]["photons_mean"] == pytest.approx(answer["photons_mean"], rel=1e-3)
     assert 0.1 < answer["direct_imaging"]["accuracy_mean"] < 1
+    gentle = answer["direct_imaging_as_illuminated"]
+    assert gentle["illumination"] == pytest.approx(answer["illumination"], rel=1e-3)
     course = json.loads((tmp_path / "course/history.json").read_text())
     stages = [step["stage"] for step in course["epochs"]]
     assert stages == ["grow"] * 4 + ["grey"] * 3 + ["shown"]
