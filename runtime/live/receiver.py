@@ -297,7 +297,11 @@ class Receiver:
         while True:
             for _ in self._parts(kernel, outputs):
                 if self._goes_between and self._fd is not None and ended == ring.DUE:
-                    ended = self._run_on(kernel, self._glance(), outputs, more=True)
+                    try:
+                        ended = self._run_on(kernel, self._glance(), outputs, more=True)
+                    except LinkError as error:  # told once all that has come is settled
+                        self._run.note_broken(error)
+                        ended = ring.ALL_TAKEN
             if ended == ring.DUE or not kernel.holds:
                 break
         if self._told != (kernel.said.answers, kernel.said.shows):
@@ -313,23 +317,25 @@ class Receiver:
         """Settle what has come up to now, in parts: session, driver, marks, recording, decisions."""
         run, begin, end = self._run, kernel.begin, kernel.look()
         self._following = self._core.tracker.next_exposure
-        if end.kept > begin.kept:
-            connection = run.connection
-            connection.session.heard_ns = end.heard_ns or connection.session.heard_ns
-            connection.delivered += end.messages - begin.messages
-            connection.answers += end.answers - begin.answers
-            run.taken_here += end.messages - begin.messages
-            self._settle_commands(kernel)
-            self._stamp(kernel)
-            if end.messages - begin.messages > end.steps - begin.steps:
-                self._settle_marks(kernel)
-            self._record(kernel)
-            yield
-            if end.steps > begin.steps:
-                yield from self._settle_blocks(kernel, outputs)
-        if not run.connection.link.virtual and (end.notes > begin.notes or end.arrivals > begin.arrivals):
-            self._note(kernel)
-        kernel.done()
+        try:
+            if end.kept > begin.kept:
+                connection = run.connection
+                connection.session.heard_ns = end.heard_ns or connection.session.heard_ns
+                connection.delivered += end.messages - begin.messages
+                connection.answers += end.answers - begin.answers
+                run.taken_here += end.messages - begin.messages
+                self._settle_commands(kernel)
+                self._stamp(kernel)
+                if end.messages - begin.messages > end.steps - begin.steps:
+                    self._settle_marks(kernel)
+                self._record(kernel)
+                yield
+                if end.steps > begin.steps:
+                    yield from self._settle_blocks(kernel, outputs)
+            if not run.connection.link.virtual and (end.notes > begin.notes or end.arrivals > begin.arrivals):
+                self._note(kernel)
+        finally:  # a file that cannot be written must not make messages count twice
+            kernel.done()
 
     def _stamp(self, kernel: Kernel) -> None:
         """Set the times of the blocks where the kernel has another clock than the link; in virtual time none passes in between."""

@@ -24,6 +24,7 @@ from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import RecordingError
 from pans.runtime.kernel import receive
 from pans.runtime.kernel.calls import Kernel
 from pans.runtime.link.base import open_link
@@ -93,6 +94,23 @@ def test_a_run_at_real_pace(mode: str, listen: str, tmp_path: Path) -> None:
         assert result.turn_us["max"] > 0
     else:
         assert not decisions["flags"].any()
+
+
+def test_a_recording_that_fails_counts_nothing_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    setup, runs = Served("sequential", "tcp:127.0.0.1:0"), list[Any]()
+
+    def full(recorder: Recorder, rows: Any) -> None:
+        raise RecordingError("no space is left")
+
+    monkeypatch.setattr(Recorder, "add_decisions", full)
+    try:
+        with pytest.raises(RecordingError, match="no space"):
+            recorded(setup, open_link(setup.url), tmp_path / "run.pansrec", Observers(prepared=runs.append))
+    finally:
+        setup.close()
+    runs[0].count_decoded()
+    assert runs[0].stopped
+    assert runs[0].contradictions == {}
 
 
 def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
