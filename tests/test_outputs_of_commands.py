@@ -73,7 +73,7 @@ def refused(words: list[str], folder: Path, why: str, capsys: pytest.CaptureFixt
     """Run a command that must be refused for `why`, with a remedy, and leave the folder as it is."""
     if words[0] in ("train", "reproduce", "evaluate"):
         pytest.importorskip("torch", reason="needs the train extra")
-    if words[0] == "evaluate":
+    if words[0] in ("bench", "evaluate"):
         pytest.importorskip("matplotlib", reason="needs the plot extra")
     before = contents(folder)
     capsys.readouterr()
