@@ -148,7 +148,8 @@ class ScoredDecider:
 
     def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
         """Return the labels, int64 (n,), of click counts, integers (n, d_f)."""
-        return self.scores_batch(counts, shots).argmax(axis=1)
+        checked = checked_counts(counts, shots * self.largest, self.n_features)
+        return self._scores(checked, shots * self.largest).argmax(axis=1)
 
     def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
         """Return labels and probabilities of click counts, int64 (n, d_f), that are known to be 0..shots * largest."""

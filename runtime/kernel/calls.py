@@ -92,8 +92,8 @@ _NOTHING = Counts._make([0] * len(Counts._fields))
 class Kernel:
     """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming.
 
-    What came is looked at from `begin` to `end`: all that a call brought, unless it adds to the call before. Then it lies behind, until
-    `look`; `done` moves on to it.
+    `rows`, `blocks`, `messages` and the like give what lies from `begin` to `end`: after `run` all that came. After `run` with `more` the
+    new part lies behind `end` until `look` moves `end`; `done` moves `begin` to `end`.
     """
 
     def __init__(self, steps: Steps, decoder: FrameDecoder, drive: Drive | None = None) -> None:
@@ -125,32 +125,33 @@ class Kernel:
     def run(self, fd: int = -1, limits: Limits = NO_LIMITS, *, more: bool = False) -> int:
         """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY).
 
-        With `more` what comes is added to what the last call brought, and nothing of that moves.
+        With `more` the rings are filled behind what the last call brought, which stays where it is.
         """
         return self._call(self._nothing, fd, limits, more)
 
     def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits, more: bool = False) -> int:
         self._prepare(fd, limits, more)
         ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
+        before = self.said.messages if more else 0
         self.said = Counts._make((*self.control[ring.ERRNO :].tolist(), int(self.state[core_kernels.N_ROWS])))
         if not more:
             self.begin, self.end = _NOTHING, self.said
-        if self.said.messages:
+        if self.said.messages > before:
             self.steps.store()
         return int(ended)
 
     def look(self) -> Counts:
-        """Look at all that came behind `begin`, and return it."""
+        """Move `end` behind all that came, and return it."""
         self.end = self.said
         return self.end
 
     def done(self) -> None:
-        """All that was looked at is done with."""
+        """Move `begin` to `end`: all up to there is settled."""
         self.begin = self.end
 
     @property
     def holds(self) -> bool:
-        """Whether something came that is not done with: the next call must add to it."""
+        """Whether something lies behind `begin`: the next call must add to it."""
         return (self.said.kept, self.said.arrivals) > (self.begin.kept, self.begin.arrivals)
 
     def _prepare(self, fd: int, limits: Limits, more: bool) -> None:

@@ -289,7 +289,7 @@ class Receiver:
         evidence.arrived(*kernel.arrivals.tolist())
 
     def _settle(self, kernel: Kernel, outputs: list[Output], ended: int) -> int:
-        """Account for what a call took and sent, which is over because of `ended`; return why the latest one is.
+        """Account for what a call took and sent; `ended` says why it ended. Return why the latest call ended.
 
         Settling takes longer than a block. Between its parts the kernel takes what has come meanwhile, where it is the kernel that reads
         and decides: that is settled with the next call, and with this one if it is not ordinary.

@@ -153,7 +153,8 @@ class Growth:
                 slope = slope_of(falls, _gains(parts, whole, block), self.sight.law)
                 slope.neg_().add_(aim.price).mul_(by_row(alpha, self.channels)).mul_(1.0 / len(block))
                 mask_slope = self.sight.mask_slope(slope, block.grey, light)
-                mask_slope += by_row(alpha.mean(dim=1, keepdim=True), self.channels) * aim.sent_price
+                if aim.sent_price:
+                    mask_slope += by_row(alpha.mean(dim=1, keepdim=True), self.channels) * aim.sent_price
                 light.set_gradients(mask_slope, None)
                 optimiser.param_groups[0]["lr"] = RATE * (1 - done / steps) + 1e-4
                 optimiser.step()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,12 +108,16 @@ def finish(
     words: list[str] = []
     payload: dict[str, Any] = {}
     if task.light == "transmission" and photons >= LEAST_PHOTONS:
-        direct = compared(task, [photons], args.seed or 0)[0]
-        sent = photons * figures["illumination"] / direct["illumination"]  # of a camera both rise together
-        gentle = compared(task, [max(sent, LEAST_PHOTONS)], args.seed or 0)[0]
-        payload = {"direct_imaging": direct, "direct_imaging_as_illuminated": gentle}
-        words.append("SIMULATED direct imaging, the exact posterior of an ideal camera:")
-        words += [_beside(direct, "the same photons"), _beside(gentle, "the same illumination")]
+        direct = compared(task, photons, args.seed or 0)
+        payload = {"direct_imaging": direct}
+        words += [
+            "SIMULATED direct imaging, the exact posterior of an ideal camera:",
+            _beside(direct, "the same photons"),
+        ]
+        at_illumination = photons * figures["illumination"] / direct["illumination"]  # of a camera both rise together
+        if at_illumination >= LEAST_PHOTONS:
+            direct = payload["direct_imaging_as_illuminated"] = compared(task, at_illumination, args.seed or 0)
+            words.append(_beside(direct, "the same illumination"))
     return payload, "\n".join([*words, next_commands(args, profile.name)])
 
 
@@ -125,15 +129,15 @@ def _beside(direct: Mapping[str, float], same: str) -> str:
     )
 
 
-def compared(task: Task, photons: Sequence[float], seed: int) -> list[dict[str, Any]]:
-    """Return what direct imaging decides at these photons, by its exact posterior: accuracy, its error, photons, illumination."""
+def compared(task: Task, photons: float, seed: int) -> dict[str, Any]:
+    """Return what direct imaging decides at that many photons, by its exact posterior: accuracy, its error, photons, illumination."""
     from pans.trainer.baselines.rows import baseline_rows
     from pans.trainer.options import BaselineOptions
 
     options = BaselineOptions("direct", "bayes", trials=BASELINE_TRIALS, seed=seed)
     wanted = "accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination"
-    rows = baseline_rows(task, options, list(photons), lambda _what, _done: None)
-    return [{key: row[key] for key in wanted} for row in rows]
+    row = next(iter(baseline_rows(task, options, [photons], lambda _what, _done: None)))
+    return {key: row[key] for key in wanted}
 
 
 def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float, illumination: float) -> None:
