@@ -67,6 +67,7 @@ def test_the_refusal_of_a_name_is_taken_in_the_call_that_sent_it() -> None:
 
 def test_a_signal_ends_a_call_that_waits() -> None:
     streamed, _ = streaming()
+    streamed.warm_up()  # else the signal may come while the kernel is compiled
     ours, theirs = socket.socketpair()
     came: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda number, frame: came.append(number))
