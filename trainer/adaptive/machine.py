@@ -289,7 +289,7 @@ class Sight:
 class Step:
     """One level of a pass: probability of the states, light by rows, chances of all outcomes but the last, and how fast these fall.
 
-    `whole` is the light of a state, all its channels together, and `sent` (states, 1) what it would be of a clear object.
+    `whole` is the light of a state, all its channels together, and `sent` (rows, 1) what each row of pixels sends.
     """
 
     alpha: Tensor
@@ -317,7 +317,8 @@ class Pass:
 
     def illumination(self) -> Tensor:
         """Return the expected light sent to every object, in photoelectrons of a clear one."""
-        return torch.stack([(step.alpha * step.sent).sum(dim=0) for step in self.steps]).sum(dim=0)
+        sent = [(step.alpha * by_state(step.sent, len(step.sent) // len(step.alpha))).sum(dim=0) for step in self.steps]
+        return torch.stack(sent).sum(dim=0)
 
     def clicks(self) -> Tensor:
         """Return the expected clicks of every object: photons counted, where they are."""
@@ -325,16 +326,19 @@ class Pass:
         return torch.stack(counted).sum(dim=0)
 
 
-def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
-    """Return the light (rows, objects) that the patterns of `light` bring from objects of `grey`."""
+def brought(light: Light, sight: Sight, grey: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the light (rows, objects) that the patterns of `light` bring from objects of `grey`, and what they send, (rows, 1)."""
     mask, scale = light.displayed()
     result = sight.light(mask, grey, light.full(mask) if sight.dark_pixels else None)
-    return result if scale is None else result.mul_(scale)
+    return result if scale is None else result.mul_(scale), _sent(mask, scale)
 
 
 def sent_by(light: Light) -> Tensor:
     """Return the light that the patterns of `light` send, (rows, 1)."""
-    mask, scale = light.displayed()
+    return _sent(*light.displayed())
+
+
+def _sent(mask: Tensor, scale: Tensor | None) -> Tensor:
     sent = mask.sum(dim=1, keepdim=True)
     return sent if scale is None else sent * scale
 
@@ -364,12 +368,11 @@ def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
         alpha = nodes[: level.n_states]
         if number:
             result.leaves.append(nodes[level.n_states :])
-        light = brought(level.light, sight, grey)
+        light, sent = brought(level.light, sight, grey)
         chances, falls = readings(light, sight.law)
         if memory is not None:
             chances, falls = memory.step(alpha, chances, falls, level.successors, machine.n_nodes(number))
-        whole, sent = by_state(light, channels), by_state(sent_by(level.light), channels)
-        result.steps.append(Step(alpha, light, whole, sent, chances, falls))
+        result.steps.append(Step(alpha, light, by_state(light, channels), sent, chances, falls))
         nodes = children(alpha, chances, level.successors, machine.n_nodes(number))
     result.leaves.append(nodes)
     return result
@@ -432,7 +435,7 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
             cost = by_row(step.alpha.sum(dim=1, keepdim=True), channels).to(slope.dtype).mul_(share * aim.sent_price)
             mask_slope += cost
             if light_slope is not None:
-                light_slope += cost * sent_by(level.light)
+                light_slope += cost * step.sent
         mask_slope = mask_slope if scale is None else mask_slope.mul_(scale)
         if aim.spread:
             mass = step.alpha.sum(dim=1, keepdim=True).mul_(aim.spread * share / len(machine.levels))
@@ -442,7 +445,7 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         for chance, gain in zip(step.chances[1:], gains[1:]):
             beta.addcmul_(chance, gain)
         beta.add_(after_last).add_(step.whole, alpha=aim.price)
-        beta += aim.exposure_price + aim.sent_price * step.sent
+        beta += aim.exposure_price + aim.sent_price * by_state(step.sent, channels)
         if number and len(machine.counts[number - 1]):
             beta = torch.cat([beta, aim.at_leaves(machine.counts[number - 1], one_hot)])
 

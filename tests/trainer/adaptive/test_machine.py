@@ -54,7 +54,7 @@ def chances_by_hand(law, light):
 def walked(machine, sight, law, i):
     """The chance of every leaf, and photons, clicks and exposures of object i, word by word."""
     channels, levels = channels_of(law), machine.levels
-    light = [brought(level.light, sight, GREY)[:, i].numpy().reshape(-1, channels) for level in levels]
+    light = [brought(level.light, sight, GREY)[0][:, i].numpy().reshape(-1, channels) for level in levels]
     leaves, sums = {}, np.zeros(3)
     for word in product(range(len(clicks_of(law))), repeat=len(levels)):
         chance, state, met = 1.0, 0, np.zeros(3)
@@ -170,7 +170,7 @@ def test_the_gradient_through_optics_holds_the_light_of_dark_pixels(bits):
     light = machine.levels[1].light
     mask, scale = light.displayed()
     scale = torch.ones(len(mask), 1) if scale is None else scale
-    torch.testing.assert_close(brought(light, sight, grey), scale * (mask @ GREY.T + light.full(mask) * leak) / 255)
+    torch.testing.assert_close(brought(light, sight, grey)[0], scale * (mask @ GREY.T + light.full(mask) * leak) / 255)
     assert_gradients(machine, sight, Aim(0.07, 0.02), grey)
 
 
