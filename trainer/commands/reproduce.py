@@ -29,6 +29,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help=words)
     words = "of the frontier: seeds per row (default 5)"
     parser.add_argument("--seeds", type=SEEDS.option, default=5, metavar="N", help=words)
+    words = "of the frontier: measure only these ways; the others stand as in NAME.json of -o"
+    parser.add_argument("--ways", nargs="+", metavar="WAY", help=words)
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
     words = "write NAME.json, the pictures and the tables of the Markdown page there; its text around the tables stays"
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", help=words)
@@ -54,11 +56,14 @@ def _run(args: argparse.Namespace) -> int:
     torch_with(args.threads)
     cache = args.cache.expanduser()
     make_folder(cache)
-    rows, dark = (None if wanted is None else tuple(wanted) for wanted in (args.rows, args.dark))
+    rows, dark, ways = (None if wanted is None else tuple(wanted) for wanted in (args.rows, args.dark, args.ways))
+    known = () if ways is None else tuple(read_rows(args.out, args.name))
     made: list[Made] = []
     try:
         for page in pages:
-            asked = Asked(page.name, cache, rows, args.data_dir, args.collect, say, dark, args.data_seed, args.seeds)
+            asked = Asked(
+                page.name, cache, rows, args.data_dir, args.collect, say, dark, args.data_seed, args.seeds, ways, known
+            )
             made.append(page.measure(asked))
             if args.out is not None:
                 write_page(args.out, page, made[-1])
@@ -93,6 +98,13 @@ def _check(args: argparse.Namespace) -> None:
     if args.dark is not None and name != "all" and (table is None or not {*table.dark} & {*args.dark}):
         has = f"{name} has {', '.join(map(str, table.dark))}" if table else "leave it out"
         raise UsageError(f"--dark {args.dark} has no effect on {name}", remedy=has)
+    if args.ways is not None:
+        from pans.trainer.reproduce.ways import ways_of
+
+        if name != "frontier" or args.out is None:
+            raise UsageError("--ways is for the frontier, with -o", remedy="pans reproduce frontier --ways ... -o DIR")
+        if unknown := [way for way in args.ways if way not in ways_of(name)]:
+            raise UsageError(f"--ways {unknown}", remedy=f"allowed: {', '.join(ways_of(name))}")
     drawn = table is not None and recipe_facts(name).get("task", name) in GENERATORS and name != "barcode"
     if args.data_seed < 0 or (args.data_seed and (args.out or not drawn)):
         remedy = "leave out -o: the page is of draw 0" if drawn else f"{name} is not drawn: leave it out"

@@ -20,7 +20,7 @@ from .active import OTHER_SEEDS, finished_row, shot_figures
 from .dynamics import ALPHAS, training
 from .page import FIRST_OBJECTS, Asked, Made, Row, Rows, against, beside_curve, by_epoch, flat, sampling_error
 from .printed import ACTIVE, DIRECT
-from .ways import measured_points
+from .ways import measured_points, points
 
 TASK = "fashion-mnist"
 PANS, ENVELOPE = "PANS", "end-to-end, envelope"
@@ -166,20 +166,25 @@ def photons_at_least(clicks: float, features: int) -> float:
 
 
 def frontier_page(asked: Asked) -> Made:
-    """Return one row per point beside direct imaging at its photons, and the paper's click budgets beside our automata."""
-    measured = measured_points(asked, "frontier", asked.seeds)
-    rows = beside_direct(by_point(measured + fixed_rows(asked)))
+    """Return one row per point beside direct imaging at its light, and the paper's click budgets beside our automata."""
+    measured = by_point(measured_points(asked, "frontier", asked.seeds) + fixed_rows(asked))
+    new, listed = {_key(row) for row in measured}, {(one.task, one.way, one.level) for one in points("frontier")}
+    known = [row | {"task": row["table"]} for row in asked.known if row["table"] in ACTIVE]
+    kept = [
+        row for row in known if _key(row) not in new and (_key(row) in listed or row["way"] in (FIXED, FIXED_LIGHT))
+    ]
+    rows = on_front(beside_direct(sorted(measured + kept, key=lambda row: (row["task"], row["way"], row["photons"]))))
     return Made(click_budgets(rows) + rows)
+
+
+def _key(row: Row) -> tuple[str, str, float]:
+    return row["task"], row["way"], row["level"]
 
 
 def by_point(measured: Rows) -> Rows:
     """Return means over the seeds of each task, way and level, with `seeds` and the standard error over them (None of one seed)."""
-
-    def key(row: Row) -> tuple[str, str, float]:
-        return row["task"], row["way"], row["level"]
-
     rows = []
-    for (task, way, level), group in groupby(sorted(measured, key=key), key):
+    for (task, way, level), group in groupby(sorted(measured, key=_key), _key):
         found = list(group)
         values = [row["value"] for row in found]
         error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
@@ -187,7 +192,7 @@ def by_point(measured: Rows) -> Rows:
         rows.append(
             facts | {"error_seeds": error} | {mean: statistics.fmean(row[mean] for row in found) for mean in MEANS}
         )
-    return sorted(rows, key=lambda row: (row["task"], row["way"], row["photons"]))
+    return rows
 
 
 def error_of(row: Row) -> float:
@@ -196,21 +201,44 @@ def error_of(row: Row) -> float:
 
 
 def beside_direct(rows: Rows) -> Rows:
-    """Return the points, those of other ways beside exact direct imaging and beside direct imaging that stops, at their own photons.
+    """Return the points, those of other ways beside the best direct imaging, single frame or stopped, at their photons and illumination.
 
     Both errors count, as if the images were drawn for each: they are the same, so that the true error is smaller.
     """
 
-    def whole(row: Row) -> Row:
-        return row | {"error_objects": error_of(row)}
+    def beside(row: Row, of: str, prefix: str) -> Row:
+        mine = row | {"error_objects": error_of(row)}
+        found = [beside_curve(mine, curves[row["task"], way], of, prefix) for way in (EXACT, STOPPING)]
+        return max(found, key=lambda one: float(one.get(f"{prefix}there", -math.inf)))
 
-    found = []
-    for row in rows:
-        for way, prefix in ((EXACT, ""), (STOPPING, "sure_")) if row["way"] not in (EXACT, STOPPING) else ():
-            curve = [whole(other) for other in rows if (other["task"], other["way"]) == (row["task"], way)]
-            row = row | beside_curve(whole(row), curve, "photons", prefix)
-        found.append(row)
-    return found
+    whole = [row | {"error_objects": error_of(row)} for row in rows]
+    curves = {
+        (task, way): [row for row in whole if (row["task"], row["way"]) == (task, way)]
+        for task in ACTIVE
+        for way in (EXACT, STOPPING)
+    }
+    others = [row["way"] not in (EXACT, STOPPING) for row in rows]
+    return [
+        row | beside(row, "photons", "") | beside(row, "illumination", "light_") if other else row
+        for row, other in zip(rows, others)
+    ]
+
+
+def on_front(rows: Rows) -> Rows:
+    """Return the points with `front`: "yes" where no other point of the task is as right with no more photons and no more illumination."""
+
+    def beats(other: Row, row: Row) -> bool:
+        ahead = [
+            other["value"] - row["value"],
+            row["photons"] - other["photons"],
+            row["illumination"] - other["illumination"],
+        ]
+        return min(ahead) >= 0 and max(ahead) > 0
+
+    def front(row: Row) -> str:
+        return "" if any(other["task"] == row["task"] and beats(other, row) for other in rows) else "yes"
+
+    return [row | {"front": front(row)} for row in rows]
 
 
 def click_budgets(rows: Rows) -> Rows:

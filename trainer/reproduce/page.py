@@ -47,8 +47,8 @@ NAMES: tuple[str, ...] = tuple(_FILE["page"])
 class Asked:
     """One page: finished parts are in `cache`; `rows` are the only numbers of patterns wanted; with `collect` nothing is measured.
 
-    `dark` (dark counts wanted) and `data_seed` (draw of the generator) are for the tables over dark counts, `seeds` (how many) is for
-    the frontier.
+    `dark` (dark counts wanted) and `data_seed` (draw of the generator) are for the tables over dark counts. For the frontier are `seeds`
+    (how many), `ways` (the only ones wanted; None: all), and `known`, the page's rows as they are, kept where nothing new was measured.
     """
 
     name: str
@@ -60,6 +60,8 @@ class Asked:
     dark: tuple[float, ...] | None = None
     data_seed: int = 0
     seeds: int = 5
+    ways: tuple[str, ...] | None = None
+    known: tuple[Row, ...] = ()
 
     def wants(self, features: int) -> bool:
         """Return whether the row of that many patterns was asked for."""

@@ -37,22 +37,50 @@ def curves(path: Path, rows: Rows, spec: Row) -> None:
     named: dict[str, Any] = {}
     numbers: dict[str, int] = {}  # of the labels, for one colour and marker in all panels
     for axis, panel in zip(np.atleast_1d(axes).ravel(), panels):
-        for line in panel["lines"]:
-            _lines(axis, rows, numbers, {**spec.get("line", {}), **panel.get("line", {}), **line})
+        if "plane" in panel:
+            _plane(figure, axis, of_table(rows, panel["plane"]))
+        for line in panel.get("lines", ()):
+            _lines(
+                axis, rows, numbers, {**spec.get("line", {}), **panel.get("line", {}), **line}, spec.get("colours", {})
+            )
         axis.set(**spec.get("set", {}) | panel.get("set", {}))
         axis.grid(alpha=0.3)
-        if axis.get_xscale() == "log":
-            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.xaxis.set_major_formatter("{x:g}")
-            axis.xaxis.set_minor_formatter(NullFormatter())
+        for scale, ticks in ((axis.get_xscale(), axis.xaxis), (axis.get_yscale(), axis.yaxis)):
+            if scale == "log":
+                ticks.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                ticks.set_major_formatter("{x:g}")
+                ticks.set_minor_formatter(NullFormatter())
         named = dict(zip(*reversed(axis.get_legend_handles_labels()))) | named
     figure.legend(named.values(), named, loc="outside lower center", ncols=4, fontsize=8)
     figure.suptitle(f"{spec['title']} (SIMULATED)", fontsize=10)
     save_figure(figure, path)
 
 
-def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row) -> None:
-    """Draw one line per label: `y` over `x` of the rows of a table, with error bars and notes where they are asked for."""
+def _plane(figure: Any, axis: Any, points: Rows) -> None:
+    """Draw points by their photons and illumination, coloured by accuracy; ringed are those on the front."""
+    kinds = {"automata": "o", "direct imaging": "s", "fixed patterns and masks": "^"}
+    for kind, marker in kinds.items():
+        mine = [row for row in points if _kind(row["way"]) == kind]
+        places = [[row[key] for row in mine] for key in ("photons", "illumination", "value")]
+        rings = ["k" if row.get("front") else "none" for row in mine]
+        drawn = axis.scatter(
+            *places[:2], c=places[2], vmin=50, vmax=100, marker=marker, edgecolors=rings, s=28, cmap="turbo"
+        )
+        axis.scatter([], [], color="0.6", marker=marker, edgecolors="k", label=f"{kind} (ringed: on the front)")
+    figure.colorbar(drawn, ax=axis, label="accuracy, %", extend="min")
+
+
+def _kind(way: str) -> str:
+    if "automaton" in way:
+        return "automata"
+    return "direct imaging" if way.startswith("direct") else "fixed patterns and masks"
+
+
+def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row, colours: dict[str, str]) -> None:
+    """Draw one line per label: `y` over `x` of the rows of a table, with error bars and notes where they are asked for.
+
+    A label that contains a word of `colours` has its colour.
+    """
     x, y = line["x"], line["y"]
     groups: dict[str, Rows] = {}
     for row in of_table(rows, line["of"]) if "of" in line else rows:
@@ -63,9 +91,10 @@ def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row) -> None:
         number = numbers.setdefault(label, len(numbers))
         mine.sort(key=lambda row: float(row[x]))
         errors = [row.get(line["bars"]) or 0.0 for row in mine] if "bars" in line else None
+        colour = next((colours[word] for word in colours if word in label), None)
         line_style = {
-            "fmt": f"{'os^D'[number // 10 % 4]}-",
-            "color": f"C{number % 10}",
+            "fmt": f"{'os^DvP*X<>'[number % 10 if colour else number // 10 % 4]}-",
+            "color": colour or f"C{number % 10}",
             "ms": 3.5,
             "lw": 1.2,
             "capsize": 2,

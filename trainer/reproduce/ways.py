@@ -55,6 +55,11 @@ class Point:
         return {"kind": self.kind, **dict(self.options), "seed": self.training_seed(seed), **start}
 
 
+def ways_of(page: str) -> list[str]:
+    """Return the names of the ways of a page."""
+    return [way["name"] for way in WAYS if way.get("page", "frontier") == page]
+
+
 def points(page: str) -> Iterator[Point]:
     """Yield all points of a page, way by way."""
     known: dict[tuple[str, str, float], Point] = {}
@@ -71,10 +76,12 @@ def points(page: str) -> Iterator[Point]:
 
 
 def measured_points(asked: Asked, page: str, seeds: int = 1) -> Rows:
-    """Return one row per point and seed that is finished, or measured now: one seed of everything comes before the next."""
+    """Return one row per wanted point and seed that is finished, or measured now: one seed of everything comes before the next."""
     rows: Rows = []
     for seed in range(seeds):
         for point in points(page):
+            if asked.ways is not None and point.way not in asked.ways:
+                continue
             features = dict(point.options).get("features")
             if features is not None and not asked.wants(features):
                 continue

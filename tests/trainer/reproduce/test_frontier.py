@@ -14,7 +14,7 @@ from pans.trainer.adaptive import train as adaptive_train
 from pans.trainer.options import METHODS, AutomatonOptions, BaselineOptions, Options, check_options
 from pans.trainer.reproduce import curves, ways
 from pans.trainer.reproduce.curves import EXACT, STOPPING
-from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
+from pans.trainer.reproduce.page import Asked, of_table, page_of, read_rows, write_page
 from pans.trainer.reproduce.printed import ACTIVE
 from pans.trainer.reproduce.ways import Point
 from pans.trainer.tasks.registry import Task
@@ -69,19 +69,36 @@ def test_seeds_are_put_together_with_their_standard_error():
     assert curves.error_of(one) == 0.3
 
 
-def test_margins_are_over_direct_imaging_at_the_same_photons():
+def test_margins_are_over_the_best_direct_imaging_at_the_same_light():
     rows = [made(EXACT, 4, 4.0, 40.0), made(EXACT, 16, 16.0, 60.0), made("automaton", 8, 8.0, 75.0)]
     rows += [made("automaton", 40, 40.0, 90.0), made("masks", 4, 4.0, 50.0)]  # 40 is beyond direct imaging's levels
     rows += [made(EXACT, 8, 8.0, 10.0, task="fashion-mnist")]
-    rows += [made(STOPPING, 6, 6.0, 60.0), made(STOPPING, 10, 32 / 3, 80.0)]  # not for 4 photons
+    rows += [made(STOPPING, 6, 6.0, 30.0), made(STOPPING, 10, 32 / 3, 50.0)]  # not for 4 photons, worse elsewhere
+    for row in rows:
+        row["illumination"] = row["photons"] * (10 if row["way"] == EXACT else 20)
     found = {(row["way"], row["level"]): row for row in curves.beside_direct(curves.by_point(rows))}
     automaton = found["automaton", 8]
     assert (automaton["there"], automaton["ahead"]) == pytest.approx((50, 25))  # half way in the logarithm
     assert automaton["error"] == pytest.approx(0.3 * math.sqrt(2))
-    assert (automaton["sure_ahead"], automaton["sure_verdict"]) == (pytest.approx(5), "above")
-    assert (found["masks", 4]["ahead"], "sure_ahead" in found["masks", 4]) == (pytest.approx(10), False)
+    # at its 160 units the single frame has 60, the stopped one 40
+    assert (automaton["light_there"], automaton["light_verdict"]) == (pytest.approx(60), "above")
+    assert (found["masks", 4]["ahead"], found["masks", 4]["light_ahead"]) == pytest.approx((10, 0))
     assert "ahead" not in found["automaton", 40]
-    assert "ahead" not in found[EXACT, 4]
+    assert not {"ahead", "light_ahead"} & set(found[EXACT, 4])
+    better = [row | {"value": 70.0} if row["way"] == STOPPING else row for row in rows]
+    ahead = [
+        row["ahead"]
+        for row in curves.beside_direct(curves.by_point(better))
+        if (row["way"], row["level"]) == ("automaton", 8)
+    ]
+    assert ahead == pytest.approx([5])
+
+
+def test_a_point_is_on_the_front_where_none_is_as_right_with_no_more_light_of_either_kind():
+    rows = [made("a", 1, 1.0, 50.0), made("b", 1, 2.0, 60.0), made("c", 1, 2.0, 55.0), made("d", 1, 3.0, 60.0)]
+    rows[3]["illumination"] = 5.0  # more photons, but less is sent
+    rows += [made("e", 1, 9.0, 10.0, task="fashion-mnist")]
+    assert [row["front"] for row in curves.on_front(rows)] == ["yes", "yes", "", "yes", "yes"]
 
 
 def test_click_budgets_take_the_automaton_that_spends_most_within_them_and_not_the_best():
@@ -150,3 +167,10 @@ def test_the_page_measures_every_kind_of_point_and_is_drawn(asked, tmp_path, mon
     assert curves.frontier_page(replace(asked, collect=True)).rows == page.rows
     write_page(tmp_path, page_of("frontier"), page)
     assert (tmp_path / "frontier.png").stat().st_size > 5000
+    # one way alone, the others as the page has them
+    wanted[2]["levels"]["mnist"]["4"] = {"photons": 4.0}
+    known = tuple(read_rows(tmp_path, "frontier"))
+    again = curves.frontier_page(replace(asked, cache=tmp_path, ways=("fixed",), known=known))
+    found = {(row["way"], row["level"]): row for row in of_table(again.rows, "mnist")}
+    assert set(found) == {*points, ("fixed", 4)}
+    assert {key: found[EXACT, 0.5][key] for key in known[-1] if key != "table"}.items() <= points[EXACT, 0.5].items()
