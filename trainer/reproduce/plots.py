@@ -58,6 +58,8 @@ def curves(path: Path, rows: Rows, spec: Row) -> None:
 
 def _plane(figure: Any, axis: Any, points: Rows) -> None:
     """Draw points by their photons and illumination, coloured by accuracy; ringed are those on the front."""
+    if not points:
+        return
     kinds = {"automata": "o", "direct imaging": "s", "fixed patterns and masks": "^"}
     for kind, marker in kinds.items():
         mine = [row for row in points if _kind(row["way"]) == kind]
