@@ -184,12 +184,11 @@ class _Run:
         """Take the states and patterns of `start` in place of growing, and count its leaves on some of the objects."""
         self.machine, self.stage = machine_of(start), "shown"
         lights = [level.light for level in self.machine.levels if isinstance(level.light, Bits)]
-        low, high = top_limits(self.profile)[0], self._highest_top()
+        low = top_limits(self.profile)[0]
         if self._one_brightness():
             for light in lights:
                 light.log_light, light.bottom = lights[0].log_light, low
-        brightest = max(float(light.log_light.max().exp()) for light in lights)
-        set_top(self.machine, min(high, max(low, brightest)), self.profile)
+        self._set_top(max(float(light.log_light.max().exp()) for light in lights))
         found = node_counts(self.machine, self.sight(self.products), self._some_blocks())
         share = self.objects.n_fit / float(found[0].sum())
         for counts, arrived in zip(self.machine.counts, found[1:]):
@@ -330,9 +329,10 @@ class _Run:
         lights = torch.cat([level.light.brightness().flatten() for level in self.machine.levels])  # type: ignore[union-attr]
         masses, order = torch.cat(self._masses()), lights.argsort()
         below = masses[order].cumsum(0) / masses.sum()
-        low, high = top_limits(self.profile)[0], self._highest_top()
-        top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
-        set_top(self.machine, min(high, max(low, top)), self.profile)
+        self._set_top(float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))]))
+
+    def _set_top(self, top: float) -> None:
+        set_top(self.machine, min(self._highest_top(), max(top_limits(self.profile)[0], top)), self.profile)
 
     def _sweep_blocks(self) -> list[Block]:
         """The objects of a sweep over all levels, as many as memory should hold."""
@@ -352,7 +352,11 @@ class _Run:
     def finish(self) -> TrainedAutomaton:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
-        grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
+        grid = None
+        if not self.options.grey:  # first without steps: an exposure is no longer than the brightest state then needs
+            meet_budget(self.machine, self.prices, None, self.sight, self._drawn())
+            self._set_top(max(float(level.light.brightness().max()) for level in self.machine.levels))  # type: ignore[union-attr]
+            grid = bit_grid(self.machine.levels[0].light.top, self.profile)
         meet_budget(self.machine, self.prices, grid, self.sight, self._drawn())
         if grid is not None:
             to_grid(self.machine, grid)
