@@ -120,7 +120,7 @@ def test_soft_targets_are_kept_and_go_on_from_a_checkpoint(task, tmp_path):
         train_automaton(task, IDEAL, replace(options, teacher_epochs=4), teacher=file)
 
 
-@pytest.mark.parametrize("steps", [1, 20, 1000])
+@pytest.mark.parametrize("steps", [1, 20])
 def test_dwell_is_in_whole_steps_of_the_profile(task, steps):
     """Without steps a one-bit projector shows one brightness."""
     profile = load_profile("dmd-spad")
@@ -128,7 +128,7 @@ def test_dwell_is_in_whole_steps_of_the_profile(task, steps):
     arrays = train_automaton(task, profile, SMALL).arrays
     assert set(np.unique(arrays.pattern_levels)) <= {0, 1}
     assert arrays.dwell_steps == steps
-    assert 1 <= arrays.dwell.min() <= arrays.dwell.max() == steps  # no exposure is longer than it must be
+    assert 1 <= arrays.dwell.min() <= arrays.dwell.max() <= steps
     assert len(set(arrays.dwell)) > 3 or steps == 1
     low = profile.projector.peak_photoelectrons_hz * profile.exposure.min_us * 1e-6
     assert arrays.photons_per_level >= low * (1 - 1e-9)
@@ -245,6 +245,14 @@ def test_a_start_that_is_hardly_trained_walks_as_the_bundle_does(task, first):
     wanted = before.leaves @ bundle.automaton.posteriors[bundle.automaton.n_states :]
     np.testing.assert_allclose(chances, wanted, atol=0.05)  # leaves are counted and calibrated anew
     assert same.held_back.exposures < 4.9
+
+
+def test_dimmed_to_its_budget_no_exposure_is_longer_than_the_brightest_state_needs(task, first):
+    bundle, digest = first
+    options = started_from(replace(FREE, epochs=1, rate=0.0, photons=2.0), bundle, digest, task, IDEAL)
+    arrays = train_automaton(task, IDEAL, options, start=bundle).arrays
+    assert arrays.photons_per_level < 0.8 * bundle.photons_per_level
+    assert arrays.dwell.max() == arrays.dwell_steps
 
 
 def test_what_cannot_be_started_from_is_refused(task, first):
