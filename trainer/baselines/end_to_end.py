@@ -35,7 +35,7 @@ from torch import Tensor, nn
 from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Task
 
-from .common import I64, Decide, Light, Measurement, Report, Trials, detect, measure, named, silent
+from .common import Decide, Light, Measurement, Report, Trials, detect, measure, named, silent
 from .networks import Inputs, decider, feature_net, fit, seeded, size
 from .stopping import Choice, Course, best_rule, decided, empty, held_back
 
@@ -253,14 +253,15 @@ def masks_that_stop(
         if tried:
             (_, rule), spare, measurement, follow = max(tried, key=lambda one: one[0][0])
             rng = np.random.default_rng([options.seed, 1])
-            courses, photons, sent = zip(*(follow(measurement.test, rng) for _ in range(options.trials or 1)))
-            done, confidence = decided(measurement, list(courses), list(photons), sent[0], rule)
+            shown = [follow(measurement.test, rng) for _ in range(options.trials or 1)]
+            courses, detected, _ = zip(*shown)
+            done, confidence = decided(measurement, courses, detected, shown[0][2], rule)
             yield level, Choice(rule, confidence, {"spare": spare}), done
 
 
 def _mask_by_mask(
     model: FeatureSpecific, measurement: Measurement, most: float, rows: NDArray[Any], rng: np.random.Generator
-) -> tuple[Course, I64, F64]:
+) -> tuple[Course, F64, F64]:
     """What the network says of `rows` after each mask, photons detected and light sent until then, (objects, masks)."""
     counts = detect(measurement.photoelectrons(rows, most), "counting", rng)
     light = measurement.full.cumsum(dtype=np.float64)
@@ -270,4 +271,4 @@ def _mask_by_mask(
             scores = model.after(torch.from_numpy(counts), torch.tensor(k + 1))
             course.tell(np.arange(len(rows)), k, torch.softmax(scores.double(), dim=1).numpy())
     sent = measurement.sent(rows, most)[:, None] * (light / light[-1])
-    return course, counts.cumsum(axis=1).astype(np.int64), sent
+    return course, counts.cumsum(axis=1, dtype=np.float64), sent

@@ -71,7 +71,7 @@ def exposure_net(
     assert shape is not None, "direct imaging measures frames"
     net = seeded(lambda: ExposureNet(shape, measurement.n_classes), seed)
     assert isinstance(net, ExposureNet)
-    net.to(memory_format=torch.channels_last)  # a fifth less time
+    net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth less time
     labels = torch.from_numpy(measurement.train_labels[:fitted])
     fit(
         net,

@@ -10,7 +10,7 @@ Exposures are in photons of the mean test object.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -172,7 +172,7 @@ class Rule:
         return sure.argmax(axis=1)
 
 
-def at(values: NDArray[np.generic], stops: I64) -> NDArray[np.generic]:
+def at(values: NDArray[Any], stops: I64) -> NDArray[Any]:
     """Return what `values` (objects, readings) hold where each object stops."""
     return values[np.arange(len(stops)), stops]
 
@@ -238,7 +238,7 @@ def stopping(
     held = arrivals(measurement, rows, rng)
     share = measurement.photoelectrons(rows, 1.0).sum(axis=1, dtype=np.float64).mean()  # beside the test objects' mean
     spent = {"photons": held.photons / share, "illumination": measurement.sent(rows, 1.0)[:, None] * GRID}
-    courses = {None: network(held, report)}
+    courses: dict[float | None, Course] = {None: network(held, report)}  # by the floor of the posterior
     courses |= {floor: of_posterior(measurement, floor, known)(held, report) for floor in FLOORS}
     rng = np.random.default_rng([seed, 1])
     heard = [arrivals(measurement, measurement.test, rng) for _ in range(trials)]
@@ -257,15 +257,12 @@ def stopping(
             source = network if floor is None else of_posterior(measurement, floor, n)
             told[floor] = [source(each, report) for each in heard]
         done, confidence = decided(measurement, told[floor], [each.photons for each in heard], sent, rule)
-        yield (
-            level,
-            Choice(rule, confidence, {"source": "network" if floor is None else "posterior", "floor": floor}),
-            done,
-        )
+        facts = {"source": "network" if floor is None else "posterior", "floor": floor}
+        yield level, Choice(rule, confidence, facts), done
 
 
 def decided(
-    measurement: Measurement, told: list[Course], photons: list[I64], sent: F64, rule: Rule
+    measurement: Measurement, told: Sequence[Course], photons: Sequence[NDArray[Any]], sent: F64, rule: Rule
 ) -> tuple[Trials, float]:
     """Return what `rule` decides on the test objects, and its mean confidence, from one course and photons of each trial.
 
