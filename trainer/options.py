@@ -35,7 +35,7 @@ METHODS = {  # of each paradigm of `pans baseline`, the default first
     "direct": ("bayes", "cnn", "clean-cnn", "stopping"),
     "compressive": ("mlp", "clean-mlp", "bayes"),
     "e2e": ("qat", "plain"),
-    "fsi": ("deep", "pca"),
+    "fsi": ("deep", "pca", "stopping"),
     "hadamard": ("differences", "counts"),
 }
 
@@ -240,7 +240,7 @@ class BaselineOptions:
     bits: int = option(4, "of qat: bits of a detected value (default 4)", range=Range(1, 16, whole=True), metavar="B")
     epochs: int | None = option(
         None,
-        "of a network (default: 5 CNN, 10 MLP and pairs, 15 end-to-end and masks)",
+        "of a network (default: 5 CNN, 10 MLP and pairs, 15 end-to-end and masks, stopping by the task)",
         range=Range(1, 10_000, whole=True),
         metavar="E",
     )

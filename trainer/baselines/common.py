@@ -61,6 +61,7 @@ class Measurement:
     unit: float
     brightness: str
     image_shape: tuple[int, int] | None  # of a frame; None when the m values are no picture
+    mean: float  # what the mean test object gives at unit light
 
     def photoelectrons(self, rows: NDArray[Any], photons: float, floor: float = 0.0) -> F32:
         """Return expected photoelectrons, float32 (n, m), of `rows` at `photons` per object; `floor` lifts every transmission.
@@ -74,16 +75,32 @@ class Measurement:
         light *= np.float32(self._scale(light, photons))
         return light
 
+    def sent(self, rows: NDArray[Any], photons: float) -> F64:
+        """Return the sum of all pattern intensities for each of `rows` at `photons`, in photoelectrons per unit transmission, (n,)."""
+        scale = self._scale(rows.astype(np.float32) * np.float32(self.unit), photons)
+        return np.broadcast_to(np.ravel(scale), len(rows)) * self.full.sum(dtype=np.float64)
+
     def illumination(self, photons: float) -> float:
-        """Return the sum of all pattern intensities, in photoelectrons per unit transmission, averaged over the test objects."""
-        light = self.test.astype(np.float32) * np.float32(self.unit)
-        return float(np.mean(self._scale(light, photons))) * float(self.full.sum(dtype=np.float64))
+        """Return `sent` averaged over the test objects."""
+        return float(self.sent(self.test, photons).mean())
 
     def _scale(self, light: F32, photons: float) -> Any:
         if self.brightness == "source":
-            return photons / (float(self.test.sum(dtype=np.float64)) * self.unit / len(self.test))
+            return photons / self.mean
         sums = light.sum(axis=1, keepdims=True, dtype=np.float64)
         return np.divide(photons, sums, out=np.zeros_like(sums), where=sums > 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """How much light a decision has on average: `amount` photoelectrons, detected (`photons`) or sent (`illumination`)."""
+
+    of: str
+    amount: float
+
+    def photons(self, measurement: Measurement) -> float:
+        """Return the photoelectrons detected of the mean test object, where nothing depends on what was detected."""
+        return self.amount if self.of == "photons" else self.amount / measurement.illumination(1.0)
 
 
 def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str = "source") -> Measurement:
@@ -111,7 +128,8 @@ def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str =
         train, test = (_features(images, weights) for images in (train, test))
         full = weights.sum(axis=0)
     labels, n_classes = (task.train.labels, task.test.labels), len(task.classes)
-    return Measurement(train, labels[0], test, labels[1], n_classes, full, unit, brightness, shape)
+    mean = float(test.sum(dtype=np.float64)) * unit / len(test)
+    return Measurement(train, labels[0], test, labels[1], n_classes, full, unit, brightness, shape, mean)
 
 
 def _features(images: NDArray[np.uint8], weights: F32) -> F32:

@@ -15,12 +15,17 @@ Feature-specific imaging: masks trained with a network on photon counts, through
   masks are intensities (positive and negative parts of a component are masks of their own, learnt as squares), the budget is shared freely
   among the masks and held exactly on average, and the gradient passes a Poisson number as lambda + sqrt(lambda) x noise does.
 - `pca`: the same with the masks frozen, conventional feature-specific imaging.
+- `stopping`: as `deep`, but the network sees the counts of those masks that were displayed, and a decision falls as soon as it is sure
+  (stopping.py). Every training object draws how many masks it is shown, so that those that tell most come first.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,14 +35,16 @@ from torch import Tensor, nn
 from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Task
 
-from .common import Decide, Measurement, Report, measure, named, silent
+from .common import Decide, Light, Measurement, Report, Trials, detect, measure, named, silent
 from .networks import Inputs, decider, feature_net, fit, seeded, size
+from .stopping import Choice, Course, best_rule, decided, empty, held_back
 
 EPOCHS = 15
 ACTIVATION_BITS = 4
 PATTERN_BITS = 5
 PATTERN_RATE = 1e-2
 MASK_RATE = 1e-2
+SPARES = (1.5, 2.5)  # light of all masks that stop, times that of the mean decision
 START_LIGHT = 0.03  # of a mask's largest value, on all its pixels: the square of 0 has no gradient
 _LEAST = 0.05  # photoelectrons, below which the gradient of the noise's spread is cut: it grows as 1 / lambda
 
@@ -146,25 +153,36 @@ class FeatureSpecific(nn.Module):
     mean_image: Tensor
 
     def __init__(
-        self, masks: F64, mean_image: NDArray[np.float32], n_classes: int, options: BaselineOptions, photons: float
+        self, masks: F64, mean_image: NDArray[np.float32], n_classes: int, options: BaselineOptions, level: Light
     ) -> None:
         super().__init__()
         frozen = options.method == "pca"
         start = torch.from_numpy(np.sqrt(masks if frozen else masks + START_LIGHT).astype(np.float32))
         self.weight = nn.Parameter(start, requires_grad=not frozen)
         self.register_buffer("mean_image", torch.from_numpy(mean_image))
-        self.head = feature_net(len(masks), n_classes)
-        self.options, self.photons = options, photons
+        self.stops = options.method == "stopping"
+        self.head = feature_net(len(masks) * (2 if self.stops else 1), n_classes)
+        self.options, self.level = options, level
 
     def masks(self) -> Tensor:
-        """Return the masks (features, pixels), scaled so that the mean training object gives the photons asked for."""
+        """Return the masks (features, pixels), scaled to the photons of the mean training object, or to the illumination."""
         light = self.weight**2
-        return light * (self.photons / (light.sum(dim=0) @ self.mean_image).clamp(min=1e-12))
+        given = light.sum(dim=0) @ self.mean_image if self.level.of == "photons" else light.sum()
+        return light * (self.level.amount / given.clamp(min=1e-12))
 
     def forward(self, transmission: Tensor) -> Tensor:
         """Return scores (n, classes) of fresh counts of objects (n, pixels); random numbers are those of torch's own generator."""
         expected = transmission @ self.masks().T + self.options.dark
-        scores: Tensor = self.head(noisy(expected, self.options.detector))
+        counts = noisy(expected, self.options.detector)
+        if self.stops:
+            return self.after(counts, torch.randint(1, counts.shape[1] + 1, (len(counts), 1)))
+        scores: Tensor = self.head(counts)
+        return scores
+
+    def after(self, counts: Tensor, displayed: Tensor) -> Tensor:
+        """Return scores (n, classes) of the counts of the first masks, `displayed` (n, 1) or () of them."""
+        known = (torch.arange(counts.shape[1]) < displayed).to(counts.dtype).expand_as(counts)
+        scores: Tensor = self.head(torch.cat([counts * known, known], dim=1))
         return scores
 
 
@@ -183,16 +201,16 @@ def noisy(expected: Tensor, detector: str = "counting") -> Tensor:
     return carried + (counts - carried).detach()  # the value is the number itself, whatever was rounded or cut
 
 
-def train_masks(task: Task, options: BaselineOptions, photons: float, report: Report = silent) -> FeatureSpecific:
-    """Return masks and network trained on fresh counts of the training objects of `task`, `photons` per object."""
+def train_masks(task: Task, options: BaselineOptions, level: Light, report: Report = silent) -> FeatureSpecific:
+    """Return masks and network trained on fresh counts of the training objects of `task` at `level`."""
     n_pixels = math.prod(task.image_shape)
     images = task.train.images.reshape(len(task.train), n_pixels)
     mean_image = (images.mean(axis=0) / 255).astype(np.float32)
     masks = principal_masks(images, options.features)
-    model = seeded(lambda: FeatureSpecific(masks, mean_image, len(task.classes), options, photons), options.seed)
+    model = seeded(lambda: FeatureSpecific(masks, mean_image, len(task.classes), options, level), options.seed)
     assert isinstance(model, FeatureSpecific)
 
-    progress = named(f"{options.features} masks at {photons:g} photons", report)
+    progress = named(f"{options.features} masks at {level.amount:g} {level.of}", report)
     labels, epochs, rates = torch.from_numpy(task.train.labels), options.epochs or EPOCHS, {"weight": MASK_RATE}
     fit(model, transmissions(images), labels, epochs=epochs, seed=options.seed, rates=rates, report=progress)
     return model
@@ -209,3 +227,48 @@ def masks_measured(model: FeatureSpecific, task: Task, brightness: str) -> tuple
         shown: NDArray[np.float32] = model.masks().numpy()
     to_scores: Callable[[Tensor], Tensor] = model.head
     return measure(task, shown, brightness), decider(to_scores)
+
+
+def masks_that_stop(
+    task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report = silent
+) -> Iterator[tuple[Light, Choice, Trials]]:
+    """Yield for every level that can be reached what masks trained for it decide on the test objects, as `stopping.stopping` does.
+
+    All masks together have more light than the level (`SPARES`); how much more is chosen with the rule.
+    """
+    kept = len(task.train) - held_back(len(task.train))
+    fitted = replace(task, train=task.train.first(kept))
+    for level in levels:
+        tried = []
+        for spare in SPARES:
+            most = Light(level.of, spare * level.amount)
+            model = train_masks(fitted, options, most, report)
+            measurement, _ = masks_measured(model, task, options.brightness)
+            follow = partial(_mask_by_mask, model, measurement, most.photons(measurement))
+            course, photons, sent = follow(measurement.train[kept:], np.random.default_rng([options.seed, 2]))
+            spent = photons if level.of == "photons" else sent
+            found = best_rule(course, spent, level.amount, measurement.train_labels[kept:])
+            if found is not None:
+                tried.append((found, spare, measurement, follow))
+        if tried:
+            (_, rule), spare, measurement, follow = max(tried, key=lambda one: one[0][0])
+            rng = np.random.default_rng([options.seed, 1])
+            shown = [follow(measurement.test, rng) for _ in range(options.trials or 1)]
+            courses, detected, _ = zip(*shown)
+            done, confidence = decided(measurement, courses, detected, shown[0][2], rule)
+            yield level, Choice(rule, confidence, {"spare": spare}), done
+
+
+def _mask_by_mask(
+    model: FeatureSpecific, measurement: Measurement, most: float, rows: NDArray[Any], rng: np.random.Generator
+) -> tuple[Course, F64, F64]:
+    """What the network says of `rows` after each mask, photons detected and light sent until then, (objects, masks)."""
+    counts = detect(measurement.photoelectrons(rows, most), "counting", rng)
+    light = measurement.full.cumsum(dtype=np.float64)
+    course = empty(len(rows), light * (measurement.illumination(most) / light[-1]), len(light))
+    with torch.no_grad():
+        for k in range(len(light)):
+            scores = model.after(torch.from_numpy(counts), torch.tensor(k + 1))
+            course.tell(np.arange(len(rows)), k, torch.softmax(scores.double(), dim=1).numpy())
+    sent = measurement.sent(rows, most)[:, None] * (light / light[-1])
+    return course, counts.cumsum(axis=1, dtype=np.float64), sent

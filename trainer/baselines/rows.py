@@ -1,4 +1,4 @@
-"""What a baseline reaches at each of several photon levels: one row of figures per level.
+"""What a baseline reaches at each of several levels of light: one row of figures per level.
 
 Rows hold clicks, photons and illumination, the spread over trials and the error from having few objects, for all test objects and for the
 first 200 (those of the paper's tables).
@@ -17,28 +17,29 @@ from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Task
 
-from .common import Decide, Measurement, Report, Trials, detect, measure, run_trials
+from .common import Decide, Light, Measurement, Report, Trials, detect, measure, run_trials
 
 FIRST = 200  # test objects, those of the paper's tables
 
 At = Callable[[float], tuple[Decide, dict[str, Any]]]  # photons per object -> the decision, and facts about it
-AtLevel = Callable[[float], tuple[Measurement, Decide, dict[str, Any]]]  # the same, and the measurement
+AtLevel = Callable[[Light], tuple[Measurement, Decide, dict[str, Any]]]  # the same, and the measurement
 
 
 def baseline_rows(
-    task: Task, options: BaselineOptions, levels: Iterable[float], report: Report
+    task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report
 ) -> Iterator[dict[str, Any]]:
-    """Yield one row of figures per photon level, in the order of `levels` (photoelectrons per decision).
+    """Yield one row of figures per level of light, in the order of `levels`.
 
     Of `stopping` levels out of reach are left out.
     """
     walk = _stopping if options.method == "stopping" else _by_level
     started = time.perf_counter()
-    for photons, n_readouts, done, extra in walk(task, options, levels, report):
+    for level, n_readouts, done, extra in walk(task, options, levels, report):
         yield {
             **row_of(done.measured()),
             "first_200": row_of(done.measured(FIRST)),
-            "photons_asked": photons,
+            "photons_asked": level.amount if level.of == "photons" else None,
+            "illumination_asked": level.amount if level.of == "illumination" else None,
             "detector": options.detector,
             "brightness": options.brightness,
             "dark": options.dark,
@@ -50,37 +51,45 @@ def baseline_rows(
         started = time.perf_counter()
 
 
-Level = tuple[float, int, Trials, dict[str, Any]]  # photons asked for, readouts per object, what was decided, facts
+Level = tuple[Light, int, Trials, dict[str, Any]]  # asked for, readouts per object, what was decided, facts
 
 
-def _stopping(task: Task, options: BaselineOptions, levels: Iterable[float], report: Report) -> Iterator[Level]:
+def _stopping(task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report) -> Iterator[Level]:
+    from .end_to_end import masks_that_stop
     from .stopping import stopping
 
     if options.detector != "counting" or options.dark:
-        raise ValueError("stopping hears every photon: allowed with a counting detector without dark counts only")
-    measurement = measure(task, None, options.brightness)
-    found = stopping(measurement, list(levels), seed=options.seed, trials=options.trials or 1, report=report)
-    for rule, done in found:
-        yield rule.photons, measurement.train.shape[1], done, {"floor": rule.floor, "confidence": 1 - rule.doubt}
+        raise ValueError("stopping counts every photon: allowed with a counting detector without dark counts only")
+    if options.paradigm == "fsi":
+        n_readouts, found = options.features, masks_that_stop(task, options, levels, report)
+    else:
+        measurement = measure(task, None, options.brightness)
+        shared: dict[str, Any] = {"seed": options.seed, "epochs": options.epochs, "trials": options.trials or 1}
+        n_readouts, found = (
+            measurement.train.shape[1],
+            stopping(measurement, levels, task.name, report=report, **shared),
+        )
+    for level, choice, done in found:
+        yield level, n_readouts, done, choice.facts | {"confidence": choice.confidence} | asdict(choice.rule)
 
 
-def _by_level(task: Task, options: BaselineOptions, levels: Iterable[float], report: Report) -> Iterator[Level]:
+def _by_level(task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report) -> Iterator[Level]:
     at_level = _paradigm(task, options, report)
     trials = options.trials or (2 if options.method == "bayes" else 10)
     shared: dict[str, Any] = {"trials": trials, "seed": options.seed, "dark": options.dark}
-    for photons in levels:
-        measurement, decide, extra = at_level(photons)
-        done = run_trials(measurement, photons, options.detector, decide, **shared)
-        yield photons, measurement.train.shape[1], done, extra
+    for level in levels:
+        measurement, decide, extra = at_level(level)
+        done = run_trials(measurement, level.photons(measurement), options.detector, decide, **shared)
+        yield level, measurement.train.shape[1], done, extra
 
 
 def _paradigm(task: Task, options: BaselineOptions, report: Report) -> AtLevel:
-    """What gives measurement and decision at a photon level, with facts about them."""
+    """What gives measurement and decision at a level of light, with facts about them."""
     if options.paradigm == "fsi":
         return _masks(task, options, report)
     makers = {"e2e": _end_to_end, "hadamard": _hadamard}
     measurement, at = makers.get(options.paradigm, _patterns)(task, options, report)
-    return lambda photons: (measurement, *at(photons))
+    return lambda level: (measurement, *at(level.photons(measurement)))
 
 
 def _patterns(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
@@ -165,7 +174,7 @@ def _masks(task: Task, options: BaselineOptions, report: Report) -> AtLevel:
     """Masks are trained anew for every level: the measurement is of the level too."""
     from .end_to_end import masks_measured, train_masks
 
-    def at(photons: float) -> tuple[Measurement, Decide, dict[str, Any]]:
-        return *masks_measured(train_masks(task, options, photons, report), task, options.brightness), {}
+    def at(level: Light) -> tuple[Measurement, Decide, dict[str, Any]]:
+        return *masks_measured(train_masks(task, options, level, report), task, options.brightness), {}
 
     return at

@@ -1,218 +1,275 @@
-"""Direct imaging that stops when it is sure: photons come one by one, after each the exact posterior is known.
+"""Direct imaging that stops when it is sure: a frame is read again and again while it is exposed, until little doubt is left.
 
-The posterior is that of bayes.py, here of a Poisson process: log P = sum of log rate at the pixels that were hit - total rate x elapsed
-time. It knows pixels and times; a decision falls after a photon only. SIMULATED: an ideal camera that reports every photon at once, no dark
-counts. Time is measured in exposures that give one photon per object (`Measurement.photoelectrons` at 1 photon).
+Doubt has two sources: a network of all exposures (exposures.py) and the exact posterior over the training objects, which is better where
+photons are few. The source and its rule, from which doubt on it stops at which exposure, are chosen for each level of light on training
+objects that neither knew. SIMULATED: an ideal camera, without dark counts, whose frame can be read while it is exposed.
+
+Exposures are in photons of the mean test object.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .bayes import FLOORS, VALIDATION_OBJECTS
-from .common import F32, F64, I64, Measurement, Report, Trials, silent
+from .bayes import FLOORS
+from .common import F32, F64, I64, Light, Measurement, Report, Trials, blocks, silent
 
-MOST = 200  # photons after which a decision falls, sure or not
-SURE = 1e-3  # doubt below which the posterior is no longer followed: no threshold is asked to be stricter
-HELD_OUT = 10_000  # last training objects, among which floor and thresholds are chosen
-_ROWS = 8  # objects followed at a time: 2 MiB of log-likelihoods of 60 000 training objects
+GRID = np.geomspace(1.0, 600.0, 65)  # exposures at which the frame is read
+POSTERIOR_LONGEST = 100.0  # exposure; later the posterior is no rival of the network
+SURE = 1e-5  # doubt at which every rule stops
+HELD_BACK = 5000  # last training objects, which choose source and rule
+GROWTHS = (-1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 8.0)
+_MIDDLE = 40.0  # exposure at which a rule's `doubt` is stated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrivals:
-    """Photons of one object per row: pixel and time of each, (objects, most); without light the times are inf."""
+    """All photons until the longest exposure: pixels by object and reading, and how many came until each, (objects, readings)."""
 
     pixels: NDArray[np.int32]
-    times: F32
+    photons: I64
+
+    def between(self, rows: slice) -> Iterator[tuple[NDArray[np.int32], I64]]:
+        """Yield for every reading the pixels hit since the one before it in objects `rows`, and for each the object's place in `rows`."""
+        ends = self.photons[:, -1].cumsum()
+        first = ends - self.photons[:, -1]
+        until = self.photons[rows] + first[rows, None]
+        since = np.concatenate([first[rows, None], until[:, :-1]], axis=1)
+        for a, b in zip(since.T, until.T):
+            who = np.repeat(np.arange(len(a)), b - a)
+            yield self.pixels[np.arange(len(who)) + (a - np.concatenate([[0], (b - a).cumsum()[:-1]]))[who]], who
+
+
+def arrivals(measurement: Measurement, rows: NDArray[np.generic], rng: np.random.Generator) -> Arrivals:
+    """Draw the photons of every object of `rows`: a Poisson process in each pixel."""
+    pixels, photons = [], []
+    for block in blocks(len(rows), rows.shape[1]):
+        counts = rng.poisson(measurement.photoelectrons(rows[block], GRID[-1]))
+        who, pixel = np.nonzero(counts)
+        who, pixel = (np.repeat(each, counts[counts > 0]) for each in (who, pixel))
+        reading = np.searchsorted(GRID, rng.uniform(0, GRID[-1], len(who)))
+        order = np.lexsort((reading, who))
+        pixels.append(pixel[order].astype(np.int32))
+        cell = np.bincount(who * len(GRID) + reading, minlength=len(counts) * len(GRID))
+        photons.append(cell.reshape(-1, len(GRID)).cumsum(axis=1))
+    return Arrivals(np.concatenate(pixels), np.concatenate(photons))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """What is known after each photon, (objects, most): the likeliest label, and `doubt`, 1 - its posterior; what is sure stays."""
+    """What a source says at every reading, (objects, readings): the likeliest label and `doubt`, 1 - its probability.
 
+    Doubt is inf before the source says anything; what is as sure as `SURE` stays so. `exposures` (readings,) grow; every rule stops at
+    the reading `last`.
+    """
+
+    exposures: F64
     labels: NDArray[np.int16]
     doubt: F32
+    last: int
 
-    def stops(self, doubt: float) -> I64:
-        """Return how many photons each object takes until its doubt is at most `doubt`: all of them where it never is."""
-        sure = self.doubt <= np.float32(doubt)
-        most = self.doubt.shape[1]
-        return np.where(sure.any(axis=1), sure.argmax(axis=1) + 1, most)
-
-
-def arrivals(
-    measurement: Measurement, rows: NDArray[np.generic], rng: np.random.Generator, most: int = MOST
-) -> Arrivals:
-    """Draw the first `most` photons of every object: exponential waiting times, pixels by their share of the light."""
-    rates = measurement.photoelectrons(rows, 1.0)
-    pixels, times = np.zeros((len(rates), most), np.int32), np.full((len(rates), most), np.inf, np.float32)
-    waits, chances = rng.exponential(size=times.shape), rng.random(times.shape)
-    for i, of_object in enumerate(rates):
-        below = np.cumsum(of_object, dtype=np.float64)
-        if below[-1] > 0:
-            pixels[i] = np.searchsorted(below / below[-1], chances[i], side="right")
-            times[i] = np.cumsum(waits[i]) / below[-1]
-    return Arrivals(pixels, times)
+    def tell(self, place: I64 | int, k: int, chances: F64) -> None:
+        """Note the chances (..., classes) of objects `place` at reading `k`, which stay unless a later reading changes them."""
+        best = chances.argmax(axis=-1)
+        others = chances.copy()
+        np.put_along_axis(others, np.expand_dims(best, -1), 0.0, axis=-1)  # 1 - chance would lose small doubts
+        self.labels[place, k:] = best[..., None]
+        self.doubt[place, k:] = others.sum(axis=-1)[..., None]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Mixture:
-    """The training objects by class: log rates (pixels, objects), total rates (objects,), first object of each class."""
-
-    log_rates: F32
-    totals: F32
-    starts: I64
-    labels: I64  # of the classes that have objects, by `starts`
+Source = Callable[[Arrivals, Report], Course]
 
 
-def mixture(measurement: Measurement, floor: float, left_out: I64 | None = None) -> Mixture:
-    """Return the training objects of `measurement` but those numbered `left_out`, every transmission lifted by `floor` (above 0)."""
-    kept = np.ones(len(measurement.train_labels), bool)
-    if left_out is not None:
-        kept[left_out] = False
-    order = np.argsort(measurement.train_labels, kind="stable")
-    order = order[kept[order]]
+def empty(n: int, exposures: F64, readings: int) -> Course:
+    """Return a course of `n` objects of which nothing is known yet; the source knows the first `readings` alone."""
+    shape = n, len(exposures)
+    return Course(exposures, np.zeros(shape, np.int16), np.full(shape, np.inf, np.float32), readings - 1)
+
+
+def of_network(log_chances: Callable[[F32, float], F64], n_pixels: int, earliest: float) -> Source:
+    """Return the source that asks log P(class | counts, exposure) from the exposure `earliest` on."""
+
+    def follow(heard: Arrivals, report: Report) -> Course:
+        course = empty(len(heard.photons), GRID, len(GRID))
+        for rows in blocks(len(heard.photons), n_pixels):
+            size = len(course.labels[rows])
+            counts, unsure = np.zeros((size, n_pixels), np.float32), np.ones(size, bool)
+            for k, (pixels, who) in enumerate(heard.between(rows)):
+                np.add.at(counts, (who, pixels), 1)
+                if GRID[k] >= earliest and unsure.any():
+                    place = np.arange(size)[unsure] + rows.start
+                    course.tell(place, k, np.exp(log_chances(counts[unsure], GRID[k])))
+                    unsure[unsure] = course.doubt[place, k] > SURE
+                report("network, reading by reading", (rows.start + size * (k + 1) / len(GRID)) / len(course.labels))
+        return course
+
+    return follow
+
+
+def of_posterior(measurement: Measurement, floor: float, known: int) -> Source:
+    """Return the source that knows the first `known` training objects, each as likely, every transmission lifted by `floor` (above 0).
+
+    log P(photons | object) is the sum of the log rates at the pixels hit, less total rate x exposure.
+    """
+    order = np.argsort(measurement.train_labels[:known], kind="stable")
+    labels, starts = np.unique(measurement.train_labels[order], return_index=True)
     rates = measurement.photoelectrons(measurement.train[order], 1.0, floor)
     totals = rates.sum(axis=1, dtype=np.float64).astype(np.float32)
-    labels, starts = np.unique(measurement.train_labels[order], return_index=True)
-    return Mixture(np.ascontiguousarray(np.log(rates, out=rates).T), totals, starts.astype(np.int64), labels)
+    log_rates = np.ascontiguousarray(np.log(rates, out=rates).T)
+    waits = np.diff(GRID[GRID <= POSTERIOR_LONGEST], prepend=0.0).astype(np.float32)
+
+    def follow(heard: Arrivals, report: Report) -> Course:
+        course, first = empty(len(heard.photons), GRID, len(waits)), 0
+        for i, photons in enumerate(heard.photons):
+            log_joint, came = np.zeros(len(totals), np.float32), np.diff(photons, prepend=0)
+            for k, wait in enumerate(waits):
+                _hear(log_joint, log_rates, totals, heard.pixels[first : first + came[k]], wait)
+                first += came[k]
+                log_joint -= log_joint.max()
+                masses = np.zeros(measurement.n_classes)
+                masses[labels] = np.add.reduceat(np.exp(log_joint), starts)
+                course.tell(i, k, masses / masses.sum())
+                if course.doubt[i, k] <= SURE:
+                    break
+            first += photons[-1] - photons[k]
+            report("posterior, reading by reading", (i + 1) / len(heard.photons))
+        return course
+
+    return follow
 
 
 @numba.njit(cache=True, nogil=True)
-def _hear(log_joint: F32, log_rates: F32, totals: F32, pixels: NDArray[np.int32], waits: F32) -> None:
-    """Add one photon to each row of `log_joint`, (rows, objects)."""
-    for i in range(len(log_joint)):
-        row, of_pixel, wait = log_joint[i], log_rates[pixels[i]], waits[i]
-        for j in range(len(row)):
-            row[j] += of_pixel[j] - wait * totals[j]
-
-
-def follow(known: Mixture, heard: Arrivals, report: Report = silent) -> Course:
-    """Return the posterior of every object after each of its photons, in log space, until its doubt is below `SURE`."""
-    n, most = heard.pixels.shape
-    labels, doubt = np.zeros((n, most), np.int16), np.ones((n, most), np.float32)
-    alive = np.flatnonzero(np.isfinite(heard.times[:, 0])) if most else np.empty(0, np.int64)
-    waits = np.diff(heard.times[alive], axis=1, prepend=np.float32(0)).astype(np.float32)
-    labels[:] = known.labels[
-        np.argmax(np.diff(known.starts, append=len(known.totals)))
-    ]  # the most frequent: without light
-    place, taken = np.arange(min(_ROWS, len(alive))), min(_ROWS, len(alive))  # into `alive`
-    step = np.zeros(len(place), np.int64)
-    log_joint = np.zeros((len(place), len(known.totals)), np.float32)
-    scratch = np.empty_like(log_joint)
-    while len(place):
-        who = alive[place]
-        _hear(log_joint, known.log_rates, known.totals, heard.pixels[who, step], waits[place, step])
-        log_joint -= log_joint.max(axis=1, keepdims=True)
-        weights = np.exp(log_joint, out=scratch[: len(place)])
-        masses = np.add.reduceat(weights, known.starts, axis=1).astype(np.float64)
-        best = masses.argmax(axis=1)
-        lost = (masses.sum(axis=1) - masses[np.arange(len(best)), best]) / masses.sum(axis=1)
-        labels[who, step], doubt[who, step] = known.labels[best], np.maximum(lost, 0)
-        step += 1
-        ended = np.flatnonzero((step == most) | (lost < SURE))
-        for i in ended:  # what is sure stays so
-            for known_now in (labels, doubt):
-                known_now[who[i], step[i] :] = known_now[who[i], step[i] - 1]
-        place, step, log_joint, taken = _replaced(ended, place, step, log_joint, taken, len(alive))
-        report("photon by photon", taken / max(1, len(alive)))
-    return Course(labels, doubt)
-
-
-def _replaced(ended: I64, place: I64, step: I64, log_joint: F32, taken: int, n: int) -> tuple[I64, I64, F32, int]:
-    """Give the rows that have ended to objects not yet begun, and drop them where there are none."""
-    fresh = min(len(ended), n - taken)
-    into, dropped = ended[:fresh], ended[fresh:]
-    place[into], step[into], log_joint[into] = np.arange(taken, taken + fresh), 0, 0.0
-    if len(dropped):
-        place, step = np.delete(place, dropped), np.delete(step, dropped)
-        log_joint = np.delete(log_joint, dropped, axis=0)
-    return place, step, log_joint, taken + fresh
-
-
-def threshold_for(course: Course, photons: float) -> float:
-    """Return the doubt at which the mean number of photons is as near to `photons` as can be from below; ValueError out of reach."""
-    low, high = course.stops(SURE).mean(), course.stops(1.0).mean()
-    if not high <= photons <= low:
-        raise ValueError(
-            f"photons is {photons:g}, allowed when stopping: {high:g} to {low:.1f}, the mean when sure to 1 - {SURE:g}"
-        )
-    sure, unsure = math.log(SURE), 0.0
-    for _ in range(60):
-        middle = (sure + unsure) / 2
-        if course.stops(math.exp(middle)).mean() <= photons:
-            unsure = middle
-        else:
-            sure = middle
-    return math.exp(unsure)
+def _hear(log_joint: F32, log_rates: F32, totals: F32, pixels: NDArray[np.int32], wait: np.float32) -> None:
+    """Add `pixels` hit during `wait` to `log_joint`, (objects,)."""
+    for j in range(len(log_joint)):
+        log_joint[j] -= wait * totals[j]
+    for pixel in pixels:
+        of_pixel = log_rates[pixel]
+        for j in range(len(log_joint)):
+            log_joint[j] += of_pixel[j]
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """When to stop at a mean number of photons: the doubt, and the floor of the mixture."""
+    """Stop at the first reading whose doubt is at most `doubt` (exposure / 40)^`growth`, at least `SURE`."""
 
-    photons: float
     doubt: float
-    floor: float
+    growth: float
+
+    def stops(self, course: Course) -> I64:
+        """Return the number of the reading at which each object is decided: the last where doubt remains."""
+        with np.errstate(over="ignore"):
+            limit = np.maximum(SURE, self.doubt * (course.exposures / _MIDDLE) ** self.growth)
+        sure = course.doubt <= limit
+        sure[:, course.last :] = True
+        return sure.argmax(axis=1)
 
 
-def rules(measurement: Measurement, levels: Iterable[float], seed: int, report: Report = silent) -> list[Rule]:
-    """Choose one floor and a threshold per level, on some of the last training objects left out of the mixture.
+def at(values: NDArray[Any], stops: I64) -> NDArray[Any]:
+    """Return what `values` (objects, readings) hold where each object stops."""
+    return values[np.arange(len(stops)), stops]
 
-    Levels beyond what doubt `SURE` takes are left out.
+
+def best_rule(course: Course, spent: F64, level: float, wanted: I64) -> tuple[float, Rule] | None:
+    """Return the rule that decides best among those that spend `level` on average, and its accuracy; None where none spends as much.
+
+    `spent` (objects, readings) grows along the readings.
     """
-    n, rng = len(measurement.train_labels), np.random.default_rng([seed, 2])
-    last = np.arange(max(0, n - HELD_OUT), n)
-    chosen = np.sort(rng.permutation(last)[: min(VALIDATION_OBJECTS, n // 5)])
-    heard, wanted = arrivals(measurement, measurement.train[chosen], rng), measurement.train_labels[chosen]
-    best: tuple[float, list[Rule]] = (-1.0, [])
-    for floor in FLOORS:
-        course = follow(mixture(measurement, floor, chosen), heard, report)
-        found, right = [], 0.0
-        for photons in levels:
-            try:
-                found.append(Rule(photons, threshold_for(course, photons), floor))
-            except ValueError:
-                continue
-            right += float((_decided(course, found[-1].doubt)[0] == wanted).mean())
-        best = max(best, (right, found), key=lambda one: one[0])
-    return best[1]
+    found: list[tuple[float, Rule]] = []
+    for growth in GROWTHS:
+        low, high = -60.0, 60.0  # of log doubt; more doubt, earlier stops
+        extremes = [at(spent, Rule(math.exp(edge), growth).stops(course)).mean() for edge in (high, low)]
+        if not extremes[0] <= level <= extremes[1]:
+            continue
+        for _ in range(40):
+            middle = (low + high) / 2
+            if at(spent, Rule(math.exp(middle), growth).stops(course)).mean() <= level:
+                high = middle
+            else:
+                low = middle
+        rule = Rule(math.exp(high), growth)
+        found.append((float((at(course.labels, rule.stops(course)) == wanted).mean()), rule))
+    return max(found, key=lambda one: one[0], default=None)
 
 
-def _decided(course: Course, doubt: float) -> tuple[NDArray[np.int16], I64]:
-    stops = course.stops(doubt)
-    return course.labels[np.arange(len(stops)), stops - 1], stops
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """How a level is met: the rule, its mean confidence on test objects, and facts about the source."""
+
+    rule: Rule
+    confidence: float
+    facts: dict[str, Any]
+
+
+def held_back(n: int) -> int:
+    """Return how many of `n` training objects, the last ones, choose the rule."""
+    return min(HELD_BACK, n // 5)
 
 
 def stopping(
-    measurement: Measurement, levels: Iterable[float], *, seed: int, trials: int = 1, report: Report = silent
-) -> Iterator[tuple[Rule, Trials]]:
+    measurement: Measurement,
+    levels: Iterable[Light],
+    task: str,
+    *,
+    seed: int,
+    epochs: int | None = None,
+    trials: int = 1,
+    report: Report = silent,
+) -> Iterator[tuple[Light, Choice, Trials]]:
     """Yield for every level that can be reached what was decided on the test objects, each `trials` times.
 
-    Photons and clicks are those detected until the decision (every photon is a click of its own); the illumination is that until then.
+    `task` is a name, by which the network is trained. Clicks, photons and illumination are those until the decision (every photon is a
+    click of its own).
     """
-    chosen = rules(measurement, levels, seed, report)
-    if not chosen:
-        return
-    known, rng = mixture(measurement, chosen[0].floor), np.random.default_rng([seed, 1])
-    courses: list[tuple[Course, Arrivals]] = []
-    for _ in range(trials):
-        heard = arrivals(measurement, measurement.test, rng)
-        courses.append((follow(known, heard, report), heard))
-    lit, of_time = np.isfinite(courses[0][1].times[:, 0]), measurement.illumination(1.0)
-    for rule in chosen:
-        right = np.empty((trials, len(lit)), bool)
-        photons: F64 = np.zeros(len(lit))
-        elapsed = 0.0
-        for trial, (course, heard) in enumerate(courses):
-            labels, stops = _decided(course, rule.doubt)
-            right[trial] = labels == measurement.test_labels
-            photons += np.where(lit, stops, 0) / trials
-            elapsed += float(heard.times[lit, stops[lit] - 1].sum(dtype=np.float64)) / len(lit) / trials
-        yield rule, Trials(right, photons, photons, elapsed * of_time)
+    from .exposures import SHORTEST, exposure_net, log_chances
+
+    n, n_pixels = measurement.train.shape
+    known = n - held_back(n)
+    net = exposure_net(measurement, known, task, seed=seed, epochs=epochs, report=report)
+    network = of_network(lambda counts, exposure: log_chances(net, counts, exposure), n_pixels, SHORTEST)
+    rows, wanted, rng = measurement.train[known:], measurement.train_labels[known:], np.random.default_rng([seed, 2])
+    held = arrivals(measurement, rows, rng)
+    share = measurement.photoelectrons(rows, 1.0).sum(axis=1, dtype=np.float64).mean()  # beside the test objects' mean
+    spent = {"photons": held.photons / share, "illumination": measurement.sent(rows, 1.0)[:, None] * GRID}
+    courses: dict[float | None, Course] = {None: network(held, report)}  # by the floor of the posterior
+    courses |= {floor: of_posterior(measurement, floor, known)(held, report) for floor in FLOORS}
+    rng = np.random.default_rng([seed, 1])
+    heard = [arrivals(measurement, measurement.test, rng) for _ in range(trials)]
+    sent = measurement.sent(measurement.test, 1.0)[:, None] * GRID
+    told: dict[float | None, list[Course]] = {}
+    for level in levels:
+        rules = [
+            (found, floor)
+            for floor, course in courses.items()
+            if (found := best_rule(course, spent[level.of], level.amount, wanted))
+        ]
+        if not rules:
+            continue
+        (_, rule), floor = max(rules, key=lambda one: one[0][0])
+        if floor not in told:
+            source = network if floor is None else of_posterior(measurement, floor, n)
+            told[floor] = [source(each, report) for each in heard]
+        done, confidence = decided(measurement, told[floor], [each.photons for each in heard], sent, rule)
+        facts = {"source": "network" if floor is None else "posterior", "floor": floor}
+        yield level, Choice(rule, confidence, facts), done
+
+
+def decided(
+    measurement: Measurement, told: Sequence[Course], photons: Sequence[NDArray[Any]], sent: F64, rule: Rule
+) -> tuple[Trials, float]:
+    """Return what `rule` decides on the test objects, and its mean confidence, from one course and photons of each trial.
+
+    `photons` and `sent`, (objects, readings), are those until a reading.
+    """
+    stops = [rule.stops(course) for course in told]
+    right = [at(course.labels, k) == measurement.test_labels for course, k in zip(told, stops)]
+    detected: F64 = np.mean([at(each, k) for each, k in zip(photons, stops)], axis=0)
+    illumination, doubt = np.mean([at(sent, k) for k in stops]), [at(course.doubt, k) for course, k in zip(told, stops)]
+    return Trials(np.array(right), detected, detected, float(illumination)), 1 - float(np.mean(doubt))

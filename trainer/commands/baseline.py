@@ -1,4 +1,4 @@
-"""`pans baseline direct|compressive|e2e|fsi|hadamard`: the alternatives to PANS, at equal photons. All figures are SIMULATED."""
+"""`pans baseline direct|compressive|e2e|fsi|hadamard`: the alternatives to PANS, at equal light. All figures are SIMULATED."""
 
 from __future__ import annotations
 
@@ -32,10 +32,12 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "--photons",
         type=LIGHT.option,
         nargs="+",
-        default=list(DEFAULT_PHOTONS),
+        default=[],
         metavar="N",
-        help="photoelectrons per decision, averaged over the test objects (default: 5 10 17 30 100 300)",
+        help="photoelectrons detected per decision, averaged over the test objects (default: 5 10 17 30 100 300)",
     )
+    words = "photoelectrons sent per decision, instead or besides: what a clear object would give"
+    parser.add_argument("--illumination", type=LIGHT.option, nargs="+", default=[], metavar="L", help=words)
     parser.add_argument(
         "--objects", type=OBJECTS.option, metavar="N", help="only the first N test objects (default: all)"
     )
@@ -46,11 +48,15 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from pans.trainer.baselines.common import Light
     from pans.trainer.baselines.rows import baseline_rows
     from pans.trainer.tasks.registry import load_task
 
     options = _options(args)
-    if not (args.paradigm == "direct" and args.method in ("bayes", "stopping")):
+    if not args.photons + args.illumination:
+        args.photons = list(DEFAULT_PHOTONS)
+    levels = [Light(of, amount) for of in ("photons", "illumination") for amount in getattr(args, of)]
+    if not (args.paradigm == "direct" and args.method == "bayes"):
         torch_with(args.threads, "a trained baseline")
     whole = load_task(args.task, args.data_dir)
     task = replace(whole, train=whole.train.first(args.train_objects), test=whole.test.first(args.objects))
@@ -58,15 +64,13 @@ def _run(args: argparse.Namespace) -> int:
     code = EXIT_FINE
     try:
         with usage_errors(), _progress() as report:
-            for row in baseline_rows(task, options, args.photons, report):
-                first, words = (
-                    row["first_200"],
-                    f"{row['photons_asked']:>9g} photons: {100 * row['accuracy_mean']:6.2f} %  ",
-                )
+            for row in baseline_rows(task, options, levels, report):
+                of = "illumination" if row["photons_asked"] is None else "photons"
+                first, words = row["first_200"], f"{row[f'{of}_asked']:>9g} {of}: {100 * row['accuracy_mean']:6.2f} %  "
                 say(f"{words}(first {first['objects']}: {100 * first['accuracy_mean']:6.2f} %)  {row['seconds']:.0f} s")
                 rows.append(row)
     except KeyboardInterrupt:
-        say("interrupted; the photon levels above are whole")
+        say("interrupted; the levels above are whole")
         code = EXIT_INTERRUPTED
     if rows:
         shared = {"task": task.name, "paradigm": args.paradigm, "method": args.method, "seed": args.seed}
@@ -74,7 +78,8 @@ def _run(args: argparse.Namespace) -> int:
         emit(args, payload, _table(task, args, rows))
     elif code == EXIT_FINE:
         raise UsageError(
-            f"--photons {args.photons}: none can be reached by stopping", remedy="ask for fewer, from 1 on"
+            f"--photons {args.photons} --illumination {args.illumination}: none can be reached by stopping",
+            remedy="ask for fewer photons, from 1 on",
         )
     return code
 

@@ -131,12 +131,13 @@ def _beside(direct: Mapping[str, float], same: str) -> str:
 
 def compared(task: Task, photons: float, seed: int) -> dict[str, Any]:
     """Return what direct imaging decides at that many photons, by its exact posterior: accuracy, its error, photons, illumination."""
+    from pans.trainer.baselines.common import Light
     from pans.trainer.baselines.rows import baseline_rows
     from pans.trainer.options import BaselineOptions
 
     options = BaselineOptions("direct", "bayes", trials=BASELINE_TRIALS, seed=seed)
     wanted = "accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination"
-    row = next(iter(baseline_rows(task, options, [photons], lambda _what, _done: None)))
+    row = next(iter(baseline_rows(task, options, [Light("photons", photons)], lambda _what, _done: None)))
     return {key: row[key] for key in wanted}
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.budget import for_task, started_from, with_defaults
-from pans.trainer.baselines.common import silent
+from pans.trainer.baselines.common import Light, silent
 from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.options import AutomatonOptions, BaselineOptions, Options
@@ -25,6 +25,8 @@ from .active import PROFILE
 from .page import FIRST_OBJECTS, Asked, Row, Rows, check_cached_bundle, flat, read_toml
 
 WAYS: list[Row] = read_toml("ways.toml")["way"]
+SENT = " sent"  # of a level in ways.toml: light sent, not photons detected
+BY_SENT = ", by light sent"  # of the way's name in a row
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +40,14 @@ class Point:
     options: tuple[tuple[str, Any], ...]
     levels: tuple[float, ...] = ()
     start: Point | None = None
+    sent: tuple[float, ...] = ()  # levels of light sent that share the options
+    by_sent: bool = False  # whether `level` is of light sent
 
     @property
     def stem(self) -> str:
         """What its files in the cache are called, but for the seed."""
         words = "".join(letter for letter in self.way.lower().replace(" ", "-") if letter.isalnum() or letter == "-")
-        return f"frontier-{self.task}-{words}-{self.level:g}"
+        return f"frontier-{self.task}-{words}-{'sent-' if self.by_sent else ''}{self.level:g}"
 
     def training_seed(self, seed: int) -> int:
         """Return the seed of the training: the next one after that of the automaton it starts from, for other distortions."""
@@ -52,7 +56,8 @@ class Point:
     def made_with(self, seed: int) -> Row:
         """Return the whole recipe of a row: one that was made with another is made again."""
         start = {} if self.start is None else {"start": self.start.made_with(seed)}
-        return {"kind": self.kind, **dict(self.options), "seed": self.training_seed(seed), **start}
+        sent = {"sent": self.sent} if self.sent else {}
+        return {"kind": self.kind, **dict(self.options), "seed": self.training_seed(seed), **start, **sent}
 
 
 def ways_of(page: str) -> list[str]:
@@ -62,16 +67,18 @@ def ways_of(page: str) -> list[str]:
 
 def points(page: str) -> Iterator[Point]:
     """Yield all points of a page, way by way."""
-    known: dict[tuple[str, str, float], Point] = {}
+    known: dict[tuple[str, str, str], Point] = {}
     for way in (way for way in WAYS if way.get("page", "frontier") == page):
         for task, levels in way["levels"].items():
             for text, more in levels.items():
-                start = known[task, way["start"], float(text)] if "start" in way else None
-                shared = tuple(float(other) for other, options in levels.items() if options == more)
-                options = tuple((way["options"] | more).items())
-                known[task, way["name"], float(text)] = Point(
-                    task, way["name"], float(text), way["kind"], options, shared, start
-                )
+                start = known[task, way["start"], text] if "start" in way else None
+                shared: dict[bool, list[float]] = {False: [], True: []}
+                for other in (other for other, options in levels.items() if options == more):
+                    shared[other.endswith(SENT)].append(float(other.removesuffix(SENT)))
+                level, options = float(text.removesuffix(SENT)), tuple((way["options"] | more).items())
+                alike = tuple(shared[False]), start, tuple(shared[True])
+                point = Point(task, way["name"], level, way["kind"], options, *alike, text.endswith(SENT))
+                known[task, way["name"], text] = point
     yield from known.values()
 
 
@@ -87,7 +94,8 @@ def measured_points(asked: Asked, page: str, seeds: int = 1) -> Rows:
                 continue
             found = point_row(asked, point, seed)
             if found is not None:
-                rows.append({"task": point.task, "way": point.way, "level": point.level} | found)
+                way = point.way + (BY_SENT if point.by_sent else "")
+                rows.append({"task": point.task, "way": way, "level": point.level} | found)
     return rows
 
 
@@ -95,14 +103,16 @@ def point_row(asked: Asked, point: Point, seed: int) -> Row | None:
     """Return the flat figures of a point from one seed, from the cache or measured now; None where it is missing or out of reach."""
     made_with = point.made_with(seed)
     if point.kind == "baseline":  # all levels of the same options at once: they share what is trained or drawn
-        name, made_with = (
-            f"{replace(point, level=point.levels[0]).stem}-seed{seed}",
-            made_with | {"levels": point.levels},
-        )
-        found = asked.kept(name, made_with, partial(_baseline, asked, point, seed))
-        return None if found is None else found["rows"].get(f"{point.level:g}")
+        first = replace(point, level=(point.levels or point.sent)[0], by_sent=not point.levels)
+        made_with |= {"levels": point.levels}
+        found = asked.kept(f"{first.stem}-seed{seed}", made_with, partial(_baseline, asked, point, seed))
+        return None if found is None else found["rows"].get(_key(point.level, point.by_sent))
     make = partial({"fixed": _fixed, "automaton": _automaton}[point.kind], asked, point, seed)
     return asked.kept(f"{point.stem}-seed{seed}", made_with, make)
+
+
+def _key(level: float, by_sent: bool) -> str:
+    return f"{level:g}{SENT if by_sent else ''}"
 
 
 @functools.lru_cache(maxsize=1)  # the points of a task share it
@@ -115,8 +125,14 @@ def _baseline(asked: Asked, point: Point, seed: int) -> Row:
     per_feature = {"fsi": 1, "hadamard": 2}.get(options.paradigm, 0)  # one per mask, two per pair, one frame
     exposures = per_feature * options.features or 1
     facts = {"exposures": exposures, "features": options.features}
-    rows = baseline_rows(_task(point.task, asked.data_dir), options, point.levels, silent)
-    return {"rows": {f"{row['photons_asked']:g}": flat(row, row["first_200"]) | facts for row in rows}}
+    levels = [Light("photons", level) for level in point.levels]
+    levels += [Light("illumination", level) for level in point.sent]
+    found: dict[str, Row] = {}
+    for row in baseline_rows(_task(point.task, asked.data_dir), options, levels, silent):
+        by_sent = row["photons_asked"] is None
+        level = row["illumination_asked" if by_sent else "photons_asked"]
+        found[_key(level, by_sent)] = flat(row, row["first_200"]) | facts
+    return {"rows": found}
 
 
 def _fixed(asked: Asked, point: Point, seed: int) -> Row:

@@ -227,12 +227,13 @@ def called(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dic
 def test_every_way_answers_with_the_keys_of_evaluate(
     words: tuple[object, ...], task_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, answer = called(capsys, *words, "--task", task_file, "--photons", 4, 40, "--trials", 2)
+    code, answer = called(capsys, *words, "--task", task_file, "--photons", 4, 40, "--illumination", 9, "--trials", 2)
     assert code == 0
     rows = answer["rows"]
     assert all(set(row) >= KEYS for row in (answer, *rows, answer["first_200"]))
-    assert [row["photons_asked"] for row in rows] == [4.0, 40.0]
-    assert [row["photons_mean"] for row in rows] == pytest.approx([4.0, 40.0], rel=1e-5)
+    assert [row["photons_asked"] for row in rows] == [4.0, 40.0, None]
+    assert [row["photons_mean"] for row in rows[:2]] == pytest.approx([4.0, 40.0], rel=1e-5)
+    assert (rows[2]["illumination_asked"], rows[2]["illumination"]) == (9.0, pytest.approx(9.0, rel=1e-5))
     assert rows[0]["illumination"] < rows[1]["illumination"]
     assert rows[0]["clicks_mean"] < rows[1]["clicks_mean"]
     assert (rows[0]["objects"], rows[0]["first_200"]["objects"], rows[0]["trials"]) == (240, 200, 2)

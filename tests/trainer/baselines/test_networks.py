@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from pans.trainer.baselines.common import measure, run_trials
-from pans.trainer.baselines.end_to_end import masks_measured, noisy, principal_masks, train_masks
+from pans.trainer.baselines.common import Light, measure, run_trials
+from pans.trainer.baselines.end_to_end import masks_measured, masks_that_stop, noisy, principal_masks, train_masks
 from pans.trainer.baselines.networks import aware_net, hadamard_12, pairs
 from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Objects, Task
@@ -93,17 +93,40 @@ def test_principal_masks_are_parts_of_the_axes_of_the_images() -> None:
         principal_masks(images, 7)
 
 
+def best_of_two_pixels() -> float:
+    """The best accuracy of 3 photons without stopping: one mask per pixel, 2.4 and 0.6 photons on average."""
+    log_p = [[n * math.log(rate) - rate - math.lgamma(n + 1) for n in range(60)] for rate in (2.4, 0.6)]
+    p, q = (np.exp(row) for row in log_p)
+    return float(np.tril(np.outer(p, q), -1).sum() + 0.5 * (p * q).sum())
+
+
 def test_masks_hold_the_photon_budget_and_reach_what_counts_allow() -> None:
     """Best is one mask per pixel: right if the bright pixel (2.4) counts more than the dim one (0.6), half right on a tie."""
     task = pixels_task()
-    model = train_masks(task, BaselineOptions("fsi", "deep", features=2, epochs=6), 3.0)
+    model = train_masks(task, BaselineOptions("fsi", "deep", features=2, epochs=6), Light("photons", 3.0))
     measurement, decide = masks_measured(model, task, "source")
     with torch.no_grad():
         masks = model.masks().numpy()
     assert (masks @ np.array([0.5, 0.5])).sum() == pytest.approx(3.0, rel=1e-4)  # the mean object is 0.5 everywhere
-    log_p = [[n * math.log(rate) - rate - math.lgamma(n + 1) for n in range(60)] for rate in (2.4, 0.6)]
-    p, q = (np.exp(row) for row in log_p)
-    best = float(np.tril(np.outer(p, q), -1).sum() + 0.5 * (p * q).sum())
+    best = best_of_two_pixels()
     found = run_trials(measurement, 3.0, "counting", decide, trials=10, seed=1).right
     error = 5 * math.sqrt(best * (1 - best) / found.size)
     assert found.mean() > best - 0.02 - error
+
+
+def test_masks_that_stop_spend_their_level_are_calibrated_and_above_those_that_do_not() -> None:
+    """The two pixels are two halves here, a little noisy, so that there are components enough for six masks."""
+    rng = np.random.default_rng(4)
+    labels = rng.integers(0, 2, 4000)
+    images = np.where((np.arange(4) // 2 == labels[:, None])[:, None], 204, 51) + rng.integers(-25, 26, (4000, 2, 4))
+    parts = [Objects(images[rows].astype(np.uint8), labels[rows]) for rows in (slice(0, 2500), slice(2500, None))]
+    task = Task("halves", ("a", "b"), *parts, "0" * 64, "made here")
+    options = BaselineOptions("fsi", "stopping", features=6, epochs=16, trials=2)
+    for level in (Light("photons", 3.0), Light("illumination", 6.0)):  # the mean object is 0.5 everywhere
+        ((asked, choice, trials),) = masks_that_stop(task, options, [level])
+        found = trials.measured()
+        assert asked == level
+        assert found.illumination == pytest.approx(2 * found.photons_mean, rel=0.05)
+        assert 2.4 < found.photons_mean < 3.1  # six masks cannot come nearer
+        assert choice.confidence == pytest.approx(found.accuracy_mean, abs=0.03)
+        assert found.accuracy_mean > best_of_two_pixels() + 3 * found.accuracy_se_objects

@@ -16,10 +16,11 @@ from pans.trainer.reproduce import curves, ways
 from pans.trainer.reproduce.curves import EXACT, STOPPING
 from pans.trainer.reproduce.page import Asked, of_table, page_of, read_rows, write_page
 from pans.trainer.reproduce.printed import ACTIVE
-from pans.trainer.reproduce.ways import Point
+from pans.trainer.reproduce.ways import BY_SENT, Point
 from pans.trainer.tasks.registry import Task
 
 QUICK = {"exposures": 4, "states": 3, "grow_epochs": 1, "tune_epochs": 1, "epochs": 1, "reroutes": 0}
+SENT = STOPPING + BY_SENT
 GROWN = Point("mnist", "automaton", 2.0, "automaton", (("photons", 2.0), *QUICK.items()))
 
 
@@ -48,7 +49,7 @@ def test_the_points_can_be_trained_and_every_start_is_there():
         if point.kind == "fixed":
             check_options(Options(**dict(point.options)), load_profile("ideal"))
         if point.kind == "baseline":
-            assert point.level in point.levels
+            assert point.level in (point.sent if point.by_sent else point.levels)
             options = BaselineOptions(**dict(point.options))
             assert options.method in METHODS[options.paradigm]
         if point.kind == "automaton":
@@ -150,17 +151,23 @@ def test_an_automaton_is_trained_once_and_trained_on_from_the_one_in_the_cache(a
 def test_the_page_measures_every_kind_of_point_and_is_drawn(asked, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
     bayes = {"paradigm": "direct", "method": "bayes", "trials": 1}
-    stopping = bayes | {"method": "stopping"}
+    stopping = bayes | {"method": "stopping", "epochs": 1}
     fixed = {"features": 3, "alpha": 0.0, "photons": 3.0, "epochs": 2, "hidden": 8, "batch": 50}
     wanted = [
         {"name": EXACT, "kind": "baseline", "options": bayes, "levels": {"mnist": {"0.5": {}, "100": {}}}},
-        {"name": STOPPING, "kind": "baseline", "options": stopping, "levels": {"mnist": {"3": {}, "1000": {}}}},
+        {
+            "name": STOPPING,
+            "kind": "baseline",
+            "options": stopping,
+            "levels": {"mnist": {"3": {}, "1000": {}, "6 sent": {}}},
+        },
         {"name": "fixed", "kind": "fixed", "options": fixed, "levels": {"mnist": {"3": {}}}},
     ]
     monkeypatch.setattr(ways, "WAYS", wanted)
     page = curves.frontier_page(asked)
     points = {(row["way"], row["level"]): row for row in of_table(page.rows, "mnist")}
-    assert set(points) == {(EXACT, 0.5), (EXACT, 100), (STOPPING, 3), ("fixed", 3)}  # no 1000 for stopping
+    assert set(points) == {(EXACT, 0.5), (EXACT, 100), (STOPPING, 3), (SENT, 6), ("fixed", 3)}  # no 1000 for stopping
+    assert points[SENT, 6]["illumination"] == pytest.approx(6, rel=0.25)
     assert points[EXACT, 0.5]["photons"] == pytest.approx(0.5, rel=1e-4)
     assert points["fixed", 3]["exposures"] == 3
     assert "ahead" in points["fixed", 3]
