@@ -20,11 +20,12 @@ from .active import OTHER_SEEDS, finished_row, shot_figures
 from .dynamics import ALPHAS, training
 from .page import FIRST_OBJECTS, Asked, Made, Row, Rows, against, beside_curve, by_epoch, flat, sampling_error
 from .printed import ACTIVE, DIRECT
-from .ways import measured_points, points
+from .ways import BY_SENT, measured_points, points
 
 TASK = "fashion-mnist"
 PANS, ENVELOPE = "PANS", "end-to-end, envelope"
 EXACT, STOPPING, CLEAN = "direct, exact posterior", "direct, stops when sure", "direct, network of clean frames"
+FRAMES = (EXACT, STOPPING, STOPPING + BY_SENT)  # of direct imaging, of which the best counts
 FIXED, FIXED_LIGHT = "ours, fixed, held to clicks", "ours, fixed, light weighed"
 LARGER = ("larger automaton", "larger automaton, trained on", "larger automaton, trained on twice")
 LONGER = ("automaton", "automaton, trained on", *LARGER)
@@ -168,7 +169,7 @@ def photons_at_least(clicks: float, features: int) -> float:
 def frontier_page(asked: Asked) -> Made:
     """Return one row per point beside direct imaging at its light, and the paper's click budgets beside our automata."""
     measured = by_point(measured_points(asked, "frontier", asked.seeds) + fixed_rows(asked))
-    new, listed = {_key(row) for row in measured}, {(one.task, one.way, one.level) for one in points("frontier")}
+    new, listed = {_key(row) for row in measured}, {(one.task, one.named, one.level) for one in points("frontier")}
     plain = ("table", "way", "level", "seeds", "error_seeds", *MEANS)  # what stands beside others is found anew
     known = [{key: row[key] for key in plain} | {"task": row["table"]} for row in asked.known if row["table"] in ACTIVE]
     kept = [
@@ -209,16 +210,16 @@ def beside_direct(rows: Rows) -> Rows:
 
     def beside(row: Row, of: str, prefix: str) -> Row:
         mine = row | {"error_objects": error_of(row)}
-        found = [beside_curve(mine, curves[row["task"], way], of, prefix) for way in (EXACT, STOPPING)]
+        found = [beside_curve(mine, curves[row["task"], way], of, prefix) for way in FRAMES]
         return max(found, key=lambda one: float(one.get(f"{prefix}there", -math.inf)))
 
     whole = [row | {"error_objects": error_of(row)} for row in rows]
     curves = {
         (task, way): [row for row in whole if (row["task"], row["way"]) == (task, way)]
         for task in ACTIVE
-        for way in (EXACT, STOPPING)
+        for way in FRAMES
     }
-    others = [row["way"] not in (EXACT, STOPPING) for row in rows]
+    others = [row["way"] not in FRAMES for row in rows]
     return [
         row | beside(row, "photons", "") | beside(row, "illumination", "light_") if other else row
         for row, other in zip(rows, others)

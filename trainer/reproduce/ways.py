@@ -44,6 +44,11 @@ class Point:
     by_sent: bool = False  # whether `level` is of light sent
 
     @property
+    def named(self) -> str:
+        """What its way is called in a row."""
+        return self.way + (BY_SENT if self.by_sent else "")
+
+    @property
     def stem(self) -> str:
         """What its files in the cache are called, but for the seed."""
         words = "".join(letter for letter in self.way.lower().replace(" ", "-") if letter.isalnum() or letter == "-")
@@ -94,8 +99,7 @@ def measured_points(asked: Asked, page: str, seeds: int = 1) -> Rows:
                 continue
             found = point_row(asked, point, seed)
             if found is not None:
-                way = point.way + (BY_SENT if point.by_sent else "")
-                rows.append({"task": point.task, "way": way, "level": point.level} | found)
+                rows.append({"task": point.task, "way": point.named, "level": point.level} | found)
     return rows
 
 
