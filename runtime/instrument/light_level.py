@@ -158,8 +158,8 @@ class LightWatch:
     def _note(self, ratio: float, since: int, what: str) -> None:
         side = "fall" if ratio < 1 else "rise"
         words = (
-            f"clicks per decision {'fell' if side == 'fall' else 'rose'} to {ratio:.3g} of what {what}, since about {self.decisions - since} "
-            "decisions: light source, place of the object, alignment or detector efficiency, or other objects; calibrate again"
+            f"clicks per decision {'fell' if side == 'fall' else 'rose'} to {ratio:.3g} of what {what}, since about "
+            f"{self.decisions - since} decisions: light source, place of the object, detector efficiency, or other objects; calibrate again"
         )
         self.found.append({"side": side, "ratio": ratio, "decision": self.decisions, "since": since, "words": words})
 
