@@ -139,6 +139,11 @@ class Bundle:
             return greatest_light(self.automaton, self.state_light())
         return int(self.pattern_levels.sum(dtype=np.uint64)) * self.photons_per_level
 
+    def expected_on(self, profile: str, automaton: Automaton | None) -> Mapping[str, Any] | None:
+        """Return `expected` where it holds: on the profile of that name, for the whole automaton."""
+        found = self.expected
+        return found if found is not None and found["profile"] == profile and automaton is self.automaton else None
+
     def state_light(self) -> NDArray[np.float64]:
         """Return what each state of the automaton shows, float64 (states,): photoelectrons per unit transmission, dwell included."""
         if self.automaton is None:

@@ -272,6 +272,7 @@ class _Run:
             if self.plan.automaton is not None:
                 say(f"pans: {drive_words(self.dark.profile, bundle, self.plan)}")
             n_cycles = n_objects * self.plan.cycles_per_object
+            self.dark.expect(self.plan, bundle)
             self.core = Core(self.plan, decider, shots, n_cycles, self.dark.guard(self.plan, bundle, shots))
         self.header = recording_header(options, profile, bundle_sha256, decider, n_objects, self.plan)
         parts = {"dark": self.dark, "registration": self.registration, "flow": self.flow_run}

@@ -1,4 +1,5 @@
-"""Change detection on the mean number of clicks per decision, against the level at the beginning of the run.
+"""Change detection on the mean number of clicks per decision, against the level at the beginning of the run, and of that beginning
+against what the bundle states.
 
 `LightWatch.take` receives the clicks of decisions and returns what has changed. A different mixture of objects looks like a change of
 light, and the words say so. How much of a change of efficiency reaches the clicks depends on the patterns: nearly all of it where an
@@ -8,6 +9,10 @@ Clicks are summed over batches of decisions, so that the spread between objects 
 mean m and standard deviation s, until m is known to BASELINE_ERROR; then a two-sided CUSUM (Page 1954) sums the deviation beyond half
 the change looked for. Its threshold follows from the stated batches between false alarms by Siegmund's approximation (Sequential
 Analysis, 1985), with the drift reduced by twice the error of m, because the mean is an estimate.
+
+Until then m is compared with the `stated` mean after 32, 64, 128, ... batches, and at the end. What differs by more than CHANGE, as
+another mixture of objects may, and about six standard errors has changed: by Student's t, less than one run in a million says so
+whose mean is within CHANGE of the stated one.
 """
 
 from __future__ import annotations
@@ -27,6 +32,9 @@ BASELINE_ERROR = 0.0075  # of the mean
 STATED_CHANGE = 0.085  # of the clicks: what a tenth of efficiency does where exposures click seldom
 BASELINE_LEAST, BASELINE_MOST = 20, 20_000  # batches
 ARL_BATCHES = 1e5
+# so many, and this over the number of batches more, as few know their own spread badly
+STATED_ERRORS, STATED_FEW = 5.5, 40.0
+STATED_FALSE_ALARM = 1e-6  # per run
 _OVERSHOOT = 1.166  # Siegmund: how far a sum of normal steps jumps over its boundary, twice
 
 
@@ -46,10 +54,10 @@ class Baseline:
 
 
 class LightWatch:
-    """Follows the clicks of decisions and reports each lasting change of their mean once."""
+    """Follows the clicks of decisions and reports each lasting change of their mean once; `stated` clicks are those to begin with."""
 
-    def __init__(self, batch: int = BATCH, arl_batches: float = ARL_BATCHES) -> None:
-        self.batch, self.arl_batches = batch, arl_batches
+    def __init__(self, batch: int = BATCH, arl_batches: float = ARL_BATCHES, stated: float | None = None) -> None:
+        self.batch, self.arl_batches, self.stated = batch, arl_batches, stated
         self.baseline: Baseline | None = None
         self.found: list[dict[str, Any]] = []
         self.decisions = 0
@@ -84,6 +92,8 @@ class LightWatch:
         return {
             "decisions": self.decisions,
             "clicks_per_decision": None if base is None else base.mean / self.batch,
+            "clicks_stated": self.stated,
+            "false_alarm_per_run": None if self.stated is None else STATED_FALSE_ALARM,
             "change_of_clicks": STATED_CHANGE,
             "found_after_decisions": None if base is None else base.stated_batches(STATED_CHANGE) * self.batch,
             "false_alarm_every_decisions": self.arl_batches * self.batch,
@@ -100,7 +110,12 @@ class LightWatch:
         variance = (squares - clicks * mean) / (n - 1)
         deviation = math.sqrt(max(variance, mean, 1.0))
         error = deviation / math.sqrt(n)
-        if mean > 0 and (error <= BASELINE_ERROR * mean or n >= BASELINE_MOST):
+        ends = mean > 0 and (error <= BASELINE_ERROR * mean or n >= BASELINE_MOST)
+        if self.stated and not self.found and (ends or n.bit_count() == 1):
+            wanted = self.stated * self.batch
+            if abs(mean - wanted) > CHANGE * wanted + (STATED_ERRORS + STATED_FEW / n) * error:
+                self._note(mean / wanted, 0, "the bundle states")
+        if ends:
             self.baseline = make_baseline(mean, deviation, error, self.arl_batches)
             self._since = dict.fromkeys(self._since, (self.decisions, self._batches, self._total))
 
@@ -136,15 +151,17 @@ class LightWatch:
         """Note the change, and begin a new baseline: from here on clicks are compared with the new mean."""
         decisions, batches, clicks = self._since[side]
         ratio = (self._total - clicks) / ((self._batches - batches) * base.mean)
-        words = (
-            f"clicks per decision {'fell' if side == 'fall' else 'rose'} to {ratio:.3g} of what they were at the beginning, since about "
-            f"{self.decisions - decisions} decisions: light source, alignment or detector efficiency, or other objects; calibrate again"
-        )
-        self.found.append(
-            {"side": side, "ratio": ratio, "decision": self.decisions, "since": decisions, "words": words}
-        )
+        self._note(ratio, decisions, "they were at the beginning")
         self.baseline, self._learnt = None, (0, 0, 0)
         self._sums = dict.fromkeys(self._sums, 0.0)
+
+    def _note(self, ratio: float, since: int, what: str) -> None:
+        side = "fall" if ratio < 1 else "rise"
+        words = (
+            f"clicks per decision {'fell' if side == 'fall' else 'rose'} to {ratio:.3g} of what {what}, since about "
+            f"{self.decisions - since} decisions: light source, place of the object, detector efficiency, or other objects; calibrate again"
+        )
+        self.found.append({"side": side, "ratio": ratio, "decision": self.decisions, "since": since, "words": words})
 
 
 def make_baseline(mean: float, deviation: float, error: float, arl_batches: float) -> Baseline:

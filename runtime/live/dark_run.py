@@ -98,6 +98,11 @@ class DarkRun:
         }
         return recorded_guard(self._header, plan, bundle, shots)
 
+    def expect(self, plan: Plan, bundle: Bundle) -> None:
+        """Before arming: take the clicks that `bundle` states, where they hold for this run."""
+        stated = bundle.expected_on(self.profile.name, plan.automaton)
+        self.light.stated = None if stated is None else float(stated["clicks"])
+
     def header(self) -> dict[str, Any]:
         """What the recording says, and a replay needs."""
         one = self.calibration

@@ -21,6 +21,7 @@ MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
 TROUBLE = (
     *("blame", "gap", "link_lost", "clock_step", "gate_refused", "show_refused", "parts_trouble"),
     *("beyond_plan", "contradiction", "disk_short", "disk_nearly_full", "recording_deleted", "host_clock_step"),
+    "light_changed",
 )
 
 

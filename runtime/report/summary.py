@@ -226,9 +226,9 @@ def walk_figures(result: RunResult, plan: Plan, bundle: Bundle, profile: str, co
     tally, expected = result.tally, bundle.expected
     hosted = plan.drive == "host"
     light = float(result.states_shown @ bundle.light_of(plan.automaton))
-    figures, off = tally.figures(), None
-    if expected is not None and expected["profile"] == profile and plan.automaton is bundle.automaton:
-        off = _in_standard_errors(figures.accuracy, figures.accuracy_stderr_objects, expected)
+    figures, off, stated = tally.figures(), None, bundle.expected_on(profile, plan.automaton)
+    if stated is not None:
+        off = _in_standard_errors(figures.accuracy, figures.accuracy_stderr_objects, stated)
     return WalkFigures(
         drive=plan.drive,
         confidence=confidence,

@@ -42,8 +42,8 @@ class Block:
 class TrainingObjects:
     """The training objects of a task: `epoch` gives those to fit, `held_back` the others, in blocks.
 
-    `gain` and `floor` turn grey values into the transmission of the profile's modulator. By `options` images move by whole pixels from
-    epoch to epoch, epochs take the images and their distorted copies in turn, and optics are drawn anew in every epoch.
+    `gain` and `floor` turn grey values into the transmission of the profile's modulator. By `options` all images move by whole pixels,
+    anew in every epoch, those held back once; epochs take the images and their distorted copies in turn, and draw optics anew.
     """
 
     def __init__(self, task: Task, profile: Profile, options: AutomatonOptions, held_back: int = 0) -> None:
@@ -84,26 +84,27 @@ class TrainingObjects:
         return here(grey)
 
     def epoch(self, number: int, size: int, dtype: torch.dtype, plain: bool = False) -> list[Block]:
-        """Return the objects to fit in an order of their own, augmented unless `plain`; the last block may be smaller."""
+        """Return the objects to fit in an order of their own, moved, and distorted unless `plain`; the last block may be smaller."""
         random = np.random.default_rng([ORDER_STREAM, self._seed, number])
         order = random.permutation(self.n_fit)
-        objects = self._fit if plain else self._augmented(number)
+        objects = self._moved(self._fit if plain else self._copied(number), number)
         targets = None if self._targets is None else self._targets[order]
         chosen = Objects(objects.images[order], objects.labels[order])
         return list(self._blocks(chosen, size, dtype, targets, draw=number))
 
     def held_back(self, size: int, dtype: torch.dtype) -> list[Block]:
-        """Return the objects held back, as they are, or through optics that no epoch has drawn."""
-        return list(self._blocks(self._back, size, dtype, draw=HELD_BACK_DRAW))
+        """Return the objects held back, through moves and optics that no epoch has drawn."""
+        return list(self._blocks(self._moved(self._back, HELD_BACK_DRAW), size, dtype, draw=HELD_BACK_DRAW))
 
-    def _augmented(self, number: int) -> Objects:
+    def _copied(self, number: int) -> Objects:
         objects, way = self._fit, self._options
         version = number % ((way.copies or 0) + 1)
-        if version:
-            objects = Objects(
-                distorted(objects.images, [DISTORT_STREAM, self._seed, version], way.strength), objects.labels
-            )
-        return shifted(objects, way.shift_px, way.offset_px, self._seed + 1000 * number)
+        if not version:
+            return objects
+        return Objects(distorted(objects.images, [DISTORT_STREAM, self._seed, version], way.strength), objects.labels)
+
+    def _moved(self, objects: Objects, number: int) -> Objects:
+        return shifted(objects, self._options.shift_px, self._options.offset_px, self._seed + 1000 * number)
 
     def _grey(self, images: np.ndarray) -> np.ndarray:
         flat = images.reshape(len(images), -1)

@@ -36,14 +36,19 @@ RECALLS_SHOWN = 10
 LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
 MADE = 1e-3  # of the light: beyond what W in float32 is off by
 PICTURES = ("patterns", "pictures", "confusion", "tsne", "reliability", "optics", "dose")
-CURVE_WORD, CURVES_WORD = "curve", "tolerance"  # of --dose-cap and --optics
-DOSE_CAP = Range(1e-9, 1e15)
+CURVE_WORD, CURVES_WORD, WHOLE_WORD = "curve", "tolerance", "whole"  # of --dose-cap, --optics and --draws
+DOSE_CAP, DRAWS = Range(1e-9, 1e15), Range(1, 100_000, whole=True)
 COUNT = Range(1, 1 << 30, whole=True)
 
 
 def dose_cap(text: str) -> float | str:
     """Return what `--dose-cap` stands for: a number, or the word for a curve."""
     return CURVE_WORD if text == CURVE_WORD else float(DOSE_CAP.option(text))
+
+
+def draws(text: str) -> int | str:
+    """Return what `--draws` stands for: a number, or the word for all shifts by whole pixels."""
+    return WHOLE_WORD if text == WHOLE_WORD else int(DRAWS.option(text))
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -75,9 +80,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--draws",
-        type=Range(1, 100_000, whole=True).option,
-        metavar="N",
-        help="mean over N tables drawn within --optics, read as a tolerance, or within that of the bundle's training",
+        type=draws,
+        metavar="N|whole",
+        help="mean over N tables drawn within --optics, read as a tolerance, or that of the training; whole: over all whole-pixel shifts",
     )
     parser.add_argument(
         "--dose-cap",
@@ -345,10 +350,13 @@ def _counted(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _over_draws(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
-    from pans.trainer.evaluate.optics import drawn_tables, over_optics
+    from pans.trainer.evaluate.optics import drawn_tables, over_optics, whole_shifts
 
-    options = bundle.provenance.get("options")
-    text = args.optics or (options.get("optics") if isinstance(options, Mapping) else None)
+    options, whole = bundle.provenance.get("options"), args.draws == WHOLE_WORD
+    trained = options if isinstance(options, Mapping) else {}
+    right, down = trained.get("shift_px"), trained.get("offset_px")
+    moved = f"shift=-{right}..{right},-{down}..{down}" if whole and (right or down) else None
+    text = args.optics or trained.get("optics") or moved
     if not isinstance(text, str):
         raise UsageError(
             f"--draws: {bundle.name} was trained on perfect optics, and no tolerance is given",
@@ -356,9 +364,11 @@ def _over_draws(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, con
         )
     tolerance = tolerance_of(text)
     with _counted("table") as report:
-        tables = drawn_tables(tolerance, args.draws, args.seed)
+        tables = whole_shifts(tolerance) if whole else drawn_tables(tolerance, args.draws, args.seed)
         found = asdict(over_optics(bundle, held_out, tables, conditions, report))
-    which = f"{found['tables']} tables drawn within {tolerance.words()}"
+    if whole:
+        found["accuracy_se_optics"] = 0.0  # they are all
+    which = f"{found['tables']} {'shifts by whole pixels' if whole else 'tables drawn'} within {tolerance.words()}"
     more = f" (error of the mean {_percent(found['accuracy_se_optics'])}), worst table {_percent(found['accuracy_worst'])} %"
     lines = _accuracy_lines(found, which, "tables", "accuracy_std_optics", more)
     return {"optics": tolerance.as_dict(), **found}, "\n".join([*lines, _light_words(found)])

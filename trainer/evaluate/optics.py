@@ -11,6 +11,7 @@ import numpy as np
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.imaging import Imaging, Tolerance
+from pans.runtime.ranges import demand
 from pans.trainer.options import Conditions
 
 from .accuracy import AS_IT_IS, Measured
@@ -24,6 +25,7 @@ CURVES: Mapping[str, tuple[float, ...]] = {
     "black": (0.0, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02),
 }
 DRAW_STREAM = 0xD7A  # with the seed
+TABLES_MAX = 100_000
 Figures = Measured | MeasuredWalks
 Report = Callable[[int, int], None]
 
@@ -88,6 +90,19 @@ def drawn_tables(tolerance: Tolerance, count: int, seed: int) -> list[Imaging]:
     """Return `count` optics drawn within `tolerance`."""
     random = np.random.default_rng([DRAW_STREAM, seed])
     return [tolerance.draw(random) for _ in range(count)]
+
+
+def whole_shifts(tolerance: Tolerance) -> list[Imaging]:
+    """Return the optics with every shift by whole pixels within `tolerance`; ValueError where more than the shift may vary."""
+    about = replace(tolerance.middle, right_px=0.0, down_px=0.0)
+    right, down = (range(math.ceil(low), math.floor(high) + 1) for low, high in (tolerance.right_px, tolerance.down_px))
+    free = [
+        name for name, (low, high) in tolerance.as_dict().items() if low < high and name not in ("right_px", "down_px")
+    ]
+    demand(not free, f"whole shifts with a span of {', '.join(free)}, allowed: one value of all but the shift")
+    count = len(right) * len(down)
+    demand(0 < count <= TABLES_MAX, f"{count} shifts by whole pixels, allowed: 1 to {TABLES_MAX}")
+    return [replace(about, right_px=float(x), down_px=float(y)) for y in down for x in right]
 
 
 def misalignment_curves(

@@ -160,6 +160,9 @@ def test_a_bundle_that_does_not_fit_is_refused() -> None:
 def test_expected_figures_are_kept_and_checked() -> None:
     bundle = with_expected(automaton_bundle(), EXPECTED)
     assert bundle.expected == EXPECTED
+    assert bundle.expected_on(str(EXPECTED["profile"]), bundle.automaton) == EXPECTED
+    assert bundle.expected_on("another", bundle.automaton) is None
+    assert bundle.expected_on(str(EXPECTED["profile"]), diamond()) is None  # not the one that is judged
     for change in ({"accuracy": 1.5}, {"clicks": 2.6}, {"exposures": 3.5}, {"objects": 0}, {"split": ""}, {"more": 1}):
         with pytest.raises(UsageError, match=rf"expected.*{next(iter(change))}|expected has the keys"):
             with_expected(automaton_bundle(), EXPECTED | change)

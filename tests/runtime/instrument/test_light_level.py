@@ -11,7 +11,8 @@ import pytest
 from tree import ROOT
 
 from pans.runtime.cli import main
-from pans.runtime.instrument.light_level import LightWatch, make_baseline
+from pans.runtime.instrument import light_level
+from pans.runtime.instrument.light_level import STATED_ERRORS, STATED_FALSE_ALARM, STATED_FEW, LightWatch, make_baseline
 
 
 def dim_clicks(efficiency: float, n: int, seed: int) -> np.ndarray:
@@ -67,6 +68,48 @@ def test_threshold_is_siegmunds() -> None:
     assert 0.55e4 < np.mean(lengths) < 1.8e4
 
 
+@pytest.mark.parametrize(("efficiency", "side"), [(0.8, "fall"), (1.0, ""), (1.03, ""), (1.2, "rise"), (0.0, "fall")])
+def test_a_beginning_unlike_what_is_stated_is_found_once(efficiency: float, side: str) -> None:
+    clicks = dim_clicks(efficiency, 20_000, 5)
+    watch = LightWatch(stated=dim_clicks(1.0, 1_000_000, 6).mean())
+    watch.take(clicks)
+    assert [(one["side"], one["since"]) for one in watch.found] == ([(side, 0)] if side else [])
+    if side:
+        at = watch.found[0]["decision"]
+        assert at in (32 * 50, 64 * 50, 128 * 50)
+        assert watch.found[0]["ratio"] == pytest.approx(clicks[:at].mean() / watch.stated)
+        assert "bundle" in watch.found[0]["words"]
+
+
+def student_tail(errors: float, freedom: int) -> float:
+    """Chance that Student's t is beyond `errors` on either side: twice the integral of its density, in the angle atan(t / sqrt(f))."""
+    angle = np.linspace(math.atan(errors / math.sqrt(freedom)), math.pi / 2, 20_001)
+    powers = np.cos(angle) ** (freedom - 1)
+    norm = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(math.pi)
+    return 2 * norm * float(((powers[1:] + powers[:-1]) / 2 * np.diff(angle)).sum())
+
+
+def test_false_alarms_at_the_beginning_are_as_rare_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert student_tail(2.093, 19) == pytest.approx(0.05, rel=1e-3)
+    tails = {
+        n: student_tail(STATED_ERRORS + STATED_FEW / n, n - 1)
+        for n in [*range(20, 200), *(1 << k for k in range(8, 15))]
+    }
+    together = [tails[n] + sum(tails[1 << k] for k in range(5, 15) if 1 << k < n) for n in tails]
+    assert max(together) < STATED_FALSE_ALARM
+    # the worst mean that is still as stated, and a threshold that is passed often enough to be counted
+    monkeypatch.setattr(light_level, "STATED_ERRORS", 2.0)
+    monkeypatch.setattr(light_level, "STATED_FEW", 0.0)
+    rng, passed, runs = np.random.default_rng(4), 0, 1500
+    for _ in range(runs):
+        watch = LightWatch(batch=1, stated=1000 / (1 + light_level.CHANGE))
+        watch.take(np.rint(rng.normal(1000.0, 55.0, 70)))
+        passed += bool(watch.found)
+    # one side of each test: after 32 batches, and at the end, after about 54; both together lie between the first and the sum
+    one, both = student_tail(2.0, 31) / 2, (student_tail(2.0, 31) + student_tail(2.0, 53)) / 2
+    assert one * 0.8 < passed / runs < both * 1.2
+
+
 def test_a_run_with_a_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     calibration, device = tmp_path / "cal.json", "sim:oled-qcmos?scene={}&pace=fast&seed={}"
     words = ["calibrate", "--device", device.format("uniform", 5), "-o", str(calibration), "--seconds", "5", "--json"]
@@ -83,3 +126,14 @@ def test_a_run_with_a_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "SIM-00000005" in capsys.readouterr().err
     assert main([*run, device.format("fashion200", 5), "--calibration-max-age-h", "1e-9"]) == 0
     assert len(json.loads(capsys.readouterr().out)["calibration_warnings"]) == 1
+
+
+def test_a_run_beside_its_place_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    device = "sim:dmd-spad?scene=fashion200&pace=fast&seed=3&optics=shift={},0"
+    for shift, found in ((0, 0), (1, 1)):
+        words = ["run", "fashion-adaptive", "--device", device.format(shift), "--decisions", "1650", "--no-realtime"]
+        assert main([*words, "--out", str(tmp_path / str(shift)), "--json"]) == 0
+        light = json.loads(capsys.readouterr().out)["light"]
+        assert light["clicks_stated"] == pytest.approx(4.84, abs=0.01)
+        assert len(light["found"]) == found
+    assert 1.15 < light["found"][0]["ratio"] < 1.35

@@ -13,6 +13,7 @@ from pans.trainer.adaptive.machine import Aim, Sight, forward
 from pans.trainer.adaptive.objects import TrainingObjects
 from pans.trainer.adaptive.outcomes import WordLaw
 from pans.trainer.options import AutomatonOptions
+from pans.trainer.tasks.registry import Objects, Task
 
 
 @pytest.mark.uncompiled
@@ -51,3 +52,23 @@ def test_growing_counts_every_object_once_and_spends_what_a_pass_finds():
     clicks = sum(float(one.clicks().sum()) for one in passes) / n
     sent = sum(float(one.illumination().sum()) for one in passes) / n
     assert growth.spent == pytest.approx((clicks, photons, sent), rel=1e-5)
+
+
+def test_growing_and_what_is_held_back_see_objects_that_are_moved():
+    images = np.zeros((600, 5, 7), np.uint8)
+    images[:, 2, 3] = 200
+    point = Objects(images, np.arange(600) % 2)
+    task = Task("point", ("a", "b"), point, point, "0" * 64, "none")
+    objects = TrainingObjects(task, load_profile("ideal"), AutomatonOptions(shift_px=1, offset_px=2), 300)
+    kinds = (
+        objects.epoch(0, 300, torch.float32, plain=True),
+        objects.epoch(7, 300, torch.float32),
+        objects.held_back(300, torch.float32),
+    )
+    for blocks in kinds:
+        seen = torch.cat([block.grey for block in blocks]).reshape(-1, 5, 7)
+        found = np.bincount(5 * seen.amax(dim=1).argmax(dim=1) + seen.amax(dim=2).argmax(dim=1), minlength=35)
+        places = found.reshape(7, 5)[2:5]  # columns by rows
+        assert places.sum() == len(seen)
+        assert ((places > 5) & (places < 40)).all()  # 20 in the mean
+    assert not torch.equal(kinds[0][0].grey, kinds[1][0].grey)

@@ -17,7 +17,14 @@ from pans.runtime.instrument.profile import Optics, load_profile
 from pans.trainer.commands.evaluate import other_answer
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.held_out import HeldOut, held_out_of
-from pans.trainer.evaluate.optics import CURVES, drawn_tables, figures_under, misalignment_curves, over_optics
+from pans.trainer.evaluate.optics import (
+    CURVES,
+    drawn_tables,
+    figures_under,
+    misalignment_curves,
+    over_optics,
+    whole_shifts,
+)
 from pans.trainer.evaluate.walks import measured_walks, walks_of
 from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task
@@ -70,6 +77,19 @@ def test_several_tables_give_their_mean_and_spread() -> None:
     tolerance = tolerance_of("shift=1:psf=0.5..0.8")
     first, again = drawn_tables(tolerance, 4, 7), drawn_tables(tolerance, 4, 7)
     assert [one.numbers() for one in first] == [one.numbers() for one in again]
+
+
+def test_all_whole_shifts_are_images_moved_by_hand() -> None:
+    bundle, right = automaton_bundle(six_states(), photons=1.5), []
+    for down in (-1, 0, 1):
+        for along in (0, 1):
+            wide = np.pad(IMAGES, ((0, 0), (1, 1), (1, 1)))[:, 1 - down : 3 - down, 1 - along : 4 - along]
+            right.append(measured_walks(walks_of(bundle, IDEAL, wide, LABELS)).accuracy_mean)
+    found = over_optics(bundle, HELD_OUT, whole_shifts(tolerance_of("shift=-0.5..1.9,-1..1")))
+    assert (found.tables, found.accuracy_mean) == (6, pytest.approx(np.mean(right), rel=1e-12))
+    for wrong in ("shift=1:psf=0.5..0.8", "shift=0.2..0.8", "shift=1000"):
+        with pytest.raises(ValueError, match="allowed"):
+            whole_shifts(tolerance_of(wrong))
 
 
 def test_curves_start_from_the_table_that_they_are_about() -> None:
