@@ -6,6 +6,7 @@ float64.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from pans.runtime.instrument.profile import Profile
 
 from .grow import sum_of
-from .machine import Bits, Machine, Sight, forward
+from .machine import Bits, Machine, Sight, forward, sent_by
 from .objects import Block
+from .outcomes import by_state
 from .tune import Prices, figures
 
 F64 = NDArray[np.float64]
@@ -138,13 +140,37 @@ def set_top(machine: Machine, top: float, profile: Profile) -> None:
 
 
 def to_grid(machine: Machine, grid: Grid) -> None:
-    """Round the brightness of all one-bit patterns to whole steps, at least one."""
+    """Round the brightness of all one-bit patterns to whole steps, at least one; down, where states send the same light."""
     with torch.no_grad():
         for level in machine.levels:
             light = level.light
             assert isinstance(light, Bits)
-            units = (light.log_light.exp() / grid.top * grid.steps).round().clamp(1, grid.steps)
-            light.log_light.copy_((units / grid.steps * grid.top).log())
+            units = (light.brightness() if light.even else light.log_light.exp()) / grid.top * grid.steps
+            units = units.floor() if light.even else units.round()
+            rounded = (units.clamp(1, grid.steps) / grid.steps * grid.top).log()
+            if light.even:
+                light.log_light, light.even = rounded, False
+            else:
+                light.log_light.copy_(rounded)
+
+
+def send_evenly(machine: Machine, masses: list[torch.Tensor], cap: float, fades: float) -> None:
+    """Let all states of a level send the same light, all levels together `cap`.
+
+    What acts keeps the proportions that the mean light of the levels had, by the `masses` (states,) of their states; of objects that
+    bleach (`fades`, as of Sight) later levels send more for it.
+    """
+    with torch.no_grad():
+        bits = [level.light for level in machine.levels if isinstance(level.light, Bits)]
+        sent = [by_state(sent_by(light), light.parts).flatten() for light in bits]
+        means = torch.stack([(one @ mass.to(one.dtype)) / mass.sum() for one, mass in zip(sent, masses)]).double()
+        acting = (means.cumsum(0) / means.sum()).cpu().numpy()
+        doses = cap * acting
+        if fades < math.inf:
+            doses = -fades * np.log1p(acting * math.expm1(-cap / fades))
+        for light, own in zip(bits, np.diff(doses, prepend=0.0)):
+            light.log_light, light.even = torch.full_like(light.log_light[:1], math.log(own)), True
+            light.settle()
 
 
 def meet_budget(

@@ -32,13 +32,25 @@ from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write
 from .budget import (
     aim_at,
     check_automaton_options,
+    fades_of,
     first_prices,
     for_task,
     patterns_at_most,
     tune_epochs_of,
     with_defaults,
 )
-from .finish import Finished, Posteriors, bit_grid, calibrated, finished, meet_budget, node_counts, set_top, to_grid
+from .finish import (
+    Finished,
+    Posteriors,
+    bit_grid,
+    calibrated,
+    finished,
+    meet_budget,
+    node_counts,
+    send_evenly,
+    set_top,
+    to_grid,
+)
 from .grow import Growth
 from .machine import (
     COUNT_FLOOR,
@@ -57,7 +69,7 @@ from .machine import (
 from .objects import Block, TrainingObjects
 from .outcomes import by_row, law_of
 from .sweeps import choose_patterns, reroute, share_patterns
-from .tune import Figures, Progress, Tuning, figures, masses, mean_objects
+from .tune import Figures, Progress, Tuning, figures, hold_cap, masses, mean_objects
 
 KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
 REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reached
@@ -67,6 +79,7 @@ REROUTE_NUMBERS = 1 << 29  # objects times states that a sweep keeps: 2 GiB
 TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
 DARK_COUNTS = 0.5  # per decision, at most: 0.15 to 0.8 were tried on held-back images (docs/measurements/index.md)
 BUDGET_BLOCKS = 6  # of objects, by which the budget is met
+CAP_ROUNDING = 1e-6  # of a cap on the dose, for sums in float32
 STAGES = ("grow", "grey", "shown")
 NETWORK = "network"  # a stage before them, where targets are soft
 FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch repeats the order and shifts of another
@@ -156,6 +169,7 @@ class _Run:
         self.tuning: Tuning | None = None
         self.saved_tuning: dict[str, Any] | None = None
         self.products = product_dtype()
+        self.cap = math.inf if options.dose_cap is None else options.dose_cap * (1 - CAP_ROUNDING)
         self.answers: NDArray[np.float32] | None = None
 
     @property
@@ -176,7 +190,8 @@ class _Run:
         asked = self.options
         law = law_of(self.profile, exposure_us, asked.outcomes, asked.channels, asked.dark)
         links = trained_through(self.profile, exposure_us)
-        return Sight(law, self.objects.gain, self.objects.floor, products, self.options.optics is not None, links)
+        fades = fades_of(asked, self.objects.n_pixels) if self.stage == "shown" else math.inf
+        return Sight(law, self.objects.gain, self.objects.floor, products, asked.optics is not None, links, fades)
 
     # ---- the stages ----
 
@@ -190,6 +205,7 @@ class _Run:
                 light.log_light, light.bottom = lights[0].log_light, low
         brightest = max(float(light.log_light.max().exp()) for light in lights)
         set_top(self.machine, min(high, max(low, brightest)), self.profile)
+        self._send_evenly()
         found = node_counts(self.machine, self.sight(self.products), self._some_blocks())
         share = self.objects.n_fit / float(found[0].sum())
         for counts, arrived in zip(self.machine.counts, found[1:]):
@@ -260,7 +276,15 @@ class _Run:
                 level.light = Grey(light.clamp(max=top).sqrt(), top, self.profile.projector.levels)
         else:
             self._start_bits(lights, low)
+        self._send_evenly()
         self.stage, self.epoch, self.tuning = "shown", 0, None
+
+    def _send_evenly(self) -> None:
+        """With a cap on the dose, let every walk send it, exposure by exposure; see Bits."""
+        if self.cap < math.inf:
+            fades = fades_of(self.options, self.objects.n_pixels)
+            send_evenly(self.machine, self._masses(), self.cap, fades)
+            self.prices.drop_sent()
 
     def _highest_top(self) -> float:
         """Return the brightest top that the profile allows and that brings no more than `DARK_COUNTS` to a decision."""
@@ -302,6 +326,7 @@ class _Run:
         if self.tuning is None:
             self.tuning = Tuning(self.machine, self.sight(self.products), self.prices, rate, steps)
             self.tuning.exposure_price, self.tuning.spread = self.options.exposure_price, self.options.spread
+            self.tuning.cap = self.cap
             if self.saved_tuning is not None:
                 self.tuning.restore(self.saved_tuning)
                 self.saved_tuning = None
@@ -353,7 +378,11 @@ class _Run:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
         grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
-        meet_budget(self.machine, self.prices, grid, self.sight, self._drawn())
+        capped = self.cap < math.inf
+        if self.prices.all:
+            meet_budget(self.machine, self.prices, None if capped else grid, self.sight, self._drawn())
+        with torch.no_grad():
+            hold_cap(self.machine, self.cap)
         if grid is not None:
             to_grid(self.machine, grid)
         sight = self.sight()
@@ -392,6 +421,8 @@ class _Run:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from `state`."""
         self.stage, self.epoch = state["stage"], state["epoch"]
+        if self.stage == "shown" and self.cap < math.inf:
+            self.prices.drop_sent()
         for price, value in zip(self.prices.all, state["prices"]):
             price.value = value
         self.machine = machine_from(state["machine"])

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from .grow import sum_of
-from .machine import COUNT_FLOOR, Aim, Machine, Sight, Spent, backward, forward
+from .machine import COUNT_FLOOR, Aim, Bits, Machine, Sight, Spent, backward, forward
 from .objects import Block
 
 COUNT_SHARE = 0.02  # of a step in the running class counts
@@ -133,10 +133,23 @@ class Prices:
         """Return how many times the budget was spent, the one of which most was."""
         return max(price.excess(spent) for price in self.all)
 
+    def drop_sent(self) -> None:
+        """Leave out the price of light sent, where the cap holds it."""
+        self.all = [price for price in self.all if price.kind != SENT]
+
     def follow(self, spent: Spent) -> None:
         """Let each price follow its budget."""
         for price in self.all:
             price.follow(spent)
+
+
+def hold_cap(machine: Machine, cap: float) -> None:
+    """Dim all levels alike, where the states of each send the same light, until a whole walk sends no more than `cap`."""
+    lights = [level.light.log_light for level in machine.levels if isinstance(level.light, Bits) and level.light.even]
+    total = float(torch.cat(lights).double().exp().sum()) if lights else 0.0
+    if total > cap:
+        for log_light in lights:
+            log_light += math.log(cap / total)
 
 
 class Tuning:
@@ -145,6 +158,7 @@ class Tuning:
     def __init__(self, machine: Machine, sight: Sight, prices: Prices, rate: float, steps: int) -> None:
         self.machine, self.sight, self.prices, self.rate, self.steps = machine, sight, prices, rate, steps
         self.exposure_price = self.decide = self.spread = 0.0  # see Aim; they may change from epoch to epoch
+        self.cap = math.inf  # of what a walk sends
         self.done = 0
         self.optimiser = torch.optim.Adam(machine.parameters(), lr=rate, fused=True)
 
@@ -175,6 +189,7 @@ class Tuning:
             for group in self.optimiser.param_groups:
                 group["lr"] = self.rate * max(0.0, 1 - self.done / self.steps) + 1e-5
             self.optimiser.step()
+            hold_cap(machine, self.cap)
             for level in machine.levels:
                 level.light.settle()
             self.done += 1

@@ -21,8 +21,16 @@ from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
 from pans.trainer.adaptive.train import TrainedAutomaton
-from pans.trainer.evaluate.accuracy import outcome_law_of
-from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
+from pans.trainer.evaluate.accuracy import AS_IT_IS, outcome_law_of
+from pans.trainer.evaluate.held_out import as_trained
+from pans.trainer.evaluate.walks import (
+    FIRST_OBJECTS,
+    MeasuredWalks,
+    expected_figures,
+    left_by_state,
+    measured_walks,
+    walks_of,
+)
 from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task
 
@@ -56,11 +64,11 @@ def export_automaton(
 ) -> ExportedAutomaton:
     """Write what `train_automaton` returned to `path`; UsageError if it exists, unless `force`. A wrong bundle never stands there."""
     bundle = bundle_of(trained, task, profile, name, provenance)
-    dark = trained.options.dark
-    bundle = with_tolerance(bundle, task, profile, trained.options.optics, dark)
+    conditions = replace(as_trained(bundle), dark=trained.options.dark)
+    bundle = with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
     difference = compare_walks(bundle, trained, task, profile)
-    found = measure_walks(bundle, task.test, profile, dark)
-    first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, dark)
+    found = measure_walks(bundle, task.test, profile, conditions)
+    first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, conditions)
     expected = expected_figures(found, profile.name, task.name, "test")
     with whole_file(path, force=force) as unchecked:
         write_bundle(with_expected(bundle, expected), unchecked)
@@ -98,9 +106,11 @@ def bundle_of(
     )
 
 
-def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> MeasuredWalks:
+def measure_walks(
+    bundle: Bundle, objects: Objects, profile: Profile, conditions: Conditions = AS_IT_IS
+) -> MeasuredWalks:
     """Return what the automaton of `bundle` does on `objects` through `profile`, exactly."""
-    return measured_walks(walks_of(bundle, profile, objects.images, objects.labels, Conditions(dark=dark)))
+    return measured_walks(walks_of(bundle, profile, objects.images, objects.labels, conditions))
 
 
 def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile: Profile) -> float:
@@ -112,7 +122,8 @@ def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile
     assert bundle.automaton is not None
     law = outcome_law_of(bundle, profile, dark=trained.options.dark)
     seen = object_transmission(profile, objects.images.reshape(len(objects), -1))
-    found = expected_walk(bundle.automaton, bundle.pattern_levels, seen, law, bundle.photons_per_level)
+    left = left_by_state(bundle.automaton, bundle.state_light(), as_trained(bundle).bleaching, bundle.n_pixels)
+    found = expected_walk(bundle.automaton, bundle.pattern_levels, seen, law, bundle.photons_per_level, left=left)
     of_class = found.leaves @ bundle.automaton.posteriors[bundle.automaton.n_states :].astype(np.float64)
     wanted, photons = trained.chances(objects)
     difference = float(np.abs(of_class - wanted).max())
