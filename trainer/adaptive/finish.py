@@ -27,6 +27,8 @@ SMOOTHINGS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # pseudo-objects of every 
 SHARPNESSES = tuple(0.5 + 0.02 * i for i in range(36))
 BINS = 15
 UNDER_BUDGET = 0.99  # of the budget is what drawn objects may take: others take a little more or less
+FEW_PIXELS = 3  # that are lit more or fewer, so that states send the same light in whole steps
+WORTH_A_PIXEL = 1e-3  # of that light
 DIMMINGS = 6  # steps of the search for the brightness that meets the budget
 
 
@@ -145,6 +147,13 @@ def to_grid(machine: Machine, grid: Grid) -> None:
         for level in machine.levels:
             light = level.light
             assert isinstance(light, Bits)
+            if light.even:  # by a few pixels more or less, what remains of the light is small
+                wanted = light.log_light.exp() / grid.top * grid.steps
+                change = torch.arange(-FEW_PIXELS, FEW_PIXELS + 1)
+                tried = light.lit() + change
+                cost = torch.remainder(wanted, tried) / wanted + WORTH_A_PIXEL * change.abs()
+                cost = cost.masked_fill((tried < 1) | (tried * grid.steps < wanted), math.inf)
+                light.light_up(tried.gather(1, cost.argmin(dim=1, keepdim=True)))
             units = (light.brightness() if light.even else light.log_light.exp()) / grid.top * grid.steps
             units = units.floor() if light.even else units.round()
             rounded = (units.clamp(1, grid.steps) / grid.steps * grid.top).log()

@@ -44,6 +44,7 @@ BIT_CUT = 0.2  # a pixel is lit that had more than this part of the brightest on
 BRIGHTNESS_MIN, BRIGHTNESS_MAX = 1e-6, 1e6  # photoelectrons of a lit pixel
 WRONG = 2.2  # nats, of a wrong decision: about the odds of ten classes, so that both parts of the loss are of one size
 COUNT_FLOOR = 1e-3  # objects of every class in every leaf, before any was seen
+EDGE = 1e-3  # of a pixel that was just lit, or just not, for want of light
 LEAN = 0.3  # of a pixel that is lit or not, where a bundle says no more: a hundred steps at the usual rate turn it
 
 
@@ -174,16 +175,19 @@ class Bits:
         if not self.even:
             self.log_light.clamp_(math.log(self.bottom), math.log(self.top))
             return
-        pixels = self.lean.view(-1, self.parts * self.lean.shape[1])
-        self.log_light.clamp_(math.log(self.bottom), math.log(self.top * pixels.shape[1]))
+        n_pixels = self.parts * self.lean.shape[1]
+        self.log_light.clamp_(math.log(self.bottom), math.log(self.top * n_pixels))
         light = float(self.log_light.exp())
-        least, most = min(math.ceil(light / self.top), pixels.shape[1]), max(1, math.floor(light / self.bottom))
-        lit = (pixels > 0).sum(dim=1)
-        wanted = lit.clamp(max(1, least), most)
-        for state in (lit != wanted).nonzero().flatten().tolist():
-            values, last = pixels[state].sort(descending=True).values, int(wanted[state]) - 1
-            dark = values[last + 1] if last + 1 < len(values) else values[last] - 1.0
-            pixels[state] -= (values[last] + dark) / 2
+        least, most = math.ceil(light / self.top), math.floor(light / self.bottom)
+        self.light_up(self.lit().clamp(min(max(1, least), n_pixels), max(1, most)))
+
+    def light_up(self, wanted: Tensor) -> None:
+        """Let every state light so many pixels, (states, 1): those that lean to it most."""
+        pixels = self.lean.view(-1, self.parts * self.lean.shape[1])
+        for state in (self.lit() != wanted).flatten().nonzero().flatten().tolist():
+            order, number = pixels[state].argsort(descending=True), int(wanted[state])
+            pixels[state, order[:number]] = pixels[state, order[:number]].clamp(min=EDGE)
+            pixels[state, order[number:]] = pixels[state, order[number:]].clamp(max=-EDGE)
 
 
 Light = Grey | Bits
@@ -391,7 +395,7 @@ def doses_behind(doses: Tensor, successors: Tensor, n_nodes: int) -> Tensor:
     """Return the largest dose over the walks to every node, (nodes, 1), from those behind the states (states, 1) before; -inf for none."""
     nodes = torch.full((n_nodes, 1), -math.inf, dtype=doses.dtype)
     edges = doses.expand(len(successors), *doses.shape).flatten(0, 1)
-    return nodes.index_reduce_(0, successors.flatten(), edges, "amax")
+    return nodes.scatter_reduce_(0, successors.reshape(-1, 1), edges, "amax")
 
 
 def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:

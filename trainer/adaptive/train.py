@@ -77,6 +77,7 @@ CHOICES, CHOICE_BLOCKS = 3, 20  # of shared patterns, before they are tuned; blo
 GROWTH_BLOCK = 1000  # objects; larger than in tuning, as fewer steps serve one level
 REROUTE_NUMBERS = 1 << 29  # objects times states that a sweep keeps: 2 GiB
 TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
+HEADROOM = 1.25  # of the top over that, where states send the same light: they would light more pixels for it from epoch to epoch
 DARK_COUNTS = 0.5  # per decision, at most: 0.15 to 0.8 were tried on held-back images (docs/measurements/index.md)
 BUDGET_BLOCKS = 6  # of objects, by which the budget is met
 CAP_ROUNDING = 1e-6  # of a cap on the dose, for sums in float32
@@ -357,6 +358,8 @@ class _Run:
         below = masses[order].cumsum(0) / masses.sum()
         low, high = top_limits(self.profile)[0], self._highest_top()
         top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
+        if self.cap < math.inf:
+            top *= HEADROOM
         set_top(self.machine, min(high, max(low, top)), self.profile)
 
     def _sweep_blocks(self) -> list[Block]:
@@ -377,6 +380,9 @@ class _Run:
     def finish(self) -> TrainedAutomaton:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
+        if self.cap < math.inf:
+            top = max(float(level.light.brightness().max()) for level in self.machine.levels)  # type: ignore[union-attr]
+            set_top(self.machine, max(top_limits(self.profile)[0], top), self.profile)
         grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
         capped = self.cap < math.inf
         if self.prices.all:

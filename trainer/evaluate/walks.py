@@ -41,7 +41,7 @@ _LIGHT_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
 OF_OBJECTS = ("right", "decided", "clicks", "photons", "illumination", "exposures", "labels")
-ONE_DOSE = 1e-3  # of the dose that leaves 1/e: by so much the doses of walks to one state may differ, by steps of the dwell time
+ONE_DOSE = 0.01  # of the dose that leaves 1/e: by so much the doses of walks to one state may differ, by steps of the dwell time
 BLEACHED_AT_ONCE = 512  # objects, whose pixels stand in memory
 
 
@@ -176,7 +176,7 @@ def left_by_state(automaton: Automaton, light: F64, law: Bleaching, pixels: int)
     """Return what bleaching has left in each state, float64 (states,), of objects of so many `pixels`; None: it depends on the walk.
 
     `light` (states,) is what each state sends. It does not depend on the walk where emitters mix and all walks to a state bring
-    one dose, but for rounding.
+    one dose, within `ONE_DOSE`; the largest counts.
     """
     if law.is_none:
         return np.ones(automaton.n_states)

@@ -16,7 +16,7 @@ from pans.runtime.bundle.automaton import log_scores, reachable_automaton, walk_
 from pans.runtime.bundle.model import Bundle, Shown, load_bundle, make_bundle, with_expected, write_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.expectation import expected_walk
-from pans.runtime.errors import PansError
+from pans.runtime.errors import PansError, PlanError
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
@@ -25,6 +25,7 @@ from pans.trainer.evaluate.accuracy import AS_IT_IS, outcome_law_of
 from pans.trainer.evaluate.held_out import as_trained
 from pans.trainer.evaluate.walks import (
     FIRST_OBJECTS,
+    ONE_DOSE,
     MeasuredWalks,
     expected_figures,
     left_by_state,
@@ -123,6 +124,11 @@ def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile
     law = outcome_law_of(bundle, profile, dark=trained.options.dark)
     seen = object_transmission(profile, objects.images.reshape(len(objects), -1))
     left = left_by_state(bundle.automaton, bundle.state_light(), as_trained(bundle).bleaching, bundle.n_pixels)
+    if left is None:
+        raise PlanError(
+            f"on {profile.name} walks to one state differ in dose by more than {ONE_DOSE:.0%} of that which leaves 1/e",
+            remedy="choose a profile with finer steps (projector.dwell_steps, or levels), or leave out --bleach",
+        )
     found = expected_walk(bundle.automaton, bundle.pattern_levels, seen, law, bundle.photons_per_level, left=left)
     of_class = found.leaves @ bundle.automaton.posteriors[bundle.automaton.n_states :].astype(np.float64)
     wanted, photons = trained.chances(objects)
