@@ -195,23 +195,23 @@ def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None
                 f"--bleach {options.bleach}: an automaton is trained exactly where a state has one dose, whichever walk led to it",
                 remedy=f"--bleach {law.dose:g}:mixed --dose-cap D: every walk then sends the same light, exposure by exposure",
             )
-        if options.optics is not None or options.channels > 1:
-            raise UsageError(
-                "--bleach: of an automaton under perfect optics and one detector", remedy="leave one of them out"
-            )
+        if options.optics is not None:
+            raise UsageError("--bleach: of an automaton under perfect optics", remedy="leave one of them out")
     if options.dose_cap is None:
         return
     if options.illumination is not None:
         raise UsageError(
             "--dose-cap: every walk sends that light, --illumination adds nothing", remedy="leave one of them out"
         )
+    if options.channels > 1:
+        raise UsageError("--dose-cap: of one detector", remedy="leave out --channels")
     if options.grey or (profile.projector.levels == 2 and profile.projector.dwell_steps == 1):
         raise UsageError(
             "--dose-cap: states have one-bit patterns and a brightness of their own",
             remedy="leave out --grey, or choose a profile with levels or projector.dwell_steps",
         )
     exposures, states = with_defaults(options, profile)
-    most = states_at_most(exposures, states, options.successors) * options.channels
+    most = states_at_most(exposures, states, options.successors)
     if patterns_at_most(options, profile) < most:
         raise UsageError(
             f"--dose-cap: states share no patterns, up to {most} may be needed, {patterns_at_most(options, profile)} are allowed",

@@ -19,7 +19,6 @@ from pans.runtime.instrument.profile import Profile
 from .grow import sum_of
 from .machine import Bits, Machine, Sight, forward, sent_by
 from .objects import Block
-from .outcomes import by_state
 from .tune import Prices, figures
 
 F64 = NDArray[np.float64]
@@ -170,16 +169,18 @@ def send_evenly(machine: Machine, masses: list[torch.Tensor], cap: float, fades:
     bleach (`fades`, as of Sight) later levels send more for it.
     """
     with torch.no_grad():
-        bits = [level.light for level in machine.levels if isinstance(level.light, Bits)]
-        sent = [by_state(sent_by(light), light.parts).flatten() for light in bits]
+        lights = [level.light for level in machine.levels]
+        sent = [sent_by(light).flatten() for light in lights]
         means = torch.stack([(one @ mass.to(one.dtype)) / mass.sum() for one, mass in zip(sent, masses)]).double()
         acting = (means.cumsum(0) / means.sum()).cpu().numpy()
         doses = cap * acting
         if fades < math.inf:
             doses = -fades * np.log1p(acting * math.expm1(-cap / fades))
-        for light, own in zip(bits, np.diff(doses, prepend=0.0)):
-            light.log_light, light.even = torch.full_like(light.log_light[:1], math.log(own)), True
-            light.settle()
+        for light, own in zip(lights, np.diff(doses, prepend=0.0)):
+            light.log_light = torch.full((1, 1), math.log(own))
+            if isinstance(light, Bits):
+                light.even = True
+                light.settle()
 
 
 def meet_budget(

@@ -52,26 +52,35 @@ LEAN = 0.3  # of a pixel that is lit or not, where a bundle says no more: a hund
 class Grey:
     """Patterns root**2, (rows, pixels), photoelectrons per exposure and unit transmission, at most `top` per pixel.
 
-    With `levels`, what is shown is rounded to multiples of top / (levels - 1).
+    With `levels`, what is shown is rounded to multiples of top / (levels - 1). With `log_light` (1, 1) every state sends its exponential:
+    root**2 says how it is shared among the pixels.
     """
 
     root: Tensor
     top: float = math.inf
     levels: int = 0
+    log_light: Tensor | None = None
+
+    @property
+    def even(self) -> bool:
+        """Whether every state sends the same light."""
+        return self.log_light is not None
 
     def parameters(self) -> list[Tensor]:
         """Return what an optimiser changes."""
-        return [self.root]
+        return [self.root] if self.log_light is None else [self.root, self.log_light]
 
     def displayed(self) -> tuple[Tensor, Tensor | None]:
         """Return (mask, scale); no scale stands for 1."""
         light, scale = self.root.square(), self.scale()
-        if scale is not None:
+        if self.levels:
             light = light.div_(scale).round_().clamp_(max=self.levels - 1)
         return light, scale
 
     def scale(self) -> Tensor | None:
         """Return the scale alone."""
+        if self.log_light is not None:
+            return self.log_light.exp() / self.root.square().sum(dim=1, keepdim=True)
         return torch.full((len(self.root), 1), self.top / (self.levels - 1)) if self.levels else None
 
     def full(self, mask: Tensor) -> Tensor:
@@ -86,14 +95,18 @@ class Grey:
             return slope
         return slope.scatter_add_(1, self.root.abs().argmax(dim=1, keepdim=True), of_full)
 
-    def set_gradients(self, slope: Tensor, _: Tensor | None) -> None:
+    def set_gradients(self, slope: Tensor, light_slope: Tensor | None) -> None:
         """Set the gradients from that of the mask times the scale; `slope` is used up."""
+        if self.log_light is not None:
+            assert light_slope is not None
+            slope -= light_slope / self.root.square().sum(dim=1, keepdim=True)
+            self.log_light.grad = light_slope.sum(dim=0, keepdim=True)
         factor = 2.0 * (self.levels - 1) / self.top if self.levels else 2.0
         self.root.grad = slope.mul_(self.root).mul_(factor)
 
     def settle(self) -> None:
         """Take brighter pixels back to the top after a step: no gradient would ever darken them."""
-        if self.top < math.inf:
+        if self.top < math.inf and not self.even:  # else bits are made that light more pixels
             bound = math.sqrt(self.top)
             self.root.clamp_(-bound, bound)
 
@@ -131,12 +144,12 @@ class Bits:
 
     def brightness(self) -> Tensor:
         """Return the photoelectrons of a lit pixel of every state, (states, 1)."""
-        light = self.log_light.exp() / self.lit() if self.even else self.log_light.exp()
+        light = self.log_light.exp() / self.lit().clamp(min=1) if self.even else self.log_light.exp()
         return light.expand(len(self.lean) // self.parts if self.rows is None else len(self.rows), 1)
 
     def lit(self) -> Tensor:
         """Return how many pixels every state lights, (states, 1)."""
-        return by_state(torch.gt(self.own(), 0).sum(dim=1, keepdim=True), self.parts).to(self.lean.dtype)
+        return torch.gt(self.own(), 0).sum(dim=1, keepdim=True).to(self.lean.dtype)
 
     def scale(self) -> Tensor:
         """Return the brightness of every row of pixels, (rows, 1)."""
@@ -158,7 +171,7 @@ class Bits:
         assert light_slope is not None
         light_slope = by_state(light_slope, self.parts)
         if self.even:  # one more pixel takes light from all others
-            slope -= by_row(light_slope / self.lit(), self.parts)
+            slope -= light_slope / self.lit()
         bend = torch.square(self.own()).mul_(2.0).add_(1.0).square_()
         gradient = torch.div(slope, bend, out=bend)
         if self.rows is not None:
@@ -175,7 +188,7 @@ class Bits:
         if not self.even:
             self.log_light.clamp_(math.log(self.bottom), math.log(self.top))
             return
-        n_pixels = self.parts * self.lean.shape[1]
+        n_pixels = self.lean.shape[1]
         self.log_light.clamp_(math.log(self.bottom), math.log(self.top * n_pixels))
         light = float(self.log_light.exp())
         least, most = math.ceil(light / self.top), math.floor(light / self.bottom)
@@ -183,11 +196,11 @@ class Bits:
 
     def light_up(self, wanted: Tensor) -> None:
         """Let every state light so many pixels, (states, 1): those that lean to it most."""
-        pixels = self.lean.view(-1, self.parts * self.lean.shape[1])
         for state in (self.lit() != wanted).flatten().nonzero().flatten().tolist():
-            order, number = pixels[state].argsort(descending=True), int(wanted[state])
-            pixels[state, order[:number]] = pixels[state, order[:number]].clamp(min=EDGE)
-            pixels[state, order[number:]] = pixels[state, order[number:]].clamp(max=-EDGE)
+            lean, number = self.lean[state], int(wanted[state])
+            order = lean.argsort(descending=True)
+            lean[order[:number]] = lean[order[:number]].clamp(min=EDGE)
+            lean[order[number:]] = lean[order[number:]].clamp(max=-EDGE)
 
 
 Light = Grey | Bits
@@ -506,7 +519,7 @@ def _add_fading(light: Light, step: Step, detected: float, faded: float, fades: 
 
     Both are gradients by the logarithm of what is left; returns those of this level and the later ones together.
     """
-    assert isinstance(light, Bits)
+    assert light.log_light is not None
     assert light.log_light.grad is not None
     own = float(step.sent.max()) / fades
     light.log_light.grad += detected * (own / math.expm1(own) - 1) - own * faded

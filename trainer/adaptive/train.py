@@ -191,7 +191,7 @@ class _Run:
         asked = self.options
         law = law_of(self.profile, exposure_us, asked.outcomes, asked.channels, asked.dark)
         links = trained_through(self.profile, exposure_us)
-        fades = fades_of(asked, self.objects.n_pixels) if self.stage == "shown" else math.inf
+        fades = fades_of(asked, self.objects.n_pixels) if self.stage != "grow" else math.inf
         return Sight(law, self.objects.gain, self.objects.floor, products, asked.optics is not None, links, fades)
 
     # ---- the stages ----
@@ -249,6 +249,7 @@ class _Run:
                 if len(growth.levels) % KEPT_EVERY == 0:
                     keep()
         self.stage, self.epoch = "grey", 0
+        self._send_evenly()
 
     def _grown(self, growth: Growth, aim: Aim) -> Progress:
         counts = growth.counts
@@ -270,18 +271,18 @@ class _Run:
         if self.stage != "grey":
             return
         low, high = top_limits(self.profile)
-        lights = [level.light.displayed()[0] for level in self.machine.levels]
+        shown = [level.light.displayed() for level in self.machine.levels]
+        lights = [mask if scale is None else mask * scale for mask, scale in shown]
         if self.options.grey:
             top = min(high, max(low, max(float(light.max()) for light in lights)))
             for level, light in zip(self.machine.levels, lights):
                 level.light = Grey(light.clamp(max=top).sqrt(), top, self.profile.projector.levels)
         else:
             self._start_bits(lights, low)
-        self._send_evenly()
         self.stage, self.epoch, self.tuning = "shown", 0, None
 
     def _send_evenly(self) -> None:
-        """With a cap on the dose, let every walk send it, exposure by exposure; see Bits."""
+        """With a cap on the dose, let every walk send it."""
         if self.cap < math.inf:
             fades = fades_of(self.options, self.objects.n_pixels)
             send_evenly(self.machine, self._masses(), self.cap, fades)
@@ -308,6 +309,8 @@ class _Run:
         for level, bits in zip(self.machine.levels, made):
             if shared:
                 bits.log_light, bits.bottom = typical, low
+            if level.light.even and level.light.log_light is not None:
+                bits.log_light, bits.even = level.light.log_light, True
             bits.settle()
             level.light = bits
         most = patterns_at_most(self.options, self.profile)
@@ -427,7 +430,7 @@ class _Run:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from `state`."""
         self.stage, self.epoch = state["stage"], state["epoch"]
-        if self.stage == "shown" and self.cap < math.inf:
+        if self.stage != "grow" and self.cap < math.inf:
             self.prices.drop_sent()
         for price, value in zip(self.prices.all, state["prices"]):
             price.value = value

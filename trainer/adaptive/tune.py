@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from .grow import sum_of
-from .machine import COUNT_FLOOR, Aim, Bits, Machine, Sight, Spent, backward, forward
+from .machine import COUNT_FLOOR, Aim, Machine, Sight, Spent, backward, forward
 from .objects import Block
 
 COUNT_SHARE = 0.02  # of a step in the running class counts
@@ -145,7 +145,9 @@ class Prices:
 
 def hold_cap(machine: Machine, cap: float) -> None:
     """Dim all levels alike, where the states of each send the same light, until a whole walk sends no more than `cap`."""
-    lights = [level.light.log_light for level in machine.levels if isinstance(level.light, Bits) and level.light.even]
+    lights = [
+        level.light.log_light for level in machine.levels if level.light.log_light is not None and level.light.even
+    ]
     total = float(torch.cat(lights).double().exp().sum()) if lights else 0.0
     if total > cap:
         for log_light in lights:
