@@ -116,7 +116,7 @@ def test_forward_is_the_sum_over_all_words(law, bits):
         np.testing.assert_allclose(found, sums, rtol=rel)
 
 
-@pytest.mark.parametrize("law", (*CLICKS, *COUNTS), ids=str)
+@pytest.mark.parametrize("law", [*CLICKS, *COUNTS], ids=str)
 def test_where_states_send_the_same_light_bleaching_is_that_of_every_walk(law):
     machine, sight = even_machine(law, 1), wide(law, 0.01, fades=0.8)
     passed = forward(machine, sight, GREY)
