@@ -13,8 +13,9 @@ from typing import Any
 import torch
 
 from .grow import sum_of
-from .machine import COUNT_FLOOR, Aim, Machine, Sight, Spent, backward, forward
+from .machine import COUNT_FLOOR, Aim, Bits, Machine, Sight, Spent, backward, doses_behind, forward, sent_by
 from .objects import Block
+from .outcomes import by_state
 
 COUNT_SHARE = 0.02  # of a step in the running class counts
 PRICE_MIN, PRICE_MAX = 1e-6, 10.0
@@ -133,10 +134,6 @@ class Prices:
         """Return how many times the budget was spent, the one of which most was."""
         return max(price.excess(spent) for price in self.all)
 
-    def drop_sent(self) -> None:
-        """Leave out the price of light sent, where the cap holds it."""
-        self.all = [price for price in self.all if price.kind != SENT]
-
     def follow(self, spent: Spent) -> None:
         """Let each price follow its budget."""
         for price in self.all:
@@ -144,14 +141,24 @@ class Prices:
 
 
 def hold_cap(machine: Machine, cap: float) -> None:
-    """Dim all levels alike, where the states of each send the same light, until a whole walk sends no more than `cap`."""
-    lights = [
-        level.light.log_light for level in machine.levels if level.light.log_light is not None and level.light.even
-    ]
-    total = float(torch.cat(lights).double().exp().sum()) if lights else 0.0
-    if total > cap:
-        for log_light in lights:
-            log_light += math.log(cap / total)
+    """Dim the states of `machine` until no walk sends more than `cap`: each by what the walk through it that sends most has too much.
+
+    A walk that sends L above the cap is then dimmed by L / cap or more in each of its states.
+    """
+    if cap == math.inf:
+        return
+    before, sent = [torch.zeros(1, 1)], []
+    for number, level in enumerate(machine.levels):
+        sent.append(by_state(sent_by(level.light), level.light.parts if isinstance(level.light, Bits) else 1))
+        before[number] = before[number][: level.n_states]
+        before.append(doses_behind(before[number] + sent[number], level.successors, machine.n_nodes(number)))
+    after = torch.zeros(machine.n_nodes(len(machine.levels) - 1), 1)
+    for number in range(len(machine.levels) - 1, -1, -1):
+        level = machine.levels[number]
+        after = sent[number] + after[level.successors].amax(dim=0)
+        level.light.dim(((before[number] + after) / cap).clamp(min=1))
+        if number:
+            after = torch.cat([after, torch.zeros(len(machine.counts[number - 1]), 1)])
 
 
 class Tuning:
