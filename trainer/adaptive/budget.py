@@ -34,7 +34,6 @@ PRICE_POWER = 1.6  # how the price falls with the budget
 GROWN_PRICE = 0.7  # of the last level grown, over the price of the budget: tuning saves light
 DEFAULT_PHOTONS = 10.0
 GREY_EPOCHS = 3
-CAP_SPENT = 0.9
 # by task, where they helped on held-back objects (docs/how-to/automaton.md)
 COPIES_OF = {"mnist": 20}
 SOFT_OF = {"fashion-mnist": 0.5}
@@ -43,9 +42,7 @@ SOFT_OF = {"fashion-mnist": 0.5}
 def budgets_of(options: AutomatonOptions) -> dict[str, float]:
     """Return the budgets that were given: fields of `Spent`. A cap on the dose is one of light sent, which every walk takes."""
     found = {kind: budget for kind in Spent._fields if (budget := getattr(options, kind)) is not None}
-    return (
-        found if options.dose_cap is None else found | {SENT: options.dose_cap * (1.0 if options.bleach else CAP_SPENT)}
-    )
+    return found if options.dose_cap is None else found | {SENT: options.dose_cap}
 
 
 def photons_wanted(options: AutomatonOptions) -> float:

@@ -140,8 +140,8 @@ def set_top(machine: Machine, top: float, profile: Profile) -> None:
             light.settle()
 
 
-def to_grid(machine: Machine, grid: Grid, down: bool = False) -> None:
-    """Round the brightness of all one-bit patterns to whole steps, at least one."""
+def to_grid(machine: Machine, grid: Grid) -> None:
+    """Round the brightness of all one-bit patterns to whole steps, at least one; down, where states send the same light."""
     with torch.no_grad():
         for level in machine.levels:
             light = level.light
@@ -154,7 +154,7 @@ def to_grid(machine: Machine, grid: Grid, down: bool = False) -> None:
                 cost = cost.masked_fill((tried < 1) | (tried * grid.steps < wanted), math.inf)
                 light.light_up(tried.gather(1, cost.argmin(dim=1, keepdim=True)))
             units = (light.brightness() if light.even else light.log_light.exp()) / grid.top * grid.steps
-            units = units.floor() if down else units.round()
+            units = units.floor() if light.even else units.round()
             rounded = (units.clamp(1, grid.steps) / grid.steps * grid.top).log()
             if light.even:
                 light.log_light, light.even = rounded, False

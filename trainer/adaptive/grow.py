@@ -59,7 +59,7 @@ class Growth:
         """Add a level whose light has the prices of `aim`."""
         chosen = self._best_candidates(aim).clamp(min=GLOW)
         light = Grey(chosen.sqrt(), self.top)
-        if self.options.bleach is not None:
+        if self.options.dose_cap is not None:
             masses = self.counts.sum(dim=1)
             light.log_light = (masses @ chosen.sum(dim=1) / masses.sum()).log().reshape(1, 1)
         light.settle()

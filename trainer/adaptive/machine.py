@@ -104,13 +104,6 @@ class Grey:
         factor = 2.0 * (self.levels - 1) / self.top if self.levels else 2.0
         self.root.grad = slope.mul_(self.root).mul_(factor)
 
-    def dim(self, by: Tensor) -> None:
-        """Divide the light of every state by `by` (states, 1), of an even level by the most of it."""
-        if self.log_light is not None:
-            self.log_light -= by.amax().log()
-        else:
-            self.root /= by_row(by, len(self.root) // len(by)).sqrt()
-
     def settle(self) -> None:
         """Take brighter pixels back to the top after a step: no gradient would ever darken them."""
         if self.top < math.inf and not self.even:  # else bits are made that light more pixels
@@ -189,10 +182,6 @@ class Bits:
             light_slope = light_slope.sum(dim=0, keepdim=True)
             light_slope = light_slope if self.log_light.grad is None else self.log_light.grad + light_slope
         self.log_light.grad = light_slope
-
-    def dim(self, by: Tensor) -> None:
-        """Divide the light of every state by `by` (states, 1), of an even level by the most of it."""
-        self.log_light -= (by.amax() if len(self.log_light) != len(by) else by).log()
 
     def settle(self) -> None:
         """Keep the brightness inside its limits; where states send the same light, by lighting more pixels or fewer."""

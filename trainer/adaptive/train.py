@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.automaton import capped
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
@@ -70,7 +69,7 @@ from .machine import (
 from .objects import Block, TrainingObjects
 from .outcomes import by_row, law_of
 from .sweeps import choose_patterns, reroute, share_patterns
-from .tune import SENT, Figures, Prices, Progress, Tuning, figures, hold_cap, masses, mean_objects
+from .tune import Figures, Progress, Tuning, figures, hold_cap, masses, mean_objects
 
 KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
 REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reached
@@ -81,7 +80,6 @@ TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than 
 HEADROOM = 1.25  # of the top over that, where states send the same light: they would light more pixels for it from epoch to epoch
 DARK_COUNTS = 0.5  # per decision, at most: 0.15 to 0.8 were tried on held-back images (docs/measurements/index.md)
 BUDGET_BLOCKS = 6  # of objects, by which the budget is met
-STATE_PARTS = 2
 CAP_ROUNDING = 1e-6  # of a cap on the dose, for sums in float32
 STAGES = ("grow", "grey", "shown")
 NETWORK = "network"  # a stage before them, where targets are soft
@@ -172,7 +170,6 @@ class _Run:
         self.tuning: Tuning | None = None
         self.saved_tuning: dict[str, Any] | None = None
         self.products = product_dtype()
-        self.even = options.bleach is not None
         self.cap = math.inf if options.dose_cap is None else options.dose_cap * (1 - CAP_ROUNDING)
         self.answers: NDArray[np.float32] | None = None
 
@@ -201,10 +198,6 @@ class _Run:
 
     def start_from(self, start: Bundle) -> None:
         """Take the states and patterns of `start` in place of growing, and count its leaves on some of the objects."""
-        if self.cap < math.inf and not self.even:
-            assert start.automaton is not None
-            most = STATE_PARTS * start.automaton.n_states
-            start = replace(start, automaton=capped(start.automaton, start.state_light(), self.cap, most))
         self.machine, self.stage = machine_of(start), "shown"
         lights = [level.light for level in self.machine.levels if isinstance(level.light, Bits)]
         low, high = top_limits(self.profile)[0], self._highest_top()
@@ -290,9 +283,10 @@ class _Run:
 
     def _send_evenly(self) -> None:
         """With a cap on the dose, let every walk send it."""
-        if self.even:
+        if self.cap < math.inf:
             fades = fades_of(self.options, self.objects.n_pixels)
             send_evenly(self.machine, self._masses(), self.cap, fades)
+            self.prices.drop_sent()
 
     def _highest_top(self) -> float:
         """Return the brightest top that the profile allows and that brings no more than `DARK_COUNTS` to a decision."""
@@ -367,7 +361,7 @@ class _Run:
         below = masses[order].cumsum(0) / masses.sum()
         low, high = top_limits(self.profile)[0], self._highest_top()
         top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
-        if self.even:
+        if self.cap < math.inf:
             top *= HEADROOM
         set_top(self.machine, min(high, max(low, top)), self.profile)
 
@@ -389,18 +383,17 @@ class _Run:
     def finish(self) -> TrainedAutomaton:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
-        if self.even:
+        if self.cap < math.inf:
             top = max(float(level.light.brightness().max()) for level in self.machine.levels)  # type: ignore[union-attr]
             set_top(self.machine, max(top_limits(self.profile)[0], top), self.profile)
         grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
-        within = self.cap < math.inf
-        held = Prices([price for price in self.prices.all if price.kind != SENT or not within])
-        if held.all:
-            meet_budget(self.machine, held, None if within else grid, self.sight, self._drawn())
+        capped = self.cap < math.inf
+        if self.prices.all:
+            meet_budget(self.machine, self.prices, None if capped else grid, self.sight, self._drawn())
         with torch.no_grad():
-            hold_cap(self.machine, self.cap)
+            hold_cap(self.machine, self.cap, brighten=not self.prices.all)
         if grid is not None:
-            to_grid(self.machine, grid, down=within)
+            to_grid(self.machine, grid)
         sight = self.sight()
         posteriors = self._posteriors(sight, held_back)
         measured = figures(self.machine, sight, held_back)
@@ -437,6 +430,8 @@ class _Run:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from `state`."""
         self.stage, self.epoch = state["stage"], state["epoch"]
+        if self.stage != "grow" and self.cap < math.inf:
+            self.prices.drop_sent()
         for price, value in zip(self.prices.all, state["prices"]):
             price.value = value
         self.machine = machine_from(state["machine"])

@@ -13,13 +13,13 @@ from typing import Any
 import torch
 
 from .grow import sum_of
-from .machine import COUNT_FLOOR, Aim, Bits, Machine, Sight, Spent, backward, doses_behind, forward, sent_by
+from .machine import COUNT_FLOOR, Aim, Machine, Sight, Spent, backward, forward
 from .objects import Block
-from .outcomes import by_state
 
 COUNT_SHARE = 0.02  # of a step in the running class counts
 PRICE_MIN, PRICE_MAX = 1e-6, 10.0
 SENT = "illumination"
+AT_CAP = 0.999  # of a cap is sent where it binds
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,31 +134,39 @@ class Prices:
         """Return how many times the budget was spent, the one of which most was."""
         return max(price.excess(spent) for price in self.all)
 
+    def drop_sent(self) -> None:
+        """Leave out the price of light sent, where the cap holds it."""
+        self.all = [price for price in self.all if price.kind != SENT]
+
     def follow(self, spent: Spent) -> None:
         """Let each price follow its budget."""
         for price in self.all:
             price.follow(spent)
 
 
-def hold_cap(machine: Machine, cap: float) -> None:
-    """Dim the states of `machine` until no walk sends more than `cap`: each by what the walk through it that sends most has too much.
+def even_lights(machine: Machine) -> list[torch.Tensor]:
+    """Return the logarithms of what the levels send whose states send the same light."""
+    return [level.light.log_light for level in machine.levels if level.light.even and level.light.log_light is not None]
 
-    A walk that sends L above the cap is then dimmed by L / cap or more in each of its states.
-    """
-    if cap == math.inf:
-        return
-    before, sent = [torch.zeros(1, 1)], []
-    for number, level in enumerate(machine.levels):
-        sent.append(by_state(sent_by(level.light), level.light.parts if isinstance(level.light, Bits) else 1))
-        before[number] = before[number][: level.n_states]
-        before.append(doses_behind(before[number] + sent[number], level.successors, machine.n_nodes(number)))
-    after = torch.zeros(machine.n_nodes(len(machine.levels) - 1), 1)
-    for number in range(len(machine.levels) - 1, -1, -1):
-        level = machine.levels[number]
-        after = sent[number] + after[level.successors].amax(dim=0)
-        level.light.dim(((before[number] + after) / cap).clamp(min=1))
-        if number:
-            after = torch.cat([after, torch.zeros(len(machine.counts[number - 1]), 1)])
+
+def hold_cap(machine: Machine, cap: float, brighten: bool = False) -> None:
+    """Dim all levels alike until a whole walk sends no more than `cap`; or `brighten` them until it sends as much."""
+    lights = even_lights(machine)
+    total = float(torch.cat(lights).double().exp().sum()) if lights else 0.0
+    if total > cap or (brighten and lights):
+        for log_light in lights:
+            log_light += math.log(cap / total)
+
+
+def along_cap(machine: Machine, cap: float) -> None:
+    """Leave of the gradients what shares the light out among the levels, where more would be sent than `cap`: that of a softmax."""
+    lights = even_lights(machine)
+    sent = torch.cat(lights).exp() if lights else torch.zeros(1)
+    wanted = sum(float(light.grad.sum()) for light in lights if light.grad is not None)
+    if wanted < 0 and float(sent.sum()) > AT_CAP * cap:
+        for log_light, share in zip(lights, sent / sent.sum()):
+            assert log_light.grad is not None
+            log_light.grad -= wanted * share
 
 
 class Tuning:
@@ -195,6 +203,7 @@ class Tuning:
             passed = forward(machine, self.sight, block.grey)
             aim = self.prices.aim(self.exposure_price, self.decide, self.spread)
             backward(machine, self.sight, block.grey, block.one_hot, passed, aim)
+            along_cap(machine, self.cap)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.rate * max(0.0, 1 - self.done / self.steps) + 1e-5
             self.optimiser.step()
