@@ -17,6 +17,7 @@ from pans.trainer.adaptive.budget import check_automaton_options, for_task, star
 from pans.trainer.adaptive.train import TrainedAutomaton, train_automaton
 from pans.trainer.adaptive.tune import Progress
 from pans.trainer.device import keep_freed_memory
+from pans.trainer.evaluate.held_out import trained_bleaching
 from pans.trainer.evaluate.walks import MeasuredWalks
 from pans.trainer.export.automaton import export_automaton
 from pans.trainer.options import AutomatonOptions, flag_of, option_names
@@ -87,6 +88,7 @@ class AutomatonTraining:
         bundle = self.bundle = exported.bundle
         automaton, measured = bundle.automaton, exported.measured
         assert automaton is not None
+        bleaching = trained_bleaching(bundle)
         off, missed = budget_off(trained.options, measured, bundle.illumination())
         answer = {
             **asdict(measured),
@@ -98,10 +100,12 @@ class AutomatonTraining:
             "price": trained.prices[0],
             "sent_price": trained.prices[1],
             "budget_off": off,
+            "bleaching": bleaching.spelled() or None,
         }
         lines = [
             f"{automaton.n_states} states, {bundle.n_patterns} patterns, at most {automaton.n_slots} exposures",
             words_of(measured, {"first_200": answer["first_200"]}),
+            *([f"  {bleaching.words()}"] if bleaching.spelled() else []),
             *missed,
         ]
         return exported.sha256, answer, lines

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import log_scores, reachable_automaton, walk_nodes
+from pans.runtime.bundle.automaton import DOSE_ROUNDING, log_scores, reachable_automaton, walk_nodes
 from pans.runtime.bundle.model import Bundle, Shown, load_bundle, make_bundle, with_expected, write_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import PansError, PlanError
+from pans.runtime.imaging import NO_BLEACHING
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
@@ -65,12 +66,19 @@ def export_automaton(
 ) -> ExportedAutomaton:
     """Write what `train_automaton` returned to `path`; UsageError if it exists, unless `force`. A wrong bundle never stands there."""
     bundle = bundle_of(trained, task, profile, name, provenance)
+    demand_within(bundle, trained.options.dose_cap)
     conditions = replace(as_trained(bundle), dark=trained.options.dark)
     bundle = with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
     difference = compare_walks(bundle, trained, task, profile)
     found = measure_walks(bundle, task.test, profile, conditions)
     first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, conditions)
-    expected = expected_figures(found, profile.name, task.name, "test")
+    # what a bundle says of itself is of objects that do not bleach, as `pans evaluate` judges unless it is told
+    steady = (
+        found
+        if conditions.bleaching.is_none
+        else measure_walks(bundle, task.test, profile, replace(conditions, bleaching=NO_BLEACHING))
+    )
+    expected = expected_figures(steady, profile.name, task.name, "test")
     with whole_file(path, force=force) as unchecked:
         write_bundle(with_expected(bundle, expected), unchecked)
         written, digest = load_bundle(unchecked)
@@ -105,6 +113,15 @@ def bundle_of(
         automaton=automaton,
         provenance=facts,
     )
+
+
+def demand_within(bundle: Bundle, cap: float | None) -> None:
+    """Raise PlanError where a walk of `bundle` sends more than `cap`."""
+    if cap is not None and bundle.illumination() > cap * (1 + DOSE_ROUNDING):
+        raise PlanError(
+            f"a walk of {bundle.name} sends {bundle.illumination():.9g}, the cap is {cap:.9g}: steps of the brightness are too coarse",
+            remedy="fewer --exposures, or a profile with finer steps (projector.dwell_steps, or levels)",
+        )
 
 
 def measure_walks(

@@ -22,7 +22,7 @@ from pans.trainer.evaluate.accuracy import outcome_law_of
 from pans.trainer.evaluate.dose import within_cap
 from pans.trainer.evaluate.held_out import HeldOut
 from pans.trainer.evaluate.walks import measured_walks, walks_of
-from pans.trainer.export.automaton import bundle_of, compare_walks, export_automaton, measure_walks
+from pans.trainer.export.automaton import bundle_of, compare_walks, demand_within, export_automaton, measure_walks
 from pans.trainer.options import AutomatonOptions, Conditions
 
 IDEAL = load_profile("ideal")
@@ -171,8 +171,15 @@ def test_no_walk_passes_the_cap_and_all_come_near(task, name):
     assert min(doses) >= 0.995 * 12.0
     found = measure_walks(bundle, task.test, profile)
     assert budget_off(CAPPED, found, bundle.illumination())[0] <= 0.0
-    cut = within_cap(free_bundle(task, profile), 12.0, HeldOut(task, task.test, profile), None)
+    free = free_bundle(task, profile)
+    cut = within_cap(free, 12.0, HeldOut(task, task.test, profile), None)
     assert found.accuracy_mean > measure_walks(cut.bundle, task.test, profile).accuracy_mean + 0.01
+    again = started_from(replace(CAPPED, exposures=0, states=0, epochs=2), free, "f" * 64, task, profile)
+    doses = list(doses_by_word(bundle_of(train_automaton(task, profile, again, start=free), task, profile, "on", {})))
+    assert max(doses) <= 12.0
+    assert min(doses) >= 0.995 * 12.0
+    with pytest.raises(PlanError, match="the cap is 11:"):
+        demand_within(bundle, 11.0)
 
 
 def free_bundle(task, profile):
@@ -192,6 +199,7 @@ def test_through_bleaching_the_expectation_is_that_of_sampled_walks(task, name, 
     drawn = measured_walks(walks_of(made.bundle, profile, images, labels, Conditions(bleaching=law), trials=200))
     assert abs(drawn.accuracy_mean - made.measured.accuracy_mean) < 3 * drawn.accuracy_std / np.sqrt(200)
     assert drawn.photons_mean == pytest.approx(made.measured.photons_mean, rel=0.005)
+    assert made.bundle.expected["photons"] > 1.5 * made.measured.photons_mean  # of objects that do not bleach
     # a training that knows nothing of it decides worse
     blind = bundle_of(train_automaton(task, profile, CAPPED), task, profile, "blind", {})
     judged = measured_walks(walks_of(blind, profile, images, labels, Conditions(bleaching=law)))
