@@ -73,7 +73,7 @@ class Grey:
     def displayed(self) -> tuple[Tensor, Tensor | None]:
         """Return (mask, scale); no scale stands for 1."""
         light, scale = self.root.square(), self.scale()
-        if self.levels:
+        if self.levels and scale is not None:
             light = light.div_(scale).round_().clamp_(max=self.levels - 1)
         return light, scale
 

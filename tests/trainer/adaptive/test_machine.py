@@ -203,7 +203,9 @@ def test_the_gradient_of_the_brightness_of_bits(shared, aim):
     assert_gradients(machine, wide(ClickLaw(0.01), 0.01), aim)
 
 
-@pytest.mark.parametrize(("law", "fades"), [(ClickLaw(0.01), math.inf), (ClickLaw(0.01), 0.8), (COUNTS[1], 0.8)], ids=str)
+@pytest.mark.parametrize(
+    ("law", "fades"), [(ClickLaw(0.01), math.inf), (ClickLaw(0.01), 0.8), (COUNTS[1], 0.8)], ids=str
+)
 @pytest.mark.parametrize("aim", AIMS)
 def test_the_gradient_where_states_send_the_same_light(law, fades, aim):
     sight = wide(law, 0.01, fades=fades)
