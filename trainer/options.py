@@ -148,7 +148,8 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class AutomatonOptions:
-    """What to train. `photons` or `clicks`, `illumination`, or one of each are the budget of one decision, on average.
+    """What to train. `photons` or `clicks`, `illumination`, or one of each are the budget of one decision, on average; `dose_cap` is one
+    of light sent that no walk passes.
 
     0 exposures or states stand for defaults.
     """
@@ -156,6 +157,12 @@ class AutomatonOptions:
     photons: float | None = option(None, "photoelectrons per decision to aim for", range=BUDGET)
     clicks: float | None = option(None, "clicks per decision to aim for", range=BUDGET)
     illumination: float | None = option(None, "photoelectrons to send per decision", range=LIGHT, metavar="L")
+    dose_cap: float | None = option(
+        None,
+        "photoelectrons that no walk sends more of: exposure by exposure every walk sends the same light",
+        range=LIGHT,
+        metavar="N",
+    )
     exposures: int = option(
         0, "exposures per decision (default: by the budget)", range=Range(0, SLOTS_MAX, whole=True), metavar="T"
     )
@@ -203,6 +210,7 @@ class AutomatonOptions:
     teacher_epochs: int = 6  # of that network
     dark: float | None = option(None, "dark photoelectrons per exposure, instead of the profile's", range=NONE_OR_LIGHT)
     optics: str | None = option(None, "tolerance of the optics to train through")
+    bleach: str | None = option(None, "train for objects that bleach", metavar="D0:mixed")
     spread: float = option(0.0, "weight of the concentration of the light", range=TENFOLD)
     outcomes: int = option(2, "of one exposure", range=OUTCOMES)
     channels: int = option(

@@ -1,18 +1,20 @@
 """Draws dose.png: accuracy of the shipped bundles against dose, patterns in three orders, exact over the test images, SIMULATED.
 
-Usage: python docs/pictures/dose.py [OBJECTS] (needs the extra plot and PANS_DATA; a minute for all 10 000 images).
+Usage: python docs/pictures/dose.py [OBJECTS [CAPPED.pans ...]] (needs the extra plot and PANS_DATA; a minute for all 10 000 images).
+CAPPED.pans are automata trained under caps on fashion-mnist: one more curve, a point for each.
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.imaging import NO_BLEACHING
 from pans.trainer.commands.evaluate import dose_curve_words
 from pans.trainer.evaluate.dose import dose_curve
-from pans.trainer.evaluate.held_out import held_out_of
+from pans.trainer.evaluate.held_out import held_out_of, measure
 from pans.trainer.evaluate.pictures import draw_dose
 from pans.trainer.export.ordering import information_order, reordered
 from pans.trainer.options import Conditions
@@ -30,4 +32,8 @@ if __name__ == "__main__":
     for name, (bundle, judged_on) in bundles.items():
         drawn[name] = dose_curve(bundle, judged_on, Conditions())
         print(dose_curve_words(name, len(judged_on.objects), NO_BLEACHING, drawn[name]))
+    capped = [load_bundle(path)[0] for path in sys.argv[2:]]
+    if capped:
+        name = "automata trained under caps"
+        drawn[name] = [asdict(measure(one, held_out_of(one, None, objects, None, Conditions()))) for one in capped]
     print(draw_dose(Path(__file__).parent, drawn, force=True))

@@ -54,6 +54,7 @@ def expected_walk(
     *,
     afterpulses: Afterpulses = NO_AFTERPULSES,
     begins: tuple[float, float] = (0.0, 0.0),
+    left: NDArray[np.floating[Any]] | None = None,
 ) -> ExpectedWalk:
     """Return what `automaton` does on each of n objects, exactly.
 
@@ -61,7 +62,8 @@ def expected_walk(
     time; `transmission` (n, pixels), 0 to 1. `law` is that of one whole exposure: dark counts and read noise come whatever the dwell.
     Of `afterpulses` without a time constant a click makes the next exposure click as well; the exposure before a walk is taken to have
     none (that of the last object's end is forgotten, at most one click in so many walks). With one, `begins` is the memory with which a
-    walk begins, mean and variance, and meeting walks share its moments.
+    walk begins, mean and variance, and meeting walks share its moments. `left` (states,) is the part of a state's light that objects
+    give back which bleach; None: all.
     Of several channels `law` is that of each. ValueError for shapes that do not fit, a law of other outcomes than the automaton's, and
     afterpulses of a detector that counts or of several channels.
     """
@@ -80,7 +82,7 @@ def expected_walk(
         walks = _walks(automaton, law, afterpulses, len(light), begins)
         for states in slots:
             rows, share = automaton.rows[states], automaton.dwell[states] / automaton.dwell_steps
-            each = light[:, rows] * share[:, None]
+            each = light[:, rows] * (share if left is None else share * left[states])[:, None]
             reached, clicks = walks.leave(states, each)
             sums[0, here] += clicks
             sums[1, here] += (reached * each.sum(axis=2)).sum(axis=1)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,8 @@ import numpy as np
 from pans.runtime.bundle.automaton import STATES_MAX
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.cli.option_fields import check_options as check_ranges
-from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.errors import PlanError, UsageError, as_usage_error
+from pans.runtime.imaging import bleaching_of
 from pans.runtime.instrument.click_law import cannot_count, cannot_read_at_once
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import AutomatonOptions, check_optics
@@ -38,8 +40,9 @@ SOFT_OF = {"fashion-mnist": 0.5}
 
 
 def budgets_of(options: AutomatonOptions) -> dict[str, float]:
-    """Return the budgets that were given: fields of `Spent`."""
-    return {kind: budget for kind in Spent._fields if (budget := getattr(options, kind)) is not None}
+    """Return the budgets that were given: fields of `Spent`. A cap on the dose is one of light sent, which every walk takes."""
+    found = {kind: budget for kind in Spent._fields if (budget := getattr(options, kind)) is not None}
+    return found if options.dose_cap is None else found | {SENT: options.dose_cap}
 
 
 def photons_wanted(options: AutomatonOptions) -> float:
@@ -173,12 +176,52 @@ def check_automaton_options(options: AutomatonOptions, task: Task, profile: Prof
     if not budgets_of(options):
         raise UsageError(
             "an automaton is trained for a budget of light",
-            remedy="give --photons or --clicks, --illumination, or one of the first two with --illumination",
+            remedy="give --photons or --clicks, --illumination or --dose-cap, or one of the first two with one of the others",
         )
+    _check_dose(options, task, profile)
     if options.optics is not None:
         check_optics(options.optics)
     _check_task(task)
     _check_fits(options, profile)
+
+
+def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None:
+    """Refuse what does not go with a dose cap, or with bleaching."""
+    if options.bleach is not None:
+        with as_usage_error():
+            law = bleaching_of(options.bleach)
+        if options.dose_cap is None or not law.mixed:
+            raise UsageError(
+                f"--bleach {options.bleach}: an automaton is trained exactly where a state has one dose, whichever walk led to it",
+                remedy=f"--bleach {law.dose:g}:mixed --dose-cap D: every walk then sends the same light, exposure by exposure",
+            )
+        if options.optics is not None:
+            raise UsageError("--bleach: of an automaton under perfect optics", remedy="leave one of them out")
+    if options.dose_cap is None:
+        return
+    if options.illumination is not None:
+        raise UsageError(
+            "--dose-cap: every walk sends that light, --illumination adds nothing", remedy="leave one of them out"
+        )
+    if options.channels > 1:
+        raise UsageError("--dose-cap: of one detector", remedy="leave out --channels")
+    if options.grey or (profile.projector.levels == 2 and profile.projector.dwell_steps == 1):
+        raise UsageError(
+            "--dose-cap: states have one-bit patterns and a brightness of their own",
+            remedy="leave out --grey, or choose a profile with levels or projector.dwell_steps",
+        )
+    exposures, states = with_defaults(options, profile)
+    most = states_at_most(exposures, states, options.successors)
+    if patterns_at_most(options, profile) < most:
+        raise UsageError(
+            f"--dose-cap: states share no patterns, up to {most} may be needed, {patterns_at_most(options, profile)} are allowed",
+            remedy="fewer --exposures or --states, or leave out --patterns",
+        )
+
+
+def fades_of(options: AutomatonOptions, pixels: int) -> float:
+    """Return the illumination of a whole object of so many pixels after which 1/e of its light is left; see Sight."""
+    return math.inf if options.bleach is None else bleaching_of(options.bleach).dose * pixels
 
 
 def _check_task(task: Task) -> None:

@@ -6,6 +6,7 @@ float64.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from pans.runtime.instrument.profile import Profile
 
 from .grow import sum_of
-from .machine import Bits, Machine, Sight, forward
+from .machine import Bits, Machine, Sight, forward, sent_by
 from .objects import Block
 from .tune import Prices, figures
 
@@ -25,6 +26,8 @@ SMOOTHINGS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # pseudo-objects of every 
 SHARPNESSES = tuple(0.5 + 0.02 * i for i in range(36))
 BINS = 15
 UNDER_BUDGET = 0.99  # of the budget is what drawn objects may take: others take a little more or less
+FEW_PIXELS = 3  # that are lit more or fewer, so that states send the same light in whole steps
+WORTH_A_PIXEL = 1e-3  # of that light
 DIMMINGS = 6  # steps of the search for the brightness that meets the budget
 
 
@@ -138,13 +141,46 @@ def set_top(machine: Machine, top: float, profile: Profile) -> None:
 
 
 def to_grid(machine: Machine, grid: Grid) -> None:
-    """Round the brightness of all one-bit patterns to whole steps, at least one."""
+    """Round the brightness of all one-bit patterns to whole steps, at least one; down, where states send the same light."""
     with torch.no_grad():
         for level in machine.levels:
             light = level.light
             assert isinstance(light, Bits)
-            units = (light.log_light.exp() / grid.top * grid.steps).round().clamp(1, grid.steps)
-            light.log_light.copy_((units / grid.steps * grid.top).log())
+            if light.even:  # by a few pixels more or less, what remains of the light is small
+                wanted = light.log_light.exp() / grid.top * grid.steps
+                change = torch.arange(-FEW_PIXELS, FEW_PIXELS + 1)
+                tried = light.lit() + change
+                cost = torch.remainder(wanted, tried) / wanted + WORTH_A_PIXEL * change.abs()
+                cost = cost.masked_fill((tried < 1) | (tried * grid.steps < wanted), math.inf)
+                light.light_up(tried.gather(1, cost.argmin(dim=1, keepdim=True)))
+            units = (light.brightness() if light.even else light.log_light.exp()) / grid.top * grid.steps
+            units = units.floor() if light.even else units.round()
+            rounded = (units.clamp(1, grid.steps) / grid.steps * grid.top).log()
+            if light.even:
+                light.log_light, light.even = rounded, False
+            else:
+                light.log_light.copy_(rounded)
+
+
+def send_evenly(machine: Machine, masses: list[torch.Tensor], cap: float, fades: float) -> None:
+    """Let all states of a level send the same light, all levels together `cap`.
+
+    What acts keeps the proportions that the mean light of the levels had, by the `masses` (states,) of their states; of objects that
+    bleach (`fades`, as of Sight) later levels send more for it.
+    """
+    with torch.no_grad():
+        lights = [level.light for level in machine.levels]
+        sent = [sent_by(light).flatten() for light in lights]
+        means = torch.stack([(one @ mass.to(one.dtype)) / mass.sum() for one, mass in zip(sent, masses)]).double()
+        acting = (means.cumsum(0) / means.sum()).cpu().numpy()
+        doses = cap * acting
+        if fades < math.inf:
+            doses = -fades * np.log1p(acting * math.expm1(-cap / fades))
+        for light, own in zip(lights, np.diff(doses, prepend=0.0)):
+            light.log_light = torch.full((1, 1), math.log(own))
+            if isinstance(light, Bits):
+                light.even = True
+                light.settle()
 
 
 def meet_budget(

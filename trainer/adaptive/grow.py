@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pans.trainer.options import AutomatonOptions
 
-from .machine import COUNT_FLOOR, Aim, Grey, Level, Machine, Sight, Spent, children, sent_by
+from .machine import COUNT_FLOOR, Aim, Grey, Level, Machine, Sight, Spent, brought, children, sent_by
 from .objects import Block
 from .outcomes import by_row, by_state, channels_of, clicks_of, mean_reading, readings, slope_of
 
@@ -57,8 +57,11 @@ class Growth:
 
     def grow(self, aim: Aim) -> None:
         """Add a level whose light has the prices of `aim`."""
-        roots = self._best_candidates(aim).clamp(min=GLOW).sqrt()
-        light = Grey(roots, self.top)
+        chosen = self._best_candidates(aim).clamp(min=GLOW)
+        light = Grey(chosen.sqrt(), self.top)
+        if self.options.dose_cap is not None:
+            masses = self.counts.sum(dim=1)
+            light.log_light = (masses @ chosen.sum(dim=1) / masses.sum()).log().reshape(1, 1)
         light.settle()
         self._train(light, aim)
         self._branch(light)
@@ -137,7 +140,7 @@ class Growth:
     def _train(self, light: Grey, aim: Aim) -> None:
         """Adam on the children's expected cross-entropy under running class counts."""
         options = self.options
-        optimiser = torch.optim.Adam([light.root], lr=RATE, fused=True)
+        optimiser = torch.optim.Adam(light.parameters(), lr=RATE, fused=True)
         n = sum(len(block) for block in self.blocks)
         # in float32 a child's count could vanish beside another's
         whole = self.counts.double() + len(self.clicks) * COUNT_FLOOR
@@ -147,15 +150,19 @@ class Growth:
             share = 0.05 if epoch == 0 else 0.03
             for index in torch.randperm(len(self.blocks), generator=self.random).tolist():
                 alpha, block = self.alphas[index], self.blocks[index]
-                mask, _ = light.displayed()
-                chances, falls = readings(self.sight.light(mask, block.grey), self.sight.law)
+                shown = brought(light, self.sight, block.grey)
+                chances, falls = readings(shown, self.sight.law)
                 arrived = [(alpha * chance) @ block.one_hot.T for chance in chances]
                 slope = slope_of(falls, _gains(parts, whole, block), self.sight.law)
                 slope.neg_().add_(aim.price).mul_(by_row(alpha, self.channels)).mul_(1.0 / len(block))
-                mask_slope = self.sight.mask_slope(slope, block.grey, light)
-                if aim.sent_price:
-                    mask_slope += by_row(alpha.mean(dim=1, keepdim=True), self.channels) * aim.sent_price
-                light.set_gradients(mask_slope, None)
+                mask_slope, scale = self.sight.mask_slope(slope, block.grey, light), light.scale()
+                cost = by_row(alpha.mean(dim=1, keepdim=True), self.channels) * aim.sent_price
+                mask_slope += cost
+                light_slope = None
+                if scale is not None:
+                    light_slope = slope.mul_(shown).sum(dim=1, keepdim=True) + cost * sent_by(light)
+                    mask_slope *= scale
+                light.set_gradients(mask_slope, light_slope)
                 optimiser.param_groups[0]["lr"] = RATE * (1 - done / steps) + 1e-4
                 optimiser.step()
                 light.settle()
@@ -166,10 +173,9 @@ class Growth:
 
     def _outcome_counts(self, light: Grey) -> list[Tensor]:
         """Class counts of all outcomes but the last, each (states, classes)."""
-        mask, _ = light.displayed()
         counted = []
         for alpha, block in zip(self.alphas, self.blocks):
-            chances, _ = readings(self.sight.light(mask, block.grey), self.sight.law)
+            chances, _ = readings(brought(light, self.sight, block.grey), self.sight.law)
             counted.append([(alpha * chance) @ block.one_hot.T for chance in chances])
         return [sum_of(parts) for parts in zip(*counted)]
 
@@ -187,13 +193,12 @@ class Growth:
 
     def _carry(self, light: Grey, successors: Tensor, n_nodes: int) -> None:
         """Carry the probabilities of all objects over one level, and add up its light and clicks."""
-        mask, _ = light.displayed()
         sums = torch.zeros(3, dtype=torch.float64)
         sent = by_state(sent_by(light), self.channels)
         for index, block in enumerate(self.blocks):
-            alpha, brought = self.alphas[index], self.sight.light(mask, block.grey)
-            chances, _ = readings(brought, self.sight.law)
-            each = mean_reading(chances, self.clicks), by_state(brought, self.channels), sent
+            alpha, shown = self.alphas[index], brought(light, self.sight, block.grey)
+            chances, _ = readings(shown, self.sight.law)
+            each = mean_reading(chances, self.clicks), by_state(shown, self.channels), sent
             sums += torch.stack([(alpha * one).sum() for one in each]).double()
             self.alphas[index] = children(alpha, chances, successors, n_nodes)
         n = sum(len(block) for block in self.blocks)

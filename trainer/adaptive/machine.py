@@ -44,6 +44,7 @@ BIT_CUT = 0.2  # a pixel is lit that had more than this part of the brightest on
 BRIGHTNESS_MIN, BRIGHTNESS_MAX = 1e-6, 1e6  # photoelectrons of a lit pixel
 WRONG = 2.2  # nats, of a wrong decision: about the odds of ten classes, so that both parts of the loss are of one size
 COUNT_FLOOR = 1e-3  # objects of every class in every leaf, before any was seen
+EDGE = 1e-3  # of a pixel that was just lit, or just not, for want of light
 LEAN = 0.3  # of a pixel that is lit or not, where a bundle says no more: a hundred steps at the usual rate turn it
 
 
@@ -51,26 +52,35 @@ LEAN = 0.3  # of a pixel that is lit or not, where a bundle says no more: a hund
 class Grey:
     """Patterns root**2, (rows, pixels), photoelectrons per exposure and unit transmission, at most `top` per pixel.
 
-    With `levels`, what is shown is rounded to multiples of top / (levels - 1).
+    With `levels`, what is shown is rounded to multiples of top / (levels - 1). With `log_light` (1, 1) every state sends its exponential:
+    root**2 says how it is shared among the pixels.
     """
 
     root: Tensor
     top: float = math.inf
     levels: int = 0
+    log_light: Tensor | None = None
+
+    @property
+    def even(self) -> bool:
+        """Whether every state sends the same light."""
+        return self.log_light is not None
 
     def parameters(self) -> list[Tensor]:
         """Return what an optimiser changes."""
-        return [self.root]
+        return [self.root] if self.log_light is None else [self.root, self.log_light]
 
     def displayed(self) -> tuple[Tensor, Tensor | None]:
         """Return (mask, scale); no scale stands for 1."""
         light, scale = self.root.square(), self.scale()
-        if scale is not None:
+        if self.levels and scale is not None:
             light = light.div_(scale).round_().clamp_(max=self.levels - 1)
         return light, scale
 
     def scale(self) -> Tensor | None:
         """Return the scale alone."""
+        if self.log_light is not None:
+            return self.log_light.exp() / self.root.square().sum(dim=1, keepdim=True)
         return torch.full((len(self.root), 1), self.top / (self.levels - 1)) if self.levels else None
 
     def full(self, mask: Tensor) -> Tensor:
@@ -85,14 +95,18 @@ class Grey:
             return slope
         return slope.scatter_add_(1, self.root.abs().argmax(dim=1, keepdim=True), of_full)
 
-    def set_gradients(self, slope: Tensor, _: Tensor | None) -> None:
+    def set_gradients(self, slope: Tensor, light_slope: Tensor | None) -> None:
         """Set the gradients from that of the mask times the scale; `slope` is used up."""
+        if self.log_light is not None:
+            assert light_slope is not None
+            slope -= light_slope / self.root.square().sum(dim=1, keepdim=True)
+            self.log_light.grad = light_slope.sum(dim=0, keepdim=True)
         factor = 2.0 * (self.levels - 1) / self.top if self.levels else 2.0
         self.root.grad = slope.mul_(self.root).mul_(factor)
 
     def settle(self) -> None:
         """Take brighter pixels back to the top after a step: no gradient would ever darken them."""
-        if self.top < math.inf:
+        if self.top < math.inf and not self.even:  # else bits are made that light more pixels
             bound = math.sqrt(self.top)
             self.root.clamp_(-bound, bound)
 
@@ -104,6 +118,7 @@ class Bits:
     With one brightness for all, `log_light` is one tensor (1, 1) that all levels share. The brightness stays from `bottom` to `top`.
     With `rows` (states,), `lean` is a pool (patterns, pixels) that all levels share, and a state shows the pattern of its row.
     With `parts` above 1, `lean` has as many rows of pixels for each state.
+    `even`: every state sends exp(`log_light`), (1, 1), whichever pixels it lights; its brightness is that over their number.
     """
 
     lean: Tensor
@@ -112,6 +127,7 @@ class Bits:
     top: float = BRIGHTNESS_MAX
     rows: Tensor | None = None
     parts: int = 1
+    even: bool = False
 
     def parameters(self) -> list[Tensor]:
         """Return what an optimiser changes."""
@@ -128,7 +144,12 @@ class Bits:
 
     def brightness(self) -> Tensor:
         """Return the photoelectrons of a lit pixel of every state, (states, 1)."""
-        return self.log_light.exp().expand(len(self.lean) // self.parts if self.rows is None else len(self.rows), 1)
+        light = self.log_light.exp() / self.lit().clamp(min=1) if self.even else self.log_light.exp()
+        return light.expand(len(self.lean) // self.parts if self.rows is None else len(self.rows), 1)
+
+    def lit(self) -> Tensor:
+        """Return how many pixels every state lights, (states, 1)."""
+        return torch.gt(self.own(), 0).sum(dim=1, keepdim=True).to(self.lean.dtype)
 
     def scale(self) -> Tensor:
         """Return the brightness of every row of pixels, (rows, 1)."""
@@ -147,22 +168,39 @@ class Bits:
 
         The gradient of a bit is 1 / (1 + 2 lean**2)**2, which is near that of sigmoid(4 lean) and takes an eighth of the time.
         """
+        assert light_slope is not None
+        light_slope = by_state(light_slope, self.parts)
+        if self.even:  # one more pixel takes light from all others
+            slope -= light_slope / self.lit()
         bend = torch.square(self.own()).mul_(2.0).add_(1.0).square_()
         gradient = torch.div(slope, bend, out=bend)
         if self.rows is not None:
             before = torch.zeros_like(self.lean) if self.lean.grad is None else self.lean.grad
             gradient = before.index_add_(0, self.rows, gradient)
         self.lean.grad = gradient
-        assert light_slope is not None
-        light_slope = by_state(light_slope, self.parts)
         if len(self.log_light) != len(light_slope) or self.log_light.grad is not None:  # one for all: a sum
             light_slope = light_slope.sum(dim=0, keepdim=True)
             light_slope = light_slope if self.log_light.grad is None else self.log_light.grad + light_slope
         self.log_light.grad = light_slope
 
     def settle(self) -> None:
-        """Keep the brightness inside its limits."""
-        self.log_light.clamp_(math.log(self.bottom), math.log(self.top))
+        """Keep the brightness inside its limits; where states send the same light, by lighting more pixels or fewer."""
+        if not self.even:
+            self.log_light.clamp_(math.log(self.bottom), math.log(self.top))
+            return
+        n_pixels = self.lean.shape[1]
+        self.log_light.clamp_(math.log(self.bottom), math.log(self.top * n_pixels))
+        light = float(self.log_light.exp())
+        least, most = math.ceil(light / self.top), math.floor(light / self.bottom)
+        self.light_up(self.lit().clamp(min(max(1, least), n_pixels), max(1, most)))
+
+    def light_up(self, wanted: Tensor) -> None:
+        """Let every state light so many pixels, (states, 1): those that lean to it most."""
+        for state in (self.lit() != wanted).flatten().nonzero().flatten().tolist():
+            lean, number = self.lean[state], int(wanted[state])
+            order = lean.argsort(descending=True)
+            lean[order[:number]] = lean[order[:number]].clamp(min=EDGE)
+            lean[order[number:]] = lean[order[number:]].clamp(max=-EDGE)
 
 
 Light = Grey | Bits
@@ -240,6 +278,8 @@ class Sight:
 
     With `afterpulses` a state clicks with the mean memory of the walks that reach it.
     With `dark_pixels` grey values have one more column, the light that dark pixels bring where a full one has 1 (model/imaging.py).
+    With `fades` below infinity objects bleach as a whole: 1/e of their light is left after so much illumination. The dose of a state is
+    the largest over the walks to it; where the states of a level send the same light, it is that of every walk.
     """
 
     law: Law
@@ -248,6 +288,7 @@ class Sight:
     products: torch.dtype = torch.float32
     dark_pixels: bool = False
     afterpulses: Afterpulses | None = None
+    fades: float = math.inf
 
     def exact(self) -> Sight:
         """Return the same in float64 and without memory."""
@@ -289,7 +330,8 @@ class Sight:
 class Step:
     """One level of a pass: probability of the states, light by rows, chances of all outcomes but the last, and how fast these fall.
 
-    `whole` is the light of a state, all its channels together, and `sent` (rows, 1) what each row of pixels sends.
+    `whole` is the light of a state, all its channels together, and `sent` (rows, 1) what each row of pixels sends before anything
+    bleaches. `left` (states, 1) is what bleaching leaves of it.
     """
 
     alpha: Tensor
@@ -298,6 +340,7 @@ class Step:
     sent: Tensor
     chances: tuple[Tensor, ...]
     falls: tuple[Tensor, ...]
+    left: Tensor | None = None
 
 
 @dataclass(slots=True)
@@ -359,20 +402,38 @@ def children(alpha: Tensor, chances: tuple[Tensor, ...], successors: Tensor, n_n
     return nodes.index_add_(0, successors[-1], rest)
 
 
+def left_of(dose: Tensor, sent: Tensor, fades: float) -> Tensor:
+    """Return what bleaching leaves of the light of states, (states, 1), which send `sent` after `dose`; see Sight."""
+    own = (sent / fades).clamp(min=1e-30)
+    return torch.exp(-dose.clamp(min=0) / fades) * -torch.expm1(-own) / own
+
+
+def doses_behind(doses: Tensor, successors: Tensor, n_nodes: int) -> Tensor:
+    """Return the largest dose over the walks to every node, (nodes, 1), from those behind the states (states, 1) before; -inf for none."""
+    nodes = torch.full((n_nodes, 1), -math.inf, dtype=doses.dtype)
+    edges = doses.expand(len(successors), *doses.shape).flatten(0, 1)
+    return nodes.scatter_reduce_(0, successors.reshape(-1, 1), edges, "amax")
+
+
 def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
     """Return the pass of the objects `grey` (objects, pixels) through `machine`."""
     result, channels = Pass(clicks_of(sight.law)), channels_of(sight.law)
     nodes = torch.ones(1, len(grey), dtype=sight.sums)
     memory = None if sight.afterpulses is None else MeanMemory(sight.afterpulses, nodes)
+    dose, left = torch.zeros(1, 1, dtype=torch.float64), None  # before each state
     for number, level in enumerate(machine.levels):
         alpha = nodes[: level.n_states]
         if number:
             result.leaves.append(nodes[level.n_states :])
         light, sent = brought(level.light, sight, grey)
+        if sight.fades < math.inf:
+            dose = dose[: level.n_states]
+            left = left_of(dose, sent.double(), sight.fades).to(light.dtype)
+            light, dose = light.mul_(left), doses_behind(dose + sent, level.successors, machine.n_nodes(number))
         chances, falls = readings(light, sight.law)
         if memory is not None:
             chances, falls = memory.step(alpha, chances, falls, level.successors, machine.n_nodes(number))
-        result.steps.append(Step(alpha, light, by_state(light, channels), sent, chances, falls))
+        result.steps.append(Step(alpha, light, by_state(light, channels), sent, chances, falls, left))
         nodes = children(alpha, chances, level.successors, machine.n_nodes(number))
     result.leaves.append(nodes)
     return result
@@ -422,6 +483,7 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         tensor.grad = None
     share, channels = 1.0 / len(grey), channels_of(sight.law)
     beta = aim.at_leaves(machine.counts[-1], one_hot)
+    faded = 0.0  # what later levels lose by one more photoelectron sent
     for number in range(len(machine.levels) - 1, -1, -1):
         level, step = machine.levels[number], passed.steps[number]
         after_last = beta[level.successors[-1]]
@@ -431,6 +493,9 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         mask_slope = sight.mask_slope(slope, grey, level.light)
         scale = level.light.scale()
         light_slope = None if scale is None else slope.mul_(step.light).sum(dim=1, keepdim=True)
+        if step.left is not None:
+            assert light_slope is not None
+            mask_slope, detected = mask_slope.mul_(step.left), float(light_slope.sum())
         if aim.sent_price:
             cost = by_row(step.alpha.sum(dim=1, keepdim=True), channels).to(slope.dtype).mul_(share * aim.sent_price)
             mask_slope += cost
@@ -441,6 +506,8 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
             mass = step.alpha.sum(dim=1, keepdim=True).mul_(aim.spread * share / len(machine.levels))
             mask_slope.addcmul_(by_row(mass, channels), concentration_slope(level.light.displayed()[0]))
         level.light.set_gradients(mask_slope, light_slope)
+        if step.left is not None:
+            faded = _add_fading(level.light, step, detected, faded, sight.fades)
         beta = gains[0].mul_(step.chances[0])
         for chance, gain in zip(step.chances[1:], gains[1:]):
             beta.addcmul_(chance, gain)
@@ -448,6 +515,18 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         beta += aim.exposure_price + aim.sent_price * by_state(step.sent, channels)
         if number and len(machine.counts[number - 1]):
             beta = torch.cat([beta, aim.at_leaves(machine.counts[number - 1], one_hot)])
+
+
+def _add_fading(light: Light, step: Step, detected: float, faded: float, fades: float) -> float:
+    """Add what one more photoelectron of an even level bleaches: its own light by `detected`, that of later levels by `faded`.
+
+    Both are gradients by the logarithm of what is left; returns those of this level and the later ones together.
+    """
+    assert light.log_light is not None
+    assert light.log_light.grad is not None
+    own = float(step.sent.max()) / fades
+    light.log_light.grad += detected * (own / math.expm1(own) - 1) - own * faded
+    return faded + detected
 
 
 def machine_state(machine: Machine) -> dict[str, Any]:

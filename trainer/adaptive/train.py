@@ -32,13 +32,25 @@ from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write
 from .budget import (
     aim_at,
     check_automaton_options,
+    fades_of,
     first_prices,
     for_task,
     patterns_at_most,
     tune_epochs_of,
     with_defaults,
 )
-from .finish import Finished, Posteriors, bit_grid, calibrated, finished, meet_budget, node_counts, set_top, to_grid
+from .finish import (
+    Finished,
+    Posteriors,
+    bit_grid,
+    calibrated,
+    finished,
+    meet_budget,
+    node_counts,
+    send_evenly,
+    set_top,
+    to_grid,
+)
 from .grow import Growth
 from .machine import (
     COUNT_FLOOR,
@@ -57,7 +69,7 @@ from .machine import (
 from .objects import Block, TrainingObjects
 from .outcomes import by_row, law_of
 from .sweeps import choose_patterns, reroute, share_patterns
-from .tune import Figures, Progress, Tuning, figures, masses, mean_objects
+from .tune import Figures, Progress, Tuning, figures, hold_cap, masses, mean_objects
 
 KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
 REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reached
@@ -65,8 +77,10 @@ CHOICES, CHOICE_BLOCKS = 3, 20  # of shared patterns, before they are tuned; blo
 GROWTH_BLOCK = 1000  # objects; larger than in tuning, as fewer steps serve one level
 REROUTE_NUMBERS = 1 << 29  # objects times states that a sweep keeps: 2 GiB
 TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
+HEADROOM = 1.25  # of the top over that, where states send the same light: they would light more pixels for it from epoch to epoch
 DARK_COUNTS = 0.5  # per decision, at most: 0.15 to 0.8 were tried on held-back images (docs/measurements/index.md)
 BUDGET_BLOCKS = 6  # of objects, by which the budget is met
+CAP_ROUNDING = 1e-6  # of a cap on the dose, for sums in float32
 STAGES = ("grow", "grey", "shown")
 NETWORK = "network"  # a stage before them, where targets are soft
 FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch repeats the order and shifts of another
@@ -156,6 +170,7 @@ class _Run:
         self.tuning: Tuning | None = None
         self.saved_tuning: dict[str, Any] | None = None
         self.products = product_dtype()
+        self.cap = math.inf if options.dose_cap is None else options.dose_cap * (1 - CAP_ROUNDING)
         self.answers: NDArray[np.float32] | None = None
 
     @property
@@ -176,7 +191,8 @@ class _Run:
         asked = self.options
         law = law_of(self.profile, exposure_us, asked.outcomes, asked.channels, asked.dark)
         links = trained_through(self.profile, exposure_us)
-        return Sight(law, self.objects.gain, self.objects.floor, products, self.options.optics is not None, links)
+        fades = fades_of(asked, self.objects.n_pixels) if self.stage != "grow" else math.inf
+        return Sight(law, self.objects.gain, self.objects.floor, products, asked.optics is not None, links, fades)
 
     # ---- the stages ----
 
@@ -189,6 +205,7 @@ class _Run:
             for light in lights:
                 light.log_light, light.bottom = lights[0].log_light, low
         self._set_top(max(float(light.log_light.max().exp()) for light in lights))
+        self._send_evenly()
         found = node_counts(self.machine, self.sight(self.products), self._some_blocks())
         share = self.objects.n_fit / float(found[0].sum())
         for counts, arrived in zip(self.machine.counts, found[1:]):
@@ -231,6 +248,7 @@ class _Run:
                 if len(growth.levels) % KEPT_EVERY == 0:
                     keep()
         self.stage, self.epoch = "grey", 0
+        self._send_evenly()
 
     def _grown(self, growth: Growth, aim: Aim) -> Progress:
         counts = growth.counts
@@ -252,7 +270,8 @@ class _Run:
         if self.stage != "grey":
             return
         low, high = top_limits(self.profile)
-        lights = [level.light.displayed()[0] for level in self.machine.levels]
+        shown = [level.light.displayed() for level in self.machine.levels]
+        lights = [mask if scale is None else mask * scale for mask, scale in shown]
         if self.options.grey:
             top = min(high, max(low, max(float(light.max()) for light in lights)))
             for level, light in zip(self.machine.levels, lights):
@@ -260,6 +279,13 @@ class _Run:
         else:
             self._start_bits(lights, low)
         self.stage, self.epoch, self.tuning = "shown", 0, None
+
+    def _send_evenly(self) -> None:
+        """With a cap on the dose, let every walk send it."""
+        if self.cap < math.inf:
+            fades = fades_of(self.options, self.objects.n_pixels)
+            send_evenly(self.machine, self._masses(), self.cap, fades)
+            self.prices.drop_sent()
 
     def _highest_top(self) -> float:
         """Return the brightest top that the profile allows and that brings no more than `DARK_COUNTS` to a decision."""
@@ -282,6 +308,8 @@ class _Run:
         for level, bits in zip(self.machine.levels, made):
             if shared:
                 bits.log_light, bits.bottom = typical, low
+            if level.light.even and level.light.log_light is not None:
+                bits.log_light, bits.even = level.light.log_light, True
             bits.settle()
             level.light = bits
         most = patterns_at_most(self.options, self.profile)
@@ -301,6 +329,7 @@ class _Run:
         if self.tuning is None:
             self.tuning = Tuning(self.machine, self.sight(self.products), self.prices, rate, steps)
             self.tuning.exposure_price, self.tuning.spread = self.options.exposure_price, self.options.spread
+            self.tuning.cap = self.cap
             if self.saved_tuning is not None:
                 self.tuning.restore(self.saved_tuning)
                 self.saved_tuning = None
@@ -329,7 +358,8 @@ class _Run:
         lights = torch.cat([level.light.brightness().flatten() for level in self.machine.levels])  # type: ignore[union-attr]
         masses, order = torch.cat(self._masses()), lights.argsort()
         below = masses[order].cumsum(0) / masses.sum()
-        self._set_top(float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))]))
+        top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
+        self._set_top(top * HEADROOM if self.cap < math.inf else top)
 
     def _set_top(self, top: float) -> None:
         set_top(self.machine, min(self._highest_top(), max(top_limits(self.profile)[0], top)), self.profile)
@@ -352,12 +382,16 @@ class _Run:
     def finish(self) -> TrainedAutomaton:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
-        grid = None
-        if not self.options.grey:  # first without steps: an exposure is no longer than the brightest state then needs
+        if self.prices.all:  # first without steps: an exposure is no longer than the brightest state then needs
             meet_budget(self.machine, self.prices, None, self.sight, self._drawn())
+        with torch.no_grad():
+            hold_cap(self.machine, self.cap, brighten=not self.prices.all)
+        grid = None
+        if not self.options.grey:
             self._set_top(max(float(level.light.brightness().max()) for level in self.machine.levels))  # type: ignore[union-attr]
             grid = bit_grid(self.machine.levels[0].light.top, self.profile)
-        meet_budget(self.machine, self.prices, grid, self.sight, self._drawn())
+            if self.cap == math.inf:
+                meet_budget(self.machine, self.prices, grid, self.sight, self._drawn())
         if grid is not None:
             to_grid(self.machine, grid)
         sight = self.sight()
@@ -396,6 +430,8 @@ class _Run:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from `state`."""
         self.stage, self.epoch = state["stage"], state["epoch"]
+        if self.stage != "grow" and self.cap < math.inf:
+            self.prices.drop_sent()
         for price, value in zip(self.prices.all, state["prices"]):
             price.value = value
         self.machine = machine_from(state["machine"])

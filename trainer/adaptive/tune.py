@@ -19,6 +19,7 @@ from .objects import Block
 COUNT_SHARE = 0.02  # of a step in the running class counts
 PRICE_MIN, PRICE_MAX = 1e-6, 10.0
 SENT = "illumination"
+AT_CAP = 0.999  # of a cap is sent where it binds
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,10 +134,39 @@ class Prices:
         """Return how many times the budget was spent, the one of which most was."""
         return max(price.excess(spent) for price in self.all)
 
+    def drop_sent(self) -> None:
+        """Leave out the price of light sent, where the cap holds it."""
+        self.all = [price for price in self.all if price.kind != SENT]
+
     def follow(self, spent: Spent) -> None:
         """Let each price follow its budget."""
         for price in self.all:
             price.follow(spent)
+
+
+def even_lights(machine: Machine) -> list[torch.Tensor]:
+    """Return the logarithms of what the levels send whose states send the same light."""
+    return [level.light.log_light for level in machine.levels if level.light.even and level.light.log_light is not None]
+
+
+def hold_cap(machine: Machine, cap: float, brighten: bool = False) -> None:
+    """Dim all levels alike until a whole walk sends no more than `cap`; or `brighten` them until it sends as much."""
+    lights = even_lights(machine)
+    total = float(torch.cat(lights).double().exp().sum()) if lights else 0.0
+    if total > cap or (brighten and lights):
+        for log_light in lights:
+            log_light += math.log(cap / total)
+
+
+def along_cap(machine: Machine, cap: float) -> None:
+    """Leave of the gradients what shares the light out among the levels, where more would be sent than `cap`: that of a softmax."""
+    lights = even_lights(machine)
+    sent = torch.cat(lights).exp() if lights else torch.zeros(1)
+    wanted = sum(float(light.grad.sum()) for light in lights if light.grad is not None)
+    if wanted < 0 and float(sent.sum()) > AT_CAP * cap:
+        for log_light, share in zip(lights, sent / sent.sum()):
+            assert log_light.grad is not None
+            log_light.grad -= wanted * share
 
 
 class Tuning:
@@ -145,6 +175,7 @@ class Tuning:
     def __init__(self, machine: Machine, sight: Sight, prices: Prices, rate: float, steps: int) -> None:
         self.machine, self.sight, self.prices, self.rate, self.steps = machine, sight, prices, rate, steps
         self.exposure_price = self.decide = self.spread = 0.0  # see Aim; they may change from epoch to epoch
+        self.cap = math.inf  # of what a walk sends
         self.done = 0
         self.optimiser = torch.optim.Adam(machine.parameters(), lr=rate, fused=True)
 
@@ -172,9 +203,11 @@ class Tuning:
             passed = forward(machine, self.sight, block.grey)
             aim = self.prices.aim(self.exposure_price, self.decide, self.spread)
             backward(machine, self.sight, block.grey, block.one_hot, passed, aim)
+            along_cap(machine, self.cap)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.rate * max(0.0, 1 - self.done / self.steps) + 1e-5
             self.optimiser.step()
+            hold_cap(machine, self.cap)
             for level in machine.levels:
                 level.light.settle()
             self.done += 1

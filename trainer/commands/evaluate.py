@@ -397,9 +397,9 @@ def optics_curve_words(name: str, objects: int, about: Imaging, curves: Mapping[
 
 
 def _within_dose(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
-    from pans.trainer.evaluate.dose import Capped, Knowledge, figures_of, trial_error, within_cap
+    from pans.trainer.evaluate.dose import Capped, Knowledge, depends_on_walk, figures_of, trial_error, within_cap
 
-    if args.exact and bundle.automaton is not None and args.bleach is not None:
+    if args.exact and depends_on_walk(bundle, conditions):
         raise UsageError(
             "--exact: what is left of a bleached sample depends on the walk, and walks are sampled",
             remedy="use --trials",

@@ -17,9 +17,10 @@ from pans.trainer.adaptive.budget import check_automaton_options, for_task, star
 from pans.trainer.adaptive.train import TrainedAutomaton, train_automaton
 from pans.trainer.adaptive.tune import Progress
 from pans.trainer.device import keep_freed_memory
+from pans.trainer.evaluate.held_out import trained_bleaching
 from pans.trainer.evaluate.walks import MeasuredWalks
 from pans.trainer.export.automaton import export_automaton
-from pans.trainer.options import AutomatonOptions, option_names
+from pans.trainer.options import AutomatonOptions, flag_of, option_names
 from pans.trainer.tasks.registry import Task
 from pans.trainer.train.history import write_course
 
@@ -87,7 +88,8 @@ class AutomatonTraining:
         bundle = self.bundle = exported.bundle
         automaton, measured = bundle.automaton, exported.measured
         assert automaton is not None
-        off, missed = budget_off(trained.options, measured)
+        bleaching = trained_bleaching(bundle)
+        off, missed = budget_off(trained.options, measured, bundle.illumination())
         answer = {
             **asdict(measured),
             "first_200": asdict(exported.first_200),
@@ -98,10 +100,12 @@ class AutomatonTraining:
             "price": trained.prices[0],
             "sent_price": trained.prices[1],
             "budget_off": off,
+            "bleaching": bleaching.spelled() or None,
         }
         lines = [
             f"{automaton.n_states} states, {bundle.n_patterns} patterns, at most {automaton.n_slots} exposures",
             words_of(measured, {"first_200": answer["first_200"]}),
+            *([f"  {bleaching.words()}"] if bleaching.spelled() else []),
             *missed,
         ]
         return exported.sha256, answer, lines
@@ -111,18 +115,21 @@ class AutomatonTraining:
         return write_course(folder, self.reports, force=force)
 
 
-def budget_off(options: AutomatonOptions, found: MeasuredWalks) -> tuple[float, list[str]]:
+def budget_off(options: AutomatonOptions, found: MeasuredWalks, dose: float) -> tuple[float, list[str]]:
     """Return by which part of the budget the held-out objects get more light or clicks (negative for less), and a line where it is missed.
+
+    `dose` is what the walk sends that sends most.
 
     The price was found on training objects, and dwell times have steps. Of two budgets it is the one of which more was spent: the other
     need not be used up.
     """
     spent = {"photons": found.photons_mean, "clicks": found.clicks_mean, "illumination": found.illumination}
+    spent["dose_cap"] = dose
     off, name, wanted = max(
         (got / wanted - 1, name, wanted)
         for name, got in spent.items()
         if (wanted := getattr(options, name)) is not None
     )
-    again = f"--{name} {wanted / (1 + off):.4g}" if off > -1 else f"a larger --{name}"
+    again = f"{flag_of(name)} {wanted / (1 + off):.4g}" if off > -1 else f"a larger {flag_of(name)}"
     words = f"budget missed by {off:+.1%}: {name} {spent[name]:.3g} on all held-out objects, asked for {wanted:g}; "
     return off, [f"{words}to come closer, train with {again}"] if abs(off) > BUDGET_TOLERANCE else []

@@ -28,7 +28,7 @@ from pans.trainer.tasks.registry import Objects
 from .accuracy import Measured, light_of
 from .held_out import HeldOut, measure, trained_bleaching, trials_needed
 from .readings import vector_chances
-from .walks import MeasuredWalks
+from .walks import MeasuredWalks, left_by_state
 
 TRAINING_OBJECTS = 20_000  # the first ones, from which words are known
 WORDS_MAX = 1 << 12  # whose chances are summed over training objects; beyond, the head's mean readings
@@ -208,11 +208,18 @@ def figures_of(found: Capped, held_out: HeldOut, conditions: Conditions, trials:
     """Return what the bundle decides within its cap, from `trials` decisions per object or (None) as few as can be."""
     bundle = found.bundle
     if trials is None:
-        bleached_walks = bundle.automaton is not None and not conditions.bleaching.is_none
-        trials = BLEACHED_TRIALS if bleached_walks else trials_needed(bundle)
+        trials = BLEACHED_TRIALS if depends_on_walk(bundle, conditions) else trials_needed(bundle)
     measured = measure(bundle, held_out, trials=trials, conditions=conditions)
     assert isinstance(measured, (Measured, MeasuredWalks))
     return measured
+
+
+def depends_on_walk(bundle: Bundle, conditions: Conditions) -> bool:
+    """Return whether what bleaching leaves in a state depends on the walk to it, so that walks must be sampled."""
+    if bundle.automaton is None:
+        return False
+    light = bundle.state_light() * conditions.eta
+    return left_by_state(bundle.automaton, light, conditions.bleaching, bundle.n_pixels) is None
 
 
 def dose_curve(

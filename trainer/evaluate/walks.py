@@ -41,6 +41,7 @@ _LIGHT_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
 OF_OBJECTS = ("right", "decided", "clicks", "photons", "illumination", "exposures", "labels")
+ONE_DOSE = 0.01  # of the dose that leaves 1/e: by so much the doses of walks to one state may differ, by steps of the dwell time
 BLEACHED_AT_ONCE = 512  # objects, whose pixels stand in memory
 
 
@@ -108,7 +109,7 @@ def walks_of(
 ) -> Walks:
     """Show the automaton of `bundle` to `images` (n, height, width) through `profile`; exact, or `trials` walks per object.
 
-    `conditions` say how; their profile and data seed are the caller's to follow. Bleaching needs `trials`, as what is left in a state
+    `conditions` say how; their profile and data seed are the caller's to follow. Bleaching needs `trials` where what is left in a state
     depends on the walk to it. ValueError for what does not fit.
     """
     whole = _fitting(bundle, profile, images, conditions, trials)
@@ -120,8 +121,15 @@ def walks_of(
     afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
     patterns, scale = _patterns(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
 
+    sent = patterns.sum(axis=1, dtype=np.float64)[automaton.rows].sum(axis=1) * automaton.dwell / automaton.dwell_steps
+    left = None
+    if trials is None:
+        left = left_by_state(automaton, sent * scale, conditions.bleaching, bundle.n_pixels)
+        if left is None:
+            raise ValueError("bleaching depends on the walk, there is no exact expectation (sample trials instead)")
+
     def expected(seen: NDArray[Any], begins: tuple[float, float]) -> ExpectedWalk:
-        return expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins)
+        return expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins, left=left)
 
     begins, rng = (0.0, 0.0), np.random.default_rng(conditions.seed)
     if trials is None and afterpulses.time:
@@ -159,11 +167,30 @@ def _fitting(
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
     if not conditions.bleaching.is_none:
         demand_sequence(profile)
-        if trials is None:
-            raise ValueError("bleaching depends on the walk, there is no exact expectation (sample trials instead)")
         if bundle.n_channels > 1:
             raise ValueError(f"bleaching under {bundle.n_channels} patterns at once, allowed: under one")
     return bundle.automaton
+
+
+def left_by_state(automaton: Automaton, light: F64, law: Bleaching, pixels: int) -> F64 | None:
+    """Return what bleaching has left in each state, float64 (states,), of objects of so many `pixels`; None: it depends on the walk.
+
+    `light` (states,) is what each state sends. It does not depend on the walk where emitters mix and all walks to a state bring
+    one dose, within `ONE_DOSE`; the largest counts.
+    """
+    if law.is_none:
+        return np.ones(automaton.n_states)
+    least, most = np.full((2, len(automaton.posteriors)), [[np.inf], [-np.inf]])
+    least[0] = most[0] = 0.0
+    for slot in range(automaton.n_slots):
+        states = np.flatnonzero(automaton.depth == slot)
+        for after in automaton.successors[states].T:
+            np.minimum.at(least, after, least[states] + light[states])
+            np.maximum.at(most, after, most[states] + light[states])
+    fades, n = law.dose * pixels, automaton.n_states
+    if not law.mixed or float((most - least)[:n].max()) > ONE_DOSE * fades:
+        return None
+    return np.asarray(np.exp(-most[:n] / fades) * mean_left(light / fades))
 
 
 def _patterns(bundle: Bundle, imaging: Imaging) -> NDArray[Any]:

@@ -12,17 +12,27 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import log_scores, reachable_automaton, walk_nodes
+from pans.runtime.bundle.automaton import DOSE_ROUNDING, log_scores, reachable_automaton, walk_nodes
 from pans.runtime.bundle.model import Bundle, Shown, load_bundle, make_bundle, with_expected, write_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.expectation import expected_walk
-from pans.runtime.errors import PansError
+from pans.runtime.errors import PansError, PlanError
+from pans.runtime.imaging import NO_BLEACHING
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
 from pans.trainer.adaptive.train import TrainedAutomaton
-from pans.trainer.evaluate.accuracy import outcome_law_of
-from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
+from pans.trainer.evaluate.accuracy import AS_IT_IS, outcome_law_of
+from pans.trainer.evaluate.held_out import as_trained
+from pans.trainer.evaluate.walks import (
+    FIRST_OBJECTS,
+    ONE_DOSE,
+    MeasuredWalks,
+    expected_figures,
+    left_by_state,
+    measured_walks,
+    walks_of,
+)
 from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task
 
@@ -56,12 +66,19 @@ def export_automaton(
 ) -> ExportedAutomaton:
     """Write what `train_automaton` returned to `path`; UsageError if it exists, unless `force`. A wrong bundle never stands there."""
     bundle = bundle_of(trained, task, profile, name, provenance)
-    dark = trained.options.dark
-    bundle = with_tolerance(bundle, task, profile, trained.options.optics, dark)
+    demand_within(bundle, trained.options.dose_cap)
+    conditions = replace(as_trained(bundle), dark=trained.options.dark)
+    bundle = with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
     difference = compare_walks(bundle, trained, task, profile)
-    found = measure_walks(bundle, task.test, profile, dark)
-    first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, dark)
-    expected = expected_figures(found, profile.name, task.name, "test")
+    found = measure_walks(bundle, task.test, profile, conditions)
+    first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, conditions)
+    # what a bundle says of itself is of objects that do not bleach, as `pans evaluate` judges unless it is told
+    steady = (
+        found
+        if conditions.bleaching.is_none
+        else measure_walks(bundle, task.test, profile, replace(conditions, bleaching=NO_BLEACHING))
+    )
+    expected = expected_figures(steady, profile.name, task.name, "test")
     with whole_file(path, force=force) as unchecked:
         write_bundle(with_expected(bundle, expected), unchecked)
         written, digest = load_bundle(unchecked)
@@ -98,9 +115,20 @@ def bundle_of(
     )
 
 
-def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> MeasuredWalks:
+def demand_within(bundle: Bundle, cap: float | None) -> None:
+    """Raise PlanError where a walk of `bundle` sends more than `cap`."""
+    if cap is not None and bundle.illumination() > cap * (1 + DOSE_ROUNDING):
+        raise PlanError(
+            f"a walk of {bundle.name} sends {bundle.illumination():.9g}, the cap is {cap:.9g}: steps of the brightness are too coarse",
+            remedy="fewer --exposures, or a profile with finer steps (projector.dwell_steps, or levels)",
+        )
+
+
+def measure_walks(
+    bundle: Bundle, objects: Objects, profile: Profile, conditions: Conditions = AS_IT_IS
+) -> MeasuredWalks:
     """Return what the automaton of `bundle` does on `objects` through `profile`, exactly."""
-    return measured_walks(walks_of(bundle, profile, objects.images, objects.labels, Conditions(dark=dark)))
+    return measured_walks(walks_of(bundle, profile, objects.images, objects.labels, conditions))
 
 
 def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile: Profile) -> float:
@@ -112,7 +140,13 @@ def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile
     assert bundle.automaton is not None
     law = outcome_law_of(bundle, profile, dark=trained.options.dark)
     seen = object_transmission(profile, objects.images.reshape(len(objects), -1))
-    found = expected_walk(bundle.automaton, bundle.pattern_levels, seen, law, bundle.photons_per_level)
+    left = left_by_state(bundle.automaton, bundle.state_light(), as_trained(bundle).bleaching, bundle.n_pixels)
+    if left is None:
+        raise PlanError(
+            f"on {profile.name} walks to one state differ in dose by more than {ONE_DOSE:.0%} of that which leaves 1/e",
+            remedy="choose a profile with finer steps (projector.dwell_steps, or levels), or leave out --bleach",
+        )
+    found = expected_walk(bundle.automaton, bundle.pattern_levels, seen, law, bundle.photons_per_level, left=left)
     of_class = found.leaves @ bundle.automaton.posteriors[bundle.automaton.n_states :].astype(np.float64)
     wanted, photons = trained.chances(objects)
     difference = float(np.abs(of_class - wanted).max())

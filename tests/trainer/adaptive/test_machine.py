@@ -1,5 +1,6 @@
 """The exact forward pass and its gradient: against all outcome words one by one, and against differences of the loss."""
 
+import math
 from dataclasses import replace
 from itertools import product
 
@@ -42,6 +43,30 @@ def machine_under(law, seed, bits=False, shared=False):
     return machine
 
 
+def even_machine(law, seed, kind=Bits):
+    """The same with states that send the same light in each level."""
+    machine = machine_under(law, seed, bits=True)
+    for level in machine.levels:
+        light = level.light
+        lean = light.lean.abs() + 0.1 if kind is Soft else light.lean
+        level.light = kind(lean, light.log_light[:1].clone() + 1, even=True)
+        level.light.settle()  # no state is dark
+    return machine
+
+
+class Soft(Bits):
+    """Patterns that are as bright as they lean, so that the gradient of a mask has differences."""
+
+    def displayed(self):
+        return self.lean, self.scale()
+
+    def lit(self):
+        return self.lean.sum(dim=1, keepdim=True)
+
+    def settle(self):
+        pass
+
+
 def chances_by_hand(law, light):
     """The chance of every outcome of a state, from the light (channels,)."""
     if isinstance(law, CountLaw):
@@ -57,9 +82,12 @@ def walked(machine, sight, law, i):
     light = [brought(level.light, sight, GREY)[0][:, i].numpy().reshape(-1, channels) for level in levels]
     leaves, sums = {}, np.zeros(3)
     for word in product(range(len(clicks_of(law))), repeat=len(levels)):
-        chance, state, met = 1.0, 0, np.zeros(3)
+        chance, state, met, dose = 1.0, 0, np.zeros(3), 0.0
         for number, (level, outcome) in enumerate(zip(levels, word)):
             of_state = light[number][state]
+            if sight.fades < math.inf:
+                own = float(level.light.log_light.exp()) / sight.fades
+                of_state, dose = of_state * math.exp(-dose) * (1 - math.exp(-own)) / own, dose + own
             chance *= chances_by_hand(law, of_state)[outcome]
             met += of_state.sum(), clicks_of(law)[outcome], 1
             node = int(level.successors[outcome, state])
@@ -86,6 +114,20 @@ def test_forward_is_the_sum_over_all_words(law, bits):
             assert float(passed.leaves[number][leaf, i]) == pytest.approx(chance, rel=rel, abs=1e-300)
         found = [float(each[i]) for each in (passed.photons(), passed.clicks(), exposures)]
         np.testing.assert_allclose(found, sums, rtol=rel)
+
+
+@pytest.mark.parametrize("law", [*CLICKS, *COUNTS], ids=str)
+def test_where_states_send_the_same_light_bleaching_is_that_of_every_walk(law):
+    machine, sight = even_machine(law, 1), wide(law, 0.01, fades=0.8)
+    passed = forward(machine, sight, GREY)
+    rel = 1e-12 if law in CLICKS[:2] else 1e-7
+    for i in range(len(GREY)):
+        leaves, sums = walked(machine, sight, law, i)
+        for (number, leaf), chance in leaves.items():
+            assert float(passed.leaves[number][leaf, i]) == pytest.approx(chance, rel=rel, abs=1e-300)
+        np.testing.assert_allclose([float(passed.photons()[i]), float(passed.clicks()[i])], sums[:2], rtol=rel)
+    for step, level in zip(passed.steps, machine.levels):
+        np.testing.assert_allclose(step.sent, float(level.light.log_light.exp()), rtol=1e-12)
 
 
 @pytest.mark.parametrize("law", COUNTS, ids=str)
@@ -137,7 +179,7 @@ def assert_gradients(machine, sight, aim, grey=GREY):
 
 def sent_of(machine, sight, grey):
     """The light sent to each object: what its walk would detect of a clear one, (objects,)."""
-    clear = replace(sight, gain=1.0, floor=0.0, dark_pixels=False)
+    clear = replace(sight, gain=1.0, floor=0.0, dark_pixels=False, fades=math.inf)
     ones = torch.ones(1, grey.shape[1] - sight.dark_pixels, dtype=torch.float64)
     steps = zip(forward(machine, sight, grey).steps, forward(machine, clear, ones).steps)
     return sum((step.alpha * alone.whole).sum(dim=0) for step, alone in steps)
@@ -159,6 +201,35 @@ def test_the_gradient_of_the_brightness_of_bits(shared, aim):
     machine = random_machine(4, bits=True, shared=shared)
     assert len({id(level.light.log_light) for level in machine.levels}) == (1 if shared else 3)
     assert_gradients(machine, wide(ClickLaw(0.01), 0.01), aim)
+
+
+@pytest.mark.parametrize(
+    ("law", "fades"), [(ClickLaw(0.01), math.inf), (ClickLaw(0.01), 0.8), (COUNTS[1], 0.8)], ids=str
+)
+@pytest.mark.parametrize("aim", AIMS)
+def test_the_gradient_where_states_send_the_same_light(law, fades, aim):
+    sight = wide(law, 0.01, fades=fades)
+    assert_gradients(even_machine(law, 4), sight, aim)
+    machine = even_machine(law, 4, Soft)
+    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), aim)
+    for level in machine.levels:
+        lean = level.light.lean
+        lean.grad *= (1 + 2 * lean**2) ** 2  # which stands for the step of a bit
+        assert_slope(lean, lambda: loss_of(machine, sight, aim))
+
+
+def test_the_light_of_an_even_level_is_kept_by_lighting_more_pixels_or_fewer():
+    random = torch.Generator().manual_seed(1)
+    lean = torch.randn(6, 40, generator=random)
+    lean[0], lean[1] = -1.0, 1.0  # dark, and all pixels alike
+    bits = Bits(lean.clone(), torch.zeros(1, 1), bottom=0.05, top=0.1, even=True)
+    bits.settle()
+    mask, scale = bits.displayed()
+    torch.testing.assert_close((mask * scale).sum(dim=1), torch.ones(6))
+    assert bool((scale >= 0.05 * (1 - 1e-6)).all())
+    assert bool((scale <= 0.1 * (1 + 1e-6)).all())
+    for kept, before in zip(mask[2:], lean[2:]):
+        assert float(before[kept > 0].min()) > float(before[kept == 0].max())  # those that lean to it most
 
 
 @pytest.mark.parametrize("bits", [False, True])

@@ -1,6 +1,7 @@
 """Training of an automaton on a small task: what it learns, the budget, repeatability, checkpoints, the export, and what is refused."""
 
-from dataclasses import replace
+import itertools
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,14 +12,18 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import PansError, PlanError, UsageError
+from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.budget import check_automaton_options, started_from
 from pans.trainer.adaptive.machine import machine_of
 from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.commands.train_automaton import budget_off
 from pans.trainer.evaluate.accuracy import outcome_law_of
+from pans.trainer.evaluate.dose import within_cap
+from pans.trainer.evaluate.held_out import HeldOut
 from pans.trainer.evaluate.walks import measured_walks, walks_of
-from pans.trainer.export.automaton import bundle_of, compare_walks, export_automaton, measure_walks
-from pans.trainer.options import AutomatonOptions
+from pans.trainer.export.automaton import bundle_of, compare_walks, demand_within, export_automaton, measure_walks
+from pans.trainer.options import AutomatonOptions, Conditions
 
 IDEAL = load_profile("ideal")
 SMALL = AutomatonOptions(photons=4.0, exposures=6, states=12, batch=64, tune_epochs=3, epochs=6, first_price=0.1)
@@ -142,6 +147,67 @@ def test_export_refuses_an_automaton_that_is_not_the_models(task, trained, tmp_p
     assert not list(tmp_path.iterdir())
 
 
+CAPPED = replace(SMALL, photons=None, dose_cap=12.0)
+
+
+def doses_by_word(bundle):
+    """What each of the 64 click words of six exposures sends."""
+    automaton, light = bundle.automaton, bundle.state_light()
+    for word in itertools.product((0, 1), repeat=6):
+        node, dose = 0, 0.0
+        for click in word:
+            if node < automaton.n_states:
+                dose, node = dose + light[node], int(automaton.successors[node, click])
+        yield dose
+
+
+@pytest.mark.parametrize("name", ["ideal", "dmd-spad"])
+def test_no_walk_passes_the_cap_and_all_come_near(task, name):
+    profile = load_profile(name)
+    done = train_automaton(task, profile, CAPPED)
+    bundle = bundle_of(done, task, profile, "bars", {})
+    doses = list(doses_by_word(bundle))
+    assert max(doses) <= 12.0
+    assert min(doses) >= 0.995 * 12.0
+    found = measure_walks(bundle, task.test, profile)
+    assert budget_off(CAPPED, found, bundle.illumination())[0] <= 0.0
+    free = free_bundle(task, profile)
+    cut = within_cap(free, 12.0, HeldOut(task, task.test, profile), None)
+    assert found.accuracy_mean > measure_walks(cut.bundle, task.test, profile).accuracy_mean + 0.01
+    again = started_from(replace(CAPPED, exposures=0, states=0, epochs=2), free, "f" * 64, task, profile)
+    doses = list(doses_by_word(bundle_of(train_automaton(task, profile, again, start=free), task, profile, "on", {})))
+    assert max(doses) <= 12.0
+    assert min(doses) >= 0.995 * 12.0
+    with pytest.raises(PlanError, match="the cap is 11:"):
+        demand_within(bundle, 11.0)
+
+
+def free_bundle(task, profile):
+    """An automaton that sends as much on average, some walks more."""
+    done = train_automaton(task, profile, replace(CAPPED, dose_cap=None, illumination=12.0))
+    return bundle_of(done, task, profile, "free", {})
+
+
+@pytest.mark.parametrize("name", ["ideal", "dmd-spad"])
+def test_through_bleaching_the_expectation_is_that_of_sampled_walks(task, name, tmp_path):
+    options, profile = replace(CAPPED, bleach="0.2:mixed"), load_profile(name)
+    trained = train_automaton(task, profile, options)
+    facts = {"options": asdict(options)}
+    made = export_automaton(tmp_path / "faded.pans", trained, task, profile, name="faded", provenance=facts)
+    law, images, labels = Bleaching(0.2, mixed=True), task.test.images, task.test.labels
+    assert made.difference < 1e-6
+    drawn = measured_walks(walks_of(made.bundle, profile, images, labels, Conditions(bleaching=law), trials=200))
+    assert abs(drawn.accuracy_mean - made.measured.accuracy_mean) < 3 * drawn.accuracy_std / np.sqrt(200)
+    assert drawn.photons_mean == pytest.approx(made.measured.photons_mean, rel=0.005)
+    assert made.bundle.expected["photons"] > 1.5 * made.measured.photons_mean  # of objects that do not bleach
+    # a training that knows nothing of it decides worse
+    blind = bundle_of(train_automaton(task, profile, CAPPED), task, profile, "blind", {})
+    judged = measured_walks(walks_of(blind, profile, images, labels, Conditions(bleaching=law)))
+    assert made.measured.accuracy_mean > judged.accuracy_mean + 0.02
+    with pytest.raises(ValueError, match="depends on the walk"):  # emitters that stay
+        walks_of(blind, profile, images, labels, Conditions(bleaching=Bleaching(0.2)))
+
+
 TWO = {"channels": 2}
 
 
@@ -158,6 +224,12 @@ TWO = {"channels": 2}
         ({"dark": -1.0}, "ideal", UsageError, "--dark is -1.0"),
         ({"patterns": 3}, "dmd-8bit-spad", PlanError, "states cannot share one"),
         ({"exposures": 200, "states": 500}, "ideal", PlanError, "65533"),
+        ({"dose_cap": 9.0, "illumination": 9.0}, "ideal", UsageError, "--illumination adds nothing"),
+        ({"dose_cap": 9.0, "grey": True}, "dmd-8bit-spad", UsageError, "a brightness of their own"),
+        ({"dose_cap": 9.0, "patterns": 30}, "ideal", UsageError, "share no patterns"),
+        ({"dose_cap": 9.0, "bleach": "40"}, "ideal", UsageError, "--bleach 40: .* one dose"),
+        ({"bleach": "40:mixed"}, "ideal", UsageError, "--bleach 40:mixed: .* one dose"),
+        ({"dose_cap": 9.0, "channels": 2}, "dmd-four-snspd", UsageError, "--dose-cap: of one detector"),
         ({"channels": 5}, "dmd-four-snspd", UsageError, "--channels is 5"),
         ({"channels": 0}, "dmd-four-snspd", UsageError, "--channels is 0"),
         (TWO, "dmd-spad", PlanError, r"2 channels per exposure, dmd-spad has 1 \(detector.channels\)"),
