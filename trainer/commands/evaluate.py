@@ -196,7 +196,7 @@ def _beside(
     from pans.trainer.baselines.rows import comparison_numbers
 
     task = held_out.task
-    why = "their training images are not at hand" if not held_out.apart else ""
+    why = "training images are not at hand" if not held_out.apart else ""
     if task.target != "class" or task.light != "transmission":
         why = "only classes of objects that are lit are compared"
     if args.compare and why:

@@ -124,6 +124,19 @@ def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, mon
     said = capsys.readouterr()
     assert "not better than always naming the largest class" in said.err
     assert "balanced accuracy       33.33 %; recall bar 0.00 %, cross 0.00 %, square 100.00 %" in said.out
+    assert "at equal illumination" in said.out
+    np.savez("others.npz", images=images[::-1], labels=labels[::-1], classes=np.array(["square", "bar", "cross"]))
+    others = [
+        "evaluate",
+        "s.pans",
+        "--task",
+        "others.npz",
+        "--exact",
+    ]  # all of them held out: a camera has none to learn from
+    assert main(others) == 0
+    assert "direct imaging" not in capsys.readouterr().out
+    assert main([*others, "--compare"]) == 2
+    assert "training images are not at hand" in capsys.readouterr().err
 
 
 def test_a_curve_is_thinned_and_says_its_ends():
