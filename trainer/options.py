@@ -30,6 +30,7 @@ HEADS = ("mlp", "deep", "conv", *PICTURE_HEADS)
 # (gain on the relative excess, least weight). Firm: the full rate from an excess of 20 % on, and a weight never so small that it
 # would not be back in time; it meets tight budgets. Gentle: the light is spent first and given back late, which found better patterns.
 BUDGETS = {"firm": (5.0, 3e-4), "gentle": (1.0, 1e-5)}
+LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
 DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
 METHODS = {  # of each paradigm of `pans baseline`, the default first
     "direct": ("bayes", "cnn", "clean-cnn", "stopping"),

@@ -6,6 +6,7 @@ first 200 (those of the paper's tables).
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
@@ -14,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from pans.trainer.evaluate.accuracy import row_of
-from pans.trainer.options import BaselineOptions
+from pans.trainer.options import LEAST_PHOTONS, BaselineOptions
 from pans.trainer.tasks.registry import Task
 
 from .common import Decide, Light, Measurement, Report, Trials, detect, measure, run_trials
 
 FIRST = 200  # test objects, those of the paper's tables
+EQUAL_TRIALS, EQUAL_DECISIONS = 10, 5000  # readouts per object of a comparison, fewer where all would be more than that
 
 At = Callable[[float], tuple[Decide, dict[str, Any]]]  # photons per object -> the decision, and facts about it
 AtLevel = Callable[[Light], tuple[Measurement, Decide, dict[str, Any]]]  # the same, and the measurement
@@ -49,6 +51,38 @@ def baseline_rows(
             "seconds": time.perf_counter() - started,
         }
         started = time.perf_counter()
+
+
+def comparison_numbers(task: Task) -> float:
+    """Return how many numbers one comparison at equal light goes through, about."""
+    return float(len(task.train)) * len(task.test) * _equal_trials(task) * math.prod(task.image_shape)
+
+
+def _equal_trials(task: Task) -> int:
+    return max(1, min(EQUAL_TRIALS, EQUAL_DECISIONS // len(task.test)))
+
+
+def at_equal_light(
+    task: Task, photons: float, illumination: float, report: Report, *, seed: int = 0
+) -> dict[str, dict[str, Any]]:
+    """Return what the exact posterior of direct imaging decides on as much light as a decision takes, detected and sent.
+
+    Keys as in the answers of commands: `direct_imaging` at equal photons, `direct_imaging_as_illuminated` at equal illumination. One
+    without light is left out.
+    """
+    options = BaselineOptions("direct", "bayes", trials=_equal_trials(task), seed=seed)
+    camera = measure(task, None)
+    levels = {
+        "direct_imaging": Light("photons", photons),
+        "direct_imaging_as_illuminated": Light("illumination", illumination),
+    }
+    wanted = "accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination", "objects", "trials"
+    return {
+        name: {key: row[key] for key in wanted}
+        for name, level in levels.items()
+        if level.photons(camera) >= LEAST_PHOTONS
+        for row in baseline_rows(task, options, [level], report)
+    }
 
 
 Level = tuple[Light, int, Trials, dict[str, Any]]  # asked for, readouts per object, what was decided, facts

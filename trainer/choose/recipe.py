@@ -8,7 +8,7 @@ other images as the world, and the mean log-loss on photon frames of the left-ou
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,12 +19,13 @@ from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.baselines.bayes import log_joint
 from pans.trainer.baselines.common import detect, measure
-from pans.trainer.tasks.changes import Variation, varied
+from pans.trainer.tasks.changes import Variation, enlarged, varied
 from pans.trainer.tasks.registry import Objects, Task
 
 OBJECTS = 8000  # training images with their varied copies: more took longer and gained little
 PIXELS_MAX = 1 << 24  # of all of them: what trains within minutes on one core
-PHOTONS = 10.0  # a decision's budget where none is asked for
+PHOTONS = 10.0  # what a camera detects of a decision's budget of light, where none is asked for
+LEAST_GREY = 1e-3  # mean transmission: of darker images the budget would be without bound
 EXPOSURES, STATES = 32, 128  # of an automaton trained on so few images; more states learn them by heart
 STEPS_PER_EPOCH = 40  # fewer steps than that hardly move the patterns
 BATCH = (50, 500)
@@ -61,6 +62,7 @@ class Recipe:
     objects: int  # training images with their varied copies
     kept: int  # the last training images, without copies
     photons: float
+    illumination: float  # which brings a camera so many
     batch: int
     epochs: int
     reasons: tuple[str, ...]
@@ -84,16 +86,28 @@ def choose_training(task: Task, variation: Variation, encoder: str) -> Recipe:
     n, pixels = len(task.train), math.prod(task.image_shape)
     kept = max(1, n // KEPT_PART)
     objects = n if variation == Variation() else max(n, min(OBJECTS, PIXELS_MAX // pixels))
+    light = PHOTONS, float(f"{PHOTONS / max(task.train.images.mean() / 255, LEAST_GREY):.2g}")
     batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
     reasons = [f"{objects} training images from {n}: {variation}; these changes made left-out images more likely"]
     if variation == Variation():
         reasons = [f"{n} training images as they are: no change of them made left-out images more likely"]
     if encoder == "automaton":
         reasons.append(f"{EXPOSURES} exposures of at most {STATES} states: more would learn so few images by heart")
-        return Recipe(encoder, objects, kept, PHOTONS, batch, 6, tuple(reasons), EXPOSURES, STATES)
+        return Recipe(encoder, objects, kept, *light, batch, 6, tuple(reasons), EXPOSURES, STATES)
     epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
     reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
-    return Recipe(encoder, objects, kept, PHOTONS, batch, epochs, tuple(reasons), features=FEATURES)
+    return Recipe(encoder, objects, kept, *light, batch, epochs, tuple(reasons), features=FEATURES)
+
+
+def as_trained_on(task: Task, provenance: Mapping[str, Any]) -> Task:
+    """Return `task` with the changed copies on which a bundle of that provenance was trained; as it is where there were none."""
+    found, options = provenance.get("variation"), provenance.get("options")
+    if not (isinstance(found, Mapping) and isinstance(options, Mapping)) or provenance["data_sha256"] != task.sha256:
+        return task
+    sizes = {name: found[name] for tried in TRIES for name in tried if found.get(name) in tried[name]}
+    variation = Variation(**sizes)
+    recipe = choose_training(task, variation, "automaton")  # of whose size here nothing depends on the encoder
+    return enlarged(task, variation, recipe.objects, recipe.kept, int(options["seed"]))
 
 
 def warnings_of(task: Task, profile: Profile, recipe: Recipe, clicks: float | None) -> Iterator[str]:

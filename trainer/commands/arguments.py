@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
+from math import floor
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import say, warn
@@ -142,3 +143,19 @@ def displayed_progress(quantity: str) -> Iterator[Show]:
             live.update(Group(bar, Text(words), Text(f"{quantity} {curve(values)}" if quantity else "")))
 
         yield show
+
+
+@contextmanager
+def displayed_parts() -> Iterator[Callable[[str, float], None]]:
+    """Yield a `Report` of pieces of work: a bar on a terminal, else a line per quarter of each piece; both on stderr."""
+    last = 0
+    with displayed_progress("") as show:
+
+        def report(what: str, done: float) -> None:
+            nonlocal last
+            quarter = floor(4 * done)
+            due = quarter > last and not what.startswith("posterior")
+            last = quarter
+            show(f"  {25 * quarter} %  {what}", done, round(1000 * done), 1000, due)
+
+        yield report

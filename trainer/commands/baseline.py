@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +12,9 @@ from pans.runtime.errors import UsageError
 from pans.runtime.ranges import Range
 from pans.trainer.options import LIGHT, METHODS, BaselineOptions
 
-from .arguments import add_data_dir, add_threads, displayed_progress, torch_with, usage_errors
+from .arguments import add_data_dir, add_threads, displayed_parts, torch_with, usage_errors
 
 if TYPE_CHECKING:
-    from pans.trainer.baselines.common import Report
     from pans.trainer.tasks.registry import Task
 
 DEFAULT_PHOTONS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0)
@@ -63,7 +59,7 @@ def _run(args: argparse.Namespace) -> int:
     rows: list[dict[str, Any]] = []
     code = EXIT_FINE
     try:
-        with usage_errors(), _progress() as report:
+        with usage_errors(), displayed_parts() as report:
             for row in baseline_rows(task, options, levels, report):
                 of = "illumination" if row["photons_asked"] is None else "photons"
                 first, words = row["first_200"], f"{row[f'{of}_asked']:>9g} {of}: {100 * row['accuracy_mean']:6.2f} %  "
@@ -111,21 +107,6 @@ def _table(task: Task, args: argparse.Namespace, rows: list[dict[str, Any]]) -> 
             f"{100 * row['first_200']['accuracy_mean']:13.2f}"
         )
     return "\n".join([head, *lines])
-
-
-@contextmanager
-def _progress() -> Iterator[Report]:
-    """A bar on a terminal, else a line per quarter of each piece of work; both on stderr."""
-    last = [0]
-    with displayed_progress("") as show:
-
-        def report(what: str, done: float) -> None:
-            quarter = math.floor(4 * done)
-            due = quarter > last[0] and not what.startswith("posterior")
-            last[0] = quarter
-            show(f"  {25 * quarter} %  {what}", done, round(1000 * done), 1000, due)
-
-        yield report
 
 
 BASELINE = Command(

@@ -9,7 +9,8 @@ import argparse
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -23,19 +24,20 @@ from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of,
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 from pans.runtime.safe_text import one_line
-from pans.trainer.options import Conditions
+from pans.trainer.options import LEAST_PHOTONS, Conditions
 
-from .arguments import add_data_dir, displayed_progress, needing, usage_errors, warn_of_laws
+from .arguments import add_data_dir, displayed_parts, displayed_progress, needing, usage_errors, warn_of_laws
 
 if TYPE_CHECKING:
     from pans.trainer.evaluate.accuracy import Measured, MeasuredPictures
     from pans.trainer.evaluate.held_out import HeldOut
     from pans.trainer.evaluate.walks import MeasuredWalks
+    from pans.trainer.tasks.registry import Task
 
 RECALLS_SHOWN = 10
-LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
 MADE = 1e-3  # of the light: beyond what W in float32 is off by
 PICTURES = ("patterns", "pictures", "confusion", "tsne", "reliability", "optics", "dose")
+COMPARED_UNASKED = 1e11  # numbers that a comparison goes through, at most: some seconds
 CURVE_WORD, CURVES_WORD, WHOLE_WORD = "curve", "tolerance", "whole"  # of --dose-cap, --optics and --draws
 DOSE_CAP, DRAWS = Range(1e-9, 1e15), Range(1, 100_000, whole=True)
 COUNT = Range(1, 1 << 30, whole=True)
@@ -95,6 +97,11 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         metavar="D0[:mixed]",
         help="objects bleach: 1/e of a pixel's light is left after D0 photoelectrons of illumination; mixed: after that mean of all pixels",
     )
+    parser.add_argument(
+        "--compare",
+        action=argparse.BooleanOptionalAction,
+        help="with direct imaging, an ideal camera, at equal photons and equal illumination (default: where that takes seconds)",
+    )
     add_data_dir(parser)
 
 
@@ -146,9 +153,11 @@ def _evaluate(args: argparse.Namespace) -> int:
             compared = _compared(bundle, measured, held_out, args)
             more = {"confidence": args.confidence or None, **walk_payload(walks), **compared}
         more |= passive_light(bundle, held_out)
+        direct, beside = _beside(bundle, held_out, args, asdict(measured))
     payload = {
         **asdict(measured),
         **more,
+        **direct,
         "profile_assumed": not args.profile and "profile" not in bundle.provenance,
         "optics": conditions.imaging_on(held_out.profile).numbers(),
         "afterpulses": h.afterpulses_in(bundle, held_out, args.shots, measured.trials),
@@ -158,7 +167,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.pictures:
         payload["pictures"] = _draw(args, bundle, held_out, conditions)
     differences = more.get("expected_differences") or []
-    answered(payload, "\n".join([words_of(measured, more), _profile_words(bundle, held_out, args), *differences]))
+    lines = [words_of(measured, more), _profile_words(bundle, held_out, args), *beside, *differences]
+    answered(payload, "\n".join(lines))
     return EXIT_ALERT if differences else EXIT_FINE
 
 
@@ -182,6 +192,50 @@ def _compared(bundle: Bundle, measured: MeasuredWalks, held_out: HeldOut, args: 
         return {"expected": None if kept is None else dict(kept), "expected_differences": None}
     found = expected_figures(measured, held_out.profile.name, held_out.task.name, str(kept["split"]))
     return {"expected": dict(kept), "expected_differences": expected_differences(kept, found)}
+
+
+def _beside(
+    bundle: Bundle, held_out: HeldOut, args: argparse.Namespace, figures: Mapping[str, Any]
+) -> tuple[dict[str, Any], list[str]]:
+    """What direct imaging decides on as much light, where that can be told and takes seconds or is asked for."""
+    from pans.trainer.baselines.rows import comparison_numbers
+
+    task = held_out.task
+    why = "training images are not at hand" if not held_out.apart else ""
+    if task.target != "class" or task.light != "transmission":
+        why = "only classes of objects that are lit are compared"
+    if args.compare and why:
+        raise UsageError(f"--compare: {why}", remedy="leave it out")
+    if why or args.compare is False:
+        return {}, []
+    shown = replace(task, test=held_out.objects)
+    if "variation" in bundle.provenance:
+        if not args.compare and find_spec("torch") is None:
+            return {}, []
+        with needing("--compare", "train"):
+            from pans.trainer.choose.recipe import as_trained_on
+        shown = as_trained_on(shown, bundle.provenance)
+    if not args.compare and comparison_numbers(shown) > COMPARED_UNASKED:
+        return {}, []
+    return direct_imaging(shown, figures, args.seed)
+
+
+def direct_imaging(task: Task, figures: Mapping[str, Any], seed: int) -> tuple[dict[str, Any], list[str]]:
+    """Return what direct imaging decides on the test objects of `task` with the light of `figures`, as JSON and in lines."""
+    if task.light != "transmission" or figures["photons_mean"] < LEAST_PHOTONS:
+        return {}, []
+    from pans.trainer.baselines.rows import at_equal_light
+
+    with displayed_parts() as report:
+        report("direct imaging with as much light", 0.0)
+        found = at_equal_light(task, figures["photons_mean"], figures["illumination"], report, seed=seed)
+    same = {"direct_imaging": "photons", "direct_imaging_as_illuminated": "illumination"}
+    lines = [
+        f"  at equal {same[name]:13s}{_percent(one['accuracy_mean'])} %  (error from the objects "
+        f"{_percent(one['accuracy_se_objects'])} points)\n  {_light_words(one)}"
+        for name, one in found.items()
+    ]
+    return found, ["SIMULATED direct imaging, the exact posterior of an ideal camera:", *lines]
 
 
 def _draw(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> list[str]:

@@ -142,7 +142,7 @@ def _train(args: argparse.Namespace) -> int:
     seconds = watch.seconds()
     payload = {"bundle": str(args.out), "sha256": digest, **answer, "seconds": seconds, "simulated": True}
     if own and task.target == "class":
-        more, words = finish(args, task, profile, answer)
+        more, words = finish(args, varied, profile, answer)
         payload, lines = payload | more, [*lines, words]
     emit(args, payload, "\n".join([f"{args.out}  {digest[:12]}  trained in {seconds:.0f} s", *lines]))
     return EXIT_FINE

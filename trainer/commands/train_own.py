@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import say, warn
 
-from .evaluate import LEAST_PHOTONS
+from .evaluate import direct_imaging
 
 if TYPE_CHECKING:
     from pans.runtime.instrument.profile import Profile
@@ -22,7 +22,6 @@ AUTOMATON = "automaton"
 AUTOMATON_PROFILE = "ideal"
 SIZES = ("exposures", "states")  # which a training that starts from an automaton has from it
 CHANGES = ("copies", "shift_px", "offset_px")  # a user who asks for one of these has chosen how images are varied
-BASELINE_TRIALS = 10
 BUDGET_OFF = 0.05  # relative: more is said at the end
 RUN_DECISIONS = 1000
 
@@ -89,56 +88,29 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
     for name in ("copies", "soft"):  # not those of a public set whose name the folder bears
         if recipe.encoder == AUTOMATON and getattr(args, name) is None:
             setattr(args, name, 0)
-    if all(getattr(args, name, None) is None for name in ("photons", "clicks", "alpha", "illumination")):
+    if any(getattr(args, name, None) is not None for name in ("photons", "clicks", "alpha", "illumination")):
+        return []
+    if args.encoder not in (None, "active", AUTOMATON):
         args.photons = recipe.photons
         return [f"{recipe.photons:g} photons per decision: a first guess (--photons N for another budget)"]
-    return []
+    args.illumination = recipe.illumination
+    return [
+        f"an illumination of {recipe.illumination:g} per decision, which brings a camera {recipe.photons:g} photons: a first guess "
+        "(--illumination N for another budget)"
+    ]
 
 
 def finish(
     args: argparse.Namespace, task: Task, profile: Profile, figures: Mapping[str, Any]
 ) -> tuple[dict[str, Any], str]:
-    """Warn of a missed budget, compare with direct imaging at equal photons and at equal illumination, name the next commands.
+    """Warn of a missed budget, compare with direct imaging, name the next commands; return keys of the answer, and words.
 
-    Returns keys of the answer, and words.
+    `task` holds the changed copies too: direct imaging knows what the sensor was trained on.
     """
-    photons = figures["photons_mean"]
     if args.encoder != AUTOMATON:  # whose own words tell it
-        warn_of_budget(args, figures["clicks_mean"], photons, figures["illumination"])
-    words: list[str] = []
-    payload: dict[str, Any] = {}
-    if task.light == "transmission" and photons >= LEAST_PHOTONS:
-        direct = compared(task, photons, args.seed or 0)
-        payload = {"direct_imaging": direct}
-        words += [
-            "SIMULATED direct imaging, the exact posterior of an ideal camera:",
-            _beside(direct, "the same photons"),
-        ]
-        at_illumination = photons * figures["illumination"] / direct["illumination"]  # of a camera both rise together
-        if at_illumination >= LEAST_PHOTONS:
-            direct = payload["direct_imaging_as_illuminated"] = compared(task, at_illumination, args.seed or 0)
-            words.append(_beside(direct, "the same illumination"))
-    return payload, "\n".join([*words, next_commands(args, profile.name)])
-
-
-def _beside(direct: Mapping[str, float], same: str) -> str:
-    """One line on a camera."""
-    return (
-        f"  at {same}: {100 * direct['accuracy_mean']:.2f} %  (error from the objects {100 * direct['accuracy_se_objects']:.2f} points, "
-        f"photons {direct['photons_mean']:.2f}, illumination {direct['illumination']:.1f})"
-    )
-
-
-def compared(task: Task, photons: float, seed: int) -> dict[str, Any]:
-    """Return what direct imaging decides at that many photons, by its exact posterior: accuracy, its error, photons, illumination."""
-    from pans.trainer.baselines.common import Light
-    from pans.trainer.baselines.rows import baseline_rows
-    from pans.trainer.options import BaselineOptions
-
-    options = BaselineOptions("direct", "bayes", trials=BASELINE_TRIALS, seed=seed)
-    wanted = "accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination"
-    row = next(iter(baseline_rows(task, options, [Light("photons", photons)], lambda _what, _done: None)))
-    return {key: row[key] for key in wanted}
+        warn_of_budget(args, figures["clicks_mean"], figures["photons_mean"], figures["illumination"])
+    direct, words = direct_imaging(task, figures, args.seed or 0)
+    return direct, "\n".join([*words, next_commands(args, profile.name)])
 
 
 def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float, illumination: float) -> None:

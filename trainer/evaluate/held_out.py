@@ -50,6 +50,7 @@ class HeldOut:
     task: Task
     objects: Objects
     profile: Profile
+    apart: bool = True  # from the task's training objects
 
 
 def evaluate(
@@ -105,7 +106,7 @@ def held_out_of(
         )
     whole = found.split_here and facts.get("data_sha256") != found.sha256
     profile = load_profile(conditions.profile or str(facts.get("profile", DEFAULT_PROFILE)))
-    return HeldOut(found, (found.everything() if whole else found.test).first(count), profile)
+    return HeldOut(found, (found.everything() if whole else found.test).first(count), profile, not whole)
 
 
 def measure(

@@ -9,9 +9,11 @@ from trainings import practice_folder
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
+from pans.trainer.baselines import rows
 from pans.trainer.choose import recipe
 from pans.trainer.commands import train_own
 from pans.trainer.commands.arguments import curve
+from pans.trainer.tasks.registry import load_task
 
 QUICK = ["--exposures", "4", "--states", "8", "--epochs", "1"]
 
@@ -20,7 +22,7 @@ QUICK = ["--exposures", "4", "--states", "8", "--epochs", "1"]
 def few(monkeypatch):
     monkeypatch.setattr(recipe, "OBJECTS", 400)
     monkeypatch.setattr(train_own, "RUN_DECISIONS", 40)
-    monkeypatch.setattr(train_own, "BASELINE_TRIALS", 2)
+    monkeypatch.setattr(rows, "EQUAL_TRIALS", 2)
 
 
 @pytest.fixture
@@ -35,7 +37,7 @@ def test_a_folder_needs_no_option_and_the_next_commands_work(letters, capsys):
     said = capsys.readouterr()
     assert "400 training images from 120" in said.err
     assert "an automaton" in said.err
-    assert "10 photons per decision" in said.err
+    assert "which brings a camera 10 photons" in said.err
     assert "class 'H' has 24 training images" in said.err
     assert "direct imaging" in said.out
     following = [shlex.split(line) for line in said.out.partition("next:")[2].split("\n") if line.strip()]
@@ -46,7 +48,9 @@ def test_a_folder_needs_no_option_and_the_next_commands_work(letters, capsys):
     assert bundle.automaton is not None
     assert bundle.provenance["training_objects"] == 3 * 110 + 120
     assert bundle.provenance["variation"]
-    assert bundle.provenance["options"]["photons"] == 10.0
+    options, camera = bundle.provenance["options"], load_task(letters)
+    assert options["photons"] is None
+    assert options["illumination"] * camera.train.images.mean() / 255 == pytest.approx(10, rel=0.05)
     assert bundle.expected["objects"] == 30
 
 
@@ -81,6 +85,12 @@ def test_the_course_of_an_automaton_is_written_and_the_answer_holds_direct_imagi
     assert 0.1 < answer["direct_imaging"]["accuracy_mean"] < 1
     gentle = answer["direct_imaging_as_illuminated"]
     assert gentle["illumination"] == pytest.approx(answer["illumination"], rel=1e-3)
+    assert main(["evaluate", "letters.pans", "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)  # against the same changed copies, the same readouts
+    for key in ("direct_imaging", "direct_imaging_as_illuminated"):
+        assert again[key] == pytest.approx(answer[key])
+    assert main(["evaluate", "letters.pans", "--json", "--no-compare"]) == 0
+    assert "direct_imaging" not in json.loads(capsys.readouterr().out)
     course = json.loads((tmp_path / "course/history.json").read_text())
     stages = [step["stage"] for step in course["epochs"]]
     assert stages == ["grow"] * 4 + ["grey"] * 3 + ["shown"]
@@ -114,6 +124,19 @@ def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, mon
     said = capsys.readouterr()
     assert "not better than always naming the largest class" in said.err
     assert "balanced accuracy       33.33 %; recall bar 0.00 %, cross 0.00 %, square 100.00 %" in said.out
+    assert "at equal illumination" in said.out
+    np.savez("others.npz", images=images[::-1], labels=labels[::-1], classes=np.array(["square", "bar", "cross"]))
+    others = [
+        "evaluate",
+        "s.pans",
+        "--task",
+        "others.npz",
+        "--exact",
+    ]  # all of them held out: a camera has none to learn from
+    assert main(others) == 0
+    assert "direct imaging" not in capsys.readouterr().out
+    assert main([*others, "--compare"]) == 2
+    assert "training images are not at hand" in capsys.readouterr().err
 
 
 def test_a_curve_is_thinned_and_says_its_ends():
