@@ -53,7 +53,7 @@ def conveyed(surprise: F64, labels: I64, photons: F64, illumination: F64 | float
     number brings no optimism. H(label), of their frequencies, is on average (classes - 1) / (2 n ln 2) too small.
     """
     n = len(labels)
-    gain = -np.log2(np.bincount(labels) / n)[labels] - surprise
+    gain = -np.log2((np.bincount(labels) / n)[labels]) - surprise
     found: dict[str, float | None] = {}
     for name, light in {"bits": 1.0, "bits_per_photon": photons, "bits_per_illumination": illumination}.items():
         total = float(np.broadcast_to(light, n).sum())
