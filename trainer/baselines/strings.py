@@ -5,15 +5,15 @@ would say no more without dark counts: a dark bar gives no photon.
 
 **Any scheme** (`Bars`), patterns chosen by the clicks so far, is bounded by dynamic programming over its posteriors:
 
-- A pattern clicks as the OR of its bars, lit one after the other with the same light. So a scheme that lights single bars, dimly, until they
-  click or no more is wanted, knows as much for no more photons and no more illumination: single bars are no restriction.
-- Bars are independent before any light, and stay so: a bar is known to be bright (it clicked), or it was silent under light L, which leaves
-  its bright case the weight s = exp(-L). The value W of a state, times its chance, is linear in the weights where a scheme stops (accuracy;
-  convex: -entropy), and along a bar that is lit `dW/ds = W(clicked) - prices * light`.
-- The program knows each bar at nodes of s, the last of them 0. Multilinear between the nodes, its values meet the two conditions of an upper
-  bound if a scheme that stops between two nodes is given its gain there: `d(s)`, by which -ln s is convex, for each dark bar. Beyond the last
-  node above 0 a dark bar's light is charged as if that node's s were kept. With a price on photons alone neither is needed: with s = 1 and 0
-  alone the bound is the optimum.
+- A pattern clicks as the OR of its bars, lit one after the other with the same light. So a scheme that lights single bars, dimly, until
+  they click or no more is wanted, knows as much for no more photons and no more illumination: single bars are no restriction.
+- Bars are independent, and stay so: one is known to be bright (it clicked), or it was silent under light L, which leaves its bright case
+  the weight s = exp(-L). The value W of a state, times its chance, is convex in each weight where a scheme stops, and
+  `dW/ds = W(clicked) - price * light` along a bar that is lit.
+- The program has nodes of s for each bar, the last of them 0. Linear in each s between them, its values meet both conditions of an upper
+  bound if a scheme that stops there is given, for each dark bar, the most by which -ln s, its light, is below the straight line. After the
+  last node above 0 a dark bar's light is charged as if that s were kept: the bound is not tight where certainty is paid for.
+- With a price on photons alone neither matters: with s = 1 and 0 alone the bound is the optimum.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -108,7 +109,7 @@ class Bars:
         lit = -np.diff(s)  # of a bright bar, for both prices
         unlit = np.append(np.diff(lights), 1.0)
         cost = (photon_price * lit + unit_price * (lit + unlit)) / 2 / mass[: len(lit)]
-        gains = [0.0, *(_gain(high, low) for high, low in zip(s[:-2], s[1:-1])), 0.0]
+        gains = [0.0, *(_gain(high, low) for high, low in pairwise(s[:-1])), 0.0]
         of_node = np.maximum(gains[1:], gains[:-1])
         if (np.diff(of_node) > np.diff(lights) + lit[:-1]).any():
             raise ValueError(f"lights are {lights}, allowed: steps of about the same size")
