@@ -48,6 +48,7 @@ from . import plots
 from .active import PROFILE
 from .page import (
     FIRST_OBJECTS,
+    UNITS,
     Asked,
     Draw,
     Made,
@@ -61,7 +62,6 @@ from .page import (
     sampling_error,
 )
 from .printed import PASSIVE, PassiveRow, recipe, recipe_facts
-from .readouts import UNITS
 from .ways import Point, points, trained_automaton
 
 TRIALS = 5

@@ -34,7 +34,7 @@ from pans.trainer.tasks.registry import Task, load_task
 from . import plots
 from .active import PROFILE
 from .curves import CLEAN, EXACT, curve_rows
-from .page import FIRST_OBJECTS, Asked, Draw, Made, Row, Rows, against, sampling_error
+from .page import FIRST_OBJECTS, UNITS, Asked, Draw, Made, Row, Rows, against, sampling_error
 from .trained import neighbours_agree
 
 PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5)  # of the page fig-2c
@@ -47,7 +47,6 @@ SHOWN = {1e6: 1, 1e3: 3, 1e2: 3, 1e1: 3}  # photons: frames drawn of each object
 MAPPED = (1e6, 1e2, 1e1)
 MAPPED_FRAMES = 600
 WAYS = ("camera frames", "clicks of ten patterns", "clicks of an automaton")
-UNITS = {"photons": "photon", "illumination": "illumination"}
 
 F64 = NDArray[np.float64]
 
