@@ -141,9 +141,6 @@ def bayes(
         rng = np.random.default_rng([seed, 2])
         floor = choose_floor(measurement, photons, detector, rng, dark=dark)
 
-    def decide(readouts: F32) -> I64:
-        joint = log_joint(measurement, readouts, photons, detector, floor=floor, dark=dark, report=report)
-        labels: I64 = joint.argmax(axis=1)
-        return labels
-
-    return decide, floor
+    return lambda readouts: log_joint(
+        measurement, readouts, photons, detector, floor=floor, dark=dark, report=report
+    ), floor

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.optics import incident_intensity
 from pans.trainer.evaluate.accuracy import Measured
+from pans.trainer.evaluate.information import conveyed, cooled_surprise
 from pans.trainer.tasks.registry import Task
 
 BRIGHTNESS = ("source", "object")
@@ -32,7 +33,7 @@ _GRAY_MAX = np.float32(255)
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-Decide = Callable[[F32], I64]  # readouts (n, m) -> labels (n,)
+Decide = Callable[[F32], NDArray[np.floating[Any]]]  # readouts (n, m) -> log posteriors (n, classes) but for a constant
 Report = Callable[[str, float], None]  # what is being done, and which part of it is done (0 to 1)
 
 
@@ -162,12 +163,14 @@ def detect(photoelectrons: F32, detector: str, rng: np.random.Generator, dark: f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trials:
-    """What was decided: `right` (trials, objects), the readouts' clicks (objects,), expected photons (objects,)."""
+    """What was decided: `right` (trials, objects), the readouts' clicks, expected photons and true labels, each (objects,)."""
 
     right: NDArray[np.bool_]
     clicks: F64
     photons: F64
     illumination: float
+    labels: I64 | None = None
+    surprise: F64 | None = None  # -log2 of the true label's recalibrated posterior, (objects,); None without one
 
     def measured(self, first: int | None = None) -> Measured:
         """Return means over the first `first` objects (default: all), with the spread over trials and over objects apart.
@@ -176,6 +179,10 @@ class Trials:
         """
         right = self.right[:, :first].astype(np.float64)
         of_object, n = right.mean(axis=0), right.shape[1]
+        known: dict[str, Any] = {}
+        if self.surprise is not None and self.labels is not None:
+            parts = (self.surprise[:first], self.labels[:first], self.photons[:first])
+            known = conveyed(*parts, self.illumination)
         return Measured(
             accuracy_mean=float(right.mean()),
             accuracy_std=float(right.mean(axis=1).std(ddof=1)) if len(right) > 1 else 0.0,
@@ -186,6 +193,7 @@ class Trials:
             objects=n,
             trials=len(right),
             shots=1,
+            **known,
         )
 
 
@@ -199,13 +207,16 @@ def run_trials(
     seed: int,
     dark: float = 0.0,
 ) -> Trials:
-    """Detect every test object `trials` times at `photons` per object and let `decide` (readouts -> labels) judge."""
+    """Detect every test object `trials` times at `photons` per object and let `decide` judge."""
     light = measurement.photoelectrons(measurement.test, photons)
     rng = np.random.default_rng([seed, 1])
     right = np.empty((trials, len(light)), bool)
-    clicks = np.zeros(len(light))
+    clicks, surprise, labels = np.zeros(len(light)), np.zeros(len(light)), measurement.test_labels
     for trial in range(trials):
         readouts = detect(light, detector, rng, dark)
         clicks += (readouts > 0).sum(axis=1)
-        right[trial] = decide(readouts) == measurement.test_labels
-    return Trials(right, clicks / trials, light.sum(axis=1, dtype=np.float64), measurement.illumination(photons))
+        scores = decide(readouts)
+        right[trial] = scores.argmax(axis=1) == labels
+        surprise += cooled_surprise(scores, labels)[0] / trials
+    light_of_object, illumination = light.sum(axis=1, dtype=np.float64), measurement.illumination(photons)
+    return Trials(right, clicks / trials, light_of_object, illumination, labels, surprise)

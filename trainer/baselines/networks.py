@@ -208,13 +208,12 @@ def fitted(
 
 
 def decider(net: Callable[[Tensor], Tensor]) -> Decide:
-    """Return a trained network as a function from readouts (n, m) to labels (n,)."""
+    """Return a trained network as a function from readouts (n, m) to scores (n, classes)."""
 
-    def decide(readouts: F32) -> I64:
+    def decide(readouts: F32) -> F32:
         with torch.no_grad():
-            parts = [net(part).argmax(dim=1) for part in torch.from_numpy(readouts).split(CHUNK)]
-        labels: I64 = torch.cat(parts).numpy().astype(np.int64)
-        return labels
+            scores: F32 = torch.cat([net(part) for part in torch.from_numpy(readouts).split(CHUNK)]).numpy()
+        return scores
 
     return decide
 

@@ -97,14 +97,17 @@ def _table(task: Task, args: argparse.Namespace, rows: list[dict[str, Any]]) -> 
         f"SIMULATED {args.paradigm}, {args.method}, {args.detector} detector, {task.name}: {rows[0]['objects']} objects, "
         f"{rows[0]['trials']} trials, {rows[0]['train_objects']} training objects\n"
         "   photons    clicks  illumination  accuracy %  spread(trials)  error(objects)  first 200 %"
+        "         bits   per photon  per unit sent"
     )
     lines = []
     for row in rows:
+        known = [row[key] for key in ("bits", "bits_per_photon", "bits_per_illumination")]
+        bits = "".join(f"{'-' if one is None else f'{one:.4f}':>13s}" for one in known)
         spread = f"{100 * row['accuracy_std']:.2f}" if row["trials"] > 1 else "one trial"
         lines.append(
             f"{row['photons_mean']:10.2f}{row['clicks_mean']:10.2f}{row['illumination']:14.1f}"
             f"{100 * row['accuracy_mean']:12.2f}{spread:>16}{100 * row['accuracy_se_objects']:16.2f}"
-            f"{100 * row['first_200']['accuracy_mean']:13.2f}"
+            f"{100 * row['first_200']['accuracy_mean']:13.2f}{bits}"
         )
     return "\n".join([head, *lines])
 

@@ -283,6 +283,8 @@ def words_of(
     if walks:
         lines.append(f"  calibration error       {_percent(figures['expected_calibration_error'])} points")
     lines.append(_light_words(figures))
+    if figures.get("bits") is not None:
+        lines.append(f"  {bit_words(figures)}")
     if "reaching_photons" in more:
         lines.append(f"  {_reaching_words(more)}")
     lines += class_words(figures.get("by_class"))
@@ -303,6 +305,15 @@ def _accuracy_lines(
         f"  spread over {over}      {_percent(figures[spread])} points{more}",
         f"  error from the objects  {_percent(figures['accuracy_se_objects'])} points",
     ]
+
+
+def bit_words(figures: Mapping[str, Any]) -> str:
+    """Return what the posteriors convey of the class, and per unit of light where there is some; `figures` hold information.Conveyed."""
+    words = f"at least {figures['bits']:.3f} ± {figures['bits_se']:.3f} bits of the class"
+    for key, unit in (("bits_per_photon", "photon"), ("bits_per_illumination", "unit of illumination")):
+        if figures[key] is not None:
+            words += f", {figures[key]:.4f} ± {figures[f'{key}_se']:.4f} per {unit}"
+    return words
 
 
 def class_words(found: Mapping[str, Any] | None) -> list[str]:

@@ -36,7 +36,8 @@ from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
 from pans.trainer.options import Conditions
 
-from .readings import Chain, Numbers, vector_chances
+from .information import Conveyed, conveyed, surprises
+from .readings import Chain, Numbers, outcome_probabilities, vector_chances
 
 EXACT_OUTCOMES_MAX = 1 << 20  # count vectors that an exact evaluation may enumerate
 MAJORITY_SE = 2.0  # standard errors that a sensor must be above the largest class
@@ -96,7 +97,7 @@ def among_classes(
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class Measured(Conveyed):
     """Means per decision. `accuracy_std` is the spread over trials, `accuracy_se_objects` the error from having few objects."""
 
     accuracy_mean: float
@@ -263,15 +264,28 @@ def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *,
 
     `accuracy_std` is then the exact spread that trials over these objects would show.
     """
-    right = decision_shares(bundle, light, shots=shots)[np.arange(len(labels)), labels]
-    n = len(labels)
-    over_trials = math.sqrt(float((right * (1 - right)).sum())) / n
-    found = _measured(light, right, over_trials, trials=0, shots=shots)
+    scores = _scores_of_all(bundle, shots)
+    right, surprise = (
+        _expected(bundle, light, of_outcome, shots)[np.arange(len(labels)), labels]
+        for of_outcome in (_decided(scores), surprises(scores))
+    )
+    right = np.clip(right, 0.0, 1.0)
+    over_trials = math.sqrt(float((right * (1 - right)).sum())) / len(labels)
+    found = _measured(light, right, over_trials, labels, surprise, trials=0, shots=shots)
     return replace(found, by_class=among_classes(right, labels, bundle.classes))
 
 
 def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
     """Return P(decided class | object), float64 (n, classes), by enumeration of all count vectors, (shots + 1)**d_f of clicks."""
+    return np.clip(_expected(bundle, light, _decided(_scores_of_all(bundle, shots)), shots), 0.0, 1.0)
+
+
+def _decided(scores: NDArray[np.float32]) -> F64:
+    return np.eye(scores.shape[1])[scores.argmax(axis=1)]
+
+
+def _scores_of_all(bundle: Bundle, shots: int) -> NDArray[np.float32]:
+    """Scores of every count vector; pattern 0 varies fastest."""
     base = shots * bundle.largest + 1
     outcomes = base**bundle.n_features
     if outcomes > EXACT_OUTCOMES_MAX:
@@ -281,22 +295,25 @@ def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
         )
     digits = base ** np.arange(bundle.n_features)
     counts = (np.arange(outcomes)[:, None] // digits) % base
-    decided = make_decider(bundle, shots=shots).decide_batch(counts, shots)
-    of_class = np.eye(bundle.n_classes)[decided]
+    return make_decider(bundle, shots=shots).scores_batch(counts, shots)
+
+
+def _expected(bundle: Bundle, light: Light, of_outcome: F64, shots: int) -> F64:
+    """The mean of `of_outcome` (count vectors, m) over the readings of each object, (n, m)."""
     chances, one_shot = light.probability, shots == 1
     if light.own is not None and one_shot:
-        chances, of_class = light.own, seen_from_own(of_class, bundle.n_features, light.crosstalk)
-    shares = np.empty((len(light.probability), bundle.n_classes))
-    step = max(1, _CHUNK_NUMBERS // outcomes)
-    for start in range(0, len(shares), step):
+        chances, of_outcome = light.own, seen_from_own(of_outcome, bundle.n_features, light.crosstalk)
+    found = np.empty((len(light.probability), of_outcome.shape[1]))
+    step = max(1, _CHUNK_NUMBERS // len(of_outcome))
+    for start in range(0, len(found), step):
         part = slice(start, start + step)
         if light.numbers is not None:
-            shares[part] = vector_chances(light.numbers.sums(shots, part)) @ of_class
+            found[part] = vector_chances(light.numbers.sums(shots, part)) @ of_outcome
         elif light.chain is not None and one_shot:
-            shares[part] = light.chain.word_chances(part) @ of_class
+            found[part] = light.chain.word_chances(part) @ of_outcome
         else:  # of several shots, afterpulses and crosstalk are in the mean
-            shares[part] = outcome_probabilities(chances[part], shots) @ of_class
-    return np.clip(shares, 0.0, 1.0)
+            found[part] = outcome_probabilities(chances[part], shots) @ of_outcome
+    return found
 
 
 def sampled_shares(bundle: Bundle, light: Light, *, shots: int = 1, trials: int, seed: int) -> F64:
@@ -309,32 +326,26 @@ def sampled_shares(bundle: Bundle, light: Light, *, shots: int = 1, trials: int,
     return decided / trials
 
 
-def outcome_probabilities(probability: F64, shots: int) -> F64:
-    """Return P(count vector | object), (n, (shots + 1)**d_f), from click probabilities (n, d_f); pattern 0 varies fastest."""
-    k = np.arange(shots + 1)
-    ways = np.array([math.comb(shots, int(j)) for j in k], dtype=np.float64)
-    p = probability[:, :, None]
-    return vector_chances(ways * p**k * (1 - p) ** (shots - k))
-
-
 def evaluate_sampled(
     bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1, trials: int = 30, seed: int = 0
 ) -> Measured:
     """Sample `trials` independent decisions per object, each from `shots` shots."""
     decider = make_decider(bundle, shots=shots)
     rng = np.random.default_rng(seed)
-    right = np.zeros(len(labels))
+    right, surprise, objects = np.zeros(len(labels)), np.zeros(len(labels)), np.arange(len(labels))
     of_trial = np.empty(trials)
     clicks = 0
     for trial in range(trials):
         counts = light.counts(shots, rng)
         clicks += int(counts.sum())
-        hit = decider.decide_batch(counts, shots) == labels
+        scores = decider.scores_batch(counts, shots)
+        hit = scores.argmax(axis=1) == labels
         right += hit
+        surprise += surprises(scores)[objects, labels] / trials
         of_trial[trial] = hit.mean()
     spread = float(of_trial.std(ddof=1)) if trials > 1 else 0.0
     clicks_mean = clicks / (trials * len(labels))
-    found = _measured(light, right / trials, spread, trials=trials, shots=shots, clicks=clicks_mean)
+    found = _measured(light, right / trials, spread, labels, surprise, trials=trials, shots=shots, clicks=clicks_mean)
     return replace(found, by_class=among_classes(right / trials, labels, bundle.classes))
 
 
@@ -388,19 +399,28 @@ def evaluate_pictures(
 
 
 def _measured(
-    light: Light, right: F64, spread: float, *, trials: int, shots: int, clicks: float | None = None
+    light: Light,
+    right: F64,
+    spread: float,
+    labels: NDArray[np.int64],
+    surprise: F64,
+    *,
+    trials: int,
+    shots: int,
+    clicks: float | None = None,
 ) -> Measured:
     n = len(right)
-    scale = shots * float(light.photoelectrons.sum()) / n
+    photons, illumination = shots * light.photoelectrons.sum(axis=1), light.illumination * shots
     expected = shots * float(light.probability.sum()) / n
     return Measured(
         accuracy_mean=float(right.mean()),
         accuracy_std=spread,
         accuracy_se_objects=float(right.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
         clicks_mean=expected if clicks is None else clicks,
-        photons_mean=scale,
-        illumination=light.illumination * shots,
+        photons_mean=float(photons.mean()),
+        illumination=illumination,
         objects=n,
         trials=trials,
         shots=shots,
+        **conveyed(surprise, labels, photons, illumination),
     )

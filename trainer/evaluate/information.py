@@ -1,5 +1,6 @@
 """How much the readouts know of the label: exact for click words, bounded for frames, and Fisher's ratio (paper, Fig. 2C). In bits.
 
+- **Decisions** (`conveyed`): what the posteriors that stand behind them convey of the label, per decision and per unit of light.
 - **Click words** (`word_information`): all 2**d_f click words of one shot are enumerated, so that I(label; clicks) of a set of
   objects is a sum, not an estimate. On the training objects it is optimistic about new ones: quote the held-out figures.
 - **Frames** (`posterior_information`): nothing can be enumerated. A posterior q gives I >= H(label) - E[-log2 q(label)],
@@ -10,15 +11,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 
-from .accuracy import outcome_probabilities
+from .readings import outcome_probabilities
 
 SMOOTHING = 1e-9  # of a word's probability, given to every class: words that no training object shows say nothing
 DISCRIMINANT_MAX = 2048
@@ -26,6 +29,45 @@ _CHUNK_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Conveyed:
+    """Bits of the class that the posterior of a decision conveys, and that per unit of light, with standard errors from the objects.
+
+    None without a posterior, or without light.
+    """
+
+    bits: float | None = None
+    bits_se: float | None = None
+    bits_per_photon: float | None = None
+    bits_per_photon_se: float | None = None
+    bits_per_illumination: float | None = None
+    bits_per_illumination_se: float | None = None
+
+
+def conveyed(surprise: F64, labels: I64, photons: F64, illumination: F64 | float) -> dict[str, float | None]:
+    """Return the fields of `Conveyed` from the mean -log2 q(label) of each object, its photons and its illumination, all (n,).
+
+    H(label) - E[-log2 q(label)], a lower bound of I(label; readings) whatever the posterior q. These objects chose nothing in q: their
+    number brings no optimism. H(label), of their frequencies, is on average (classes - 1) / (2 n ln 2) too small.
+    """
+    n = len(labels)
+    gain = -np.log2((np.bincount(labels) / n)[labels]) - surprise
+    found: dict[str, float | None] = {}
+    for name, light in {"bits": 1.0, "bits_per_photon": photons, "bits_per_illumination": illumination}.items():
+        total = float(np.broadcast_to(light, n).sum())
+        if total:
+            found[name] = ratio = float(gain.sum()) / total
+            # the ratio's error by its derivative
+            square = float(((gain - ratio * light) ** 2).sum())
+            found[f"{name}_se"] = math.sqrt(square * n / max(n - 1, 1)) / total
+    return found
+
+
+def surprises(scores: NDArray[np.floating[Any]]) -> F64:
+    """Return -log2 of the softmax of `scores`, float64 (n, classes)."""
+    return -_log_softmax(scores.astype(np.float64)) / math.log(2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,17 +162,10 @@ class PosteriorInformation:
 
 
 def posterior_information(log_joint: F64, labels: I64) -> PosteriorInformation:
-    """Return bounds from log P(readout, class) (n, classes), as `baselines.bayes.log_joint` gives, and the true labels (n,).
-
-    One half of the readouts chooses the temperature for the other half, so that the bound stays a bound.
-    """
+    """Return bounds from log P(readout, class) (n, classes), as `baselines.bayes.log_joint` gives, and the true labels (n,)."""
     log_posterior = _log_softmax(log_joint)
     n, n_classes = log_joint.shape
-    half = np.arange(n) % 2 == 0
-    temperatures = [_best_temperature(log_posterior[part], labels[part]) for part in (~half, half)]
-    of_row = np.where(half, *temperatures)[:, None]
-    tempered = _log_softmax(log_posterior / of_row)
-    surprise = -tempered[np.arange(n), labels] / np.log(2)
+    surprise, temperature = cooled_surprise(log_posterior, labels)
     label_bits = entropy_bits(np.bincount(labels, minlength=n_classes) / n)
     plain = np.exp(log_posterior)
     entropy = -(plain * np.maximum(log_posterior, -1e4)).sum(axis=1) / np.log(2)
@@ -139,8 +174,19 @@ def posterior_information(log_joint: F64, labels: I64) -> PosteriorInformation:
         lower_bits=label_bits - float(surprise.mean()),
         lower_bits_se=float(surprise.std(ddof=1)) / float(np.sqrt(n)),
         believed_bits=label_bits - float(entropy.mean()),
-        temperature=float(np.mean(temperatures)),
+        temperature=temperature,
     )
+
+
+def cooled_surprise(scores: NDArray[np.floating[Any]], labels: I64) -> tuple[F64, float]:
+    """Return -log2 q(label) of every readout, float64 (n,), q the softmax of `scores` (n, classes) over a temperature, and its mean.
+
+    One half of the readouts chooses the temperature for the other half, so that what follows from it stays a bound.
+    """
+    log_posterior, rows = _log_softmax(scores.astype(np.float64)), np.arange(len(labels))
+    half = rows % 2 == 0
+    temperatures = [_best_temperature(log_posterior[part], labels[part]) for part in (~half, half)]
+    return surprises(log_posterior / np.where(half, *temperatures)[:, None])[rows, labels], float(np.mean(temperatures))
 
 
 def _log_softmax(rows: F64) -> F64:

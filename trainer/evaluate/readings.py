@@ -6,6 +6,7 @@ objects leave.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,6 +112,14 @@ class Numbers:
                 wider[:, :, number : number + found.shape[2]] += found * one[:, :, number, None]
             found = wider
         return found
+
+
+def outcome_probabilities(probability: F64, shots: int) -> F64:
+    """Return P(count vector | object), (n, (shots + 1)**d_f), from click probabilities (n, d_f); pattern 0 varies fastest."""
+    k = np.arange(shots + 1)
+    ways = np.array([math.comb(shots, int(j)) for j in k], dtype=np.float64)
+    p = probability[:, :, None]
+    return vector_chances(ways * p**k * (1 - p) ** (shots - k))
 
 
 def vector_chances(of_pattern: F64) -> F64:

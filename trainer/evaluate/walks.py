@@ -32,21 +32,23 @@ from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import Conditions
 
 from .accuracy import AS_IT_IS, ByClass, among_classes, demand_sequence, exposure_of, outcome_law_of
+from .information import Conveyed, conveyed
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
+LEAST = 2.0**-126  # of a probability in float32, which a 0 stands for
 FIRST_OBJECTS = 200  # the paper's objects: judged beside all of them
 BEGIN_OBJECTS, BEGIN_ROUNDS = 500, 4  # by which the memory is found with which an object comes
 _LEAF_NUMBERS = 1 << 22  # objects times leaves at once
 _LIGHT_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
-OF_OBJECTS = ("right", "decided", "clicks", "photons", "illumination", "exposures", "labels")
+OF_OBJECTS = ("right", "decided", "clicks", "photons", "illumination", "exposures", "surprise", "labels")
 ONE_DOSE = 0.01  # of the dose that leaves 1/e: by so much the doses of walks to one state may differ, by steps of the dwell time
 BLEACHED_AT_ONCE = 512  # objects, whose pixels stand in memory
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuredWalks:
+class MeasuredWalks(Conveyed):
     """Means per decision of an automaton.
 
     With a confidence `accuracy_mean` is that of what is decided, and `abstained` the share of the decisions that are not. `accuracy_std` is
@@ -78,6 +80,7 @@ class Walks:
     photons: F64
     illumination: F64
     exposures: F64
+    surprise: F64  # -log2 of the true class's probability at the leaf
     by_class: F64  # chance that an object of this class ends at this leaf, summed over the objects
     automaton: Automaton  # the one that ran
     leaf_labels: NDArray[np.uint16]
@@ -205,13 +208,15 @@ _Sums = tuple[F64, F64, F64, F64, F64]  # clicks, photons, illumination, exposur
 
 def _judged(sums: _Sums, labels: NDArray[np.int64], automaton: Automaton, leaf_labels: NDArray[np.uint16]) -> Walks:
     leaves = sums[4]
-    right, by_class = np.empty(len(labels)), np.zeros((automaton.n_classes, automaton.n_leaves))
+    right, surprise, by_class = *np.empty((2, len(labels))), np.zeros((automaton.n_classes, automaton.n_leaves))
+    surprises = -np.log2(np.maximum(automaton.posteriors[automaton.n_states :].astype(np.float64), LEAST))
     for label in range(automaton.n_classes):
         of_class = labels == label
         right[of_class] = leaves[of_class] @ (leaf_labels == label).astype(np.float64)
+        surprise[of_class] = leaves[of_class] @ surprises[:, label]
         by_class[label] = leaves[of_class].sum(axis=0)
     decided = leaves @ (leaf_labels != NO_LABEL).astype(np.float64)
-    return Walks(np.minimum(right, decided), decided, *sums[:4], by_class, automaton, leaf_labels, labels)
+    return Walks(np.minimum(right, decided), decided, *sums[:4], surprise, by_class, automaton, leaf_labels, labels)
 
 
 class _Lit:
@@ -337,6 +342,7 @@ def measured_walks(walks: Walks) -> MeasuredWalks:
         objects=n,
         trials=walks.trials,
         by_class=among_classes(walks.right, walks.labels, walks.classes, walks.decided) if walks.classes else None,
+        **conveyed(walks.surprise, walks.labels, walks.photons, walks.illumination),
     )
 
 

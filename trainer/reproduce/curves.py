@@ -124,7 +124,9 @@ def sensed(data_dir: str | None, features: int, family: str, convolutions: bool,
     def watch(loss: float, accuracy: float, decide: Decide) -> None:
         course["loss"].append(round(loss, 4))
         course["training"].append(round(100 * accuracy, 2))
-        course["held_out"].append(round(100 * float((decide(clean) == measurement.test_labels).mean()), 2))
+        course["held_out"].append(
+            round(100 * float((decide(clean).argmax(axis=1) == measurement.test_labels).mean()), 2)
+        )
 
     at = clean_mlp(measurement, seed=0, epochs=epochs, convolutions=convolutions, watch=watch)
     cells = []

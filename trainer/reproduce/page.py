@@ -30,6 +30,7 @@ Rows = list[Row]
 Draw = Callable[[Path], None]
 
 VERDICTS = ("above", "level", "below")
+UNITS = {"photons": "photon", "illumination": "illumination"}  # of light, of which there are bits
 ERRORS = 2.0  # combined standard errors that a difference must exceed
 FIRST_OBJECTS = 200  # test images, by which the paper judges FashionMNIST and MNIST
 

@@ -18,7 +18,7 @@ from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.bayes import log_joint
-from pans.trainer.baselines.common import detect, measure
+from pans.trainer.baselines.common import Measurement, detect, measure
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.information import (
     fisher,
@@ -28,11 +28,13 @@ from pans.trainer.evaluate.information import (
     word_joint,
 )
 from pans.trainer.evaluate.pictures import tsne
+from pans.trainer.export.automaton import measure_walks
 from pans.trainer.tasks.registry import Task, load_task
 
 from . import plots
+from .active import PROFILE
 from .curves import CLEAN, EXACT, curve_rows
-from .page import FIRST_OBJECTS, Asked, Draw, Made, Row, Rows, against, sampling_error
+from .page import FIRST_OBJECTS, UNITS, Asked, Draw, Made, Row, Rows, against, sampling_error
 from .trained import neighbours_agree
 
 PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5)  # of the page fig-2c
@@ -44,14 +46,18 @@ MAP_PHOTONS = (10.0, 30.0)  # of the page fig-2f
 SHOWN = {1e6: 1, 1e3: 3, 1e2: 3, 1e1: 3}  # photons: frames drawn of each object, on the page direct-frames
 MAPPED = (1e6, 1e2, 1e1)
 MAPPED_FRAMES = 600
-WAYS = ("camera frames", "clicks of ten patterns")
+WAYS = ("camera frames", "clicks of ten patterns", "clicks of an automaton")
 
 F64 = NDArray[np.float64]
 
 
 def shipped_bundle() -> Bundle:
     """Return the bundle that comes with the package: ten patterns, FashionMNIST."""
-    return load_bundle(Path(str(importlib.resources.files("pans.runtime") / "shipped" / "fashion10.pans")))[0]
+    return _shipped("fashion10")
+
+
+def _shipped(name: str) -> Bundle:
+    return load_bundle(Path(str(importlib.resources.files("pans.runtime") / "shipped" / f"{name}.pans")))[0]
 
 
 def shipped_light(task: Task) -> tuple[F64, F64]:
@@ -66,25 +72,40 @@ def shipped_light(task: Task) -> tuple[F64, F64]:
 
 
 def information_page(asked: Asked) -> Made:
-    """Return one row per way and photon level; accuracies of both ways beside each other, with binomial errors."""
+    """Return one row per way and photon level; accuracies of ours beside frames of as many photons, with binomial errors.
+
+    Frames are also measured at the photons and at the illumination of the automaton.
+    """
     task = load_task(shipped_bundle().task, asked.data_dir)
-    frames = _information_of_frames(replace(task, test=task.test.first(FRAMES)))
+    ours = [*_information_of_words(task), _information_of_walks(task)]
+    measurement = measure(replace(task, test=task.test.first(FRAMES)), None)
+    of_walks = ours[-1]["photons"], ours[-1]["illumination"] / measurement.illumination(1.0)
+    frames = _information_of_frames(measurement, sorted({*PHOTONS, *of_walks}))
     there = {row["photons"]: row for row in frames if "value" in row}
-    words = _information_of_words(task)
-    for row in words:
+    for row in ours:
         other = there.get(row["photons"])
         if other is not None:
             errors = [sampling_error(one["value"], one["objects"]) for one in (row, other)]
             row |= against(row["value"], other["value"], *errors)
-    return Made(frames + words)
+    for row in frames + ours:
+        if "bits" in row:
+            row |= {f"bits_per_{unit}": row["bits"] / row[light] for light, unit in UNITS.items()}
+    return Made(frames + ours)
 
 
-def _information_of_frames(task: Task) -> Rows:
-    measurement = measure(task, None)
+def _information_of_walks(task: Task) -> Row:
+    """The shipped automaton behind the ideal detector."""
+    found = measure_walks(_shipped("fashion-adaptive"), task.test, load_profile(PROFILE))
+    row: Row = {"table": "information", "way": WAYS[2], "photons": found.photons_mean, "objects": found.objects}
+    row |= {"illumination": found.illumination, "clicks": found.clicks_mean}
+    return row | {"bits": found.bits, "bits_se": found.bits_se, "value": 100 * (found.accuracy_mean or 0.0)}
+
+
+def _information_of_frames(measurement: Measurement, levels: list[float]) -> Rows:
     light = measurement.photoelectrons(measurement.train[:FISHER_OBJECTS], 1.0).astype(np.float64)
-    ratios = fisher_of_frames(light, measurement.train_labels[:FISHER_OBJECTS], PHOTONS)
+    ratios = fisher_of_frames(light, measurement.train_labels[:FISHER_OBJECTS], levels)
     rows = []
-    for photons, ratio in zip(PHOTONS, ratios):
+    for photons, ratio in zip(levels, ratios):
         row: Row = {"table": "information", "way": WAYS[0], "photons": photons, "objects": FRAMES}
         row |= {"trace": ratio.trace, "discriminant": ratio.discriminant}
         row |= {"illumination": measurement.illumination(photons)}

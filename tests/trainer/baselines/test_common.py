@@ -56,6 +56,27 @@ def two_pixels(*grays: tuple[int, int]) -> Task:
     return Task("pixels", tuple(map(str, range(len(grays)))), objects, objects, "0" * 64, "made here")
 
 
+def test_a_decision_that_claims_too_much_conveys_what_its_readouts_know() -> None:
+    """One pixel, dark or of 1.2 photons: a Z channel; the log posterior is eight times too sure where there is no photon."""
+    images = np.repeat(np.array([0, 255], np.uint8), 20_000)[:, None, None]
+    objects = Objects(images, np.repeat(np.arange(2), 20_000))
+    measurement = measure(Task("pixel", ("dark", "bright"), objects, objects, "0" * 64, "made here"), None)
+    silent = math.exp(-1.2)
+    posterior = np.array([[1, silent], [1e-9, 1]])
+
+    def decide(readouts: np.ndarray) -> np.ndarray:
+        return 8 * np.log(posterior[(readouts[:, 0] > 0).astype(int)])
+
+    found = run_trials(measurement, 0.6, "binary", decide, trials=1, seed=3).measured()
+    p = (1 - silent) / 2
+    known = sum(-q * math.log2(q) for q in (p, 1 - p)) - sum(-q * math.log2(q) for q in (silent, 1 - silent)) / 2
+    assert found.bits is not None
+    assert found.bits_se is not None
+    assert abs(found.bits - known) < 5 * found.bits_se < 0.05
+    assert found.bits_per_photon == pytest.approx(found.bits / 0.6)
+    assert found.bits_per_illumination == pytest.approx(found.bits / 1.2)
+
+
 # ---- light ----
 
 

@@ -53,12 +53,17 @@ def head_bundle():
 def test_exact_accuracy_is_the_sum_over_all_counts(shots):
     model = head_bundle()
     light, decider = light_of(model, PROFILE, IMAGES), make_decider(model, shots=shots)
-    right = 0.0
+    right, bits = 0.0, 0.0
     for counts in itertools.product(range(shots + 1), repeat=3):
         ways = [math.comb(shots, k) * p**k * (1 - p) ** (shots - k) for k, p in zip(counts, light.probability.T)]
+        said = np.exp(decider.scores_batch(np.array([counts]), shots)[0].astype(np.float64))
+        share = np.array([(label == LABELS).mean() for label in range(3)])
+        bits += float((math.prod(ways) * np.log2(said / said.sum() / share)[LABELS]).sum())
         right += float((math.prod(ways) * (decider.decide(np.array(counts), shots).label == LABELS)).sum())
     found = evaluate_exactly(model, light, LABELS, shots=shots)
     assert found.accuracy_mean == pytest.approx(right / 60, rel=1e-10)
+    assert found.bits == pytest.approx(bits / 60, rel=1e-6)
+    assert found.bits_per_photon == pytest.approx(bits / (shots * light.photoelectrons.sum()), rel=1e-6)
     assert found.clicks_mean == pytest.approx(shots * light.probability.sum(axis=1).mean())
     assert found.photons_mean == pytest.approx(shots * light.photoelectrons.sum(axis=1).mean())
     assert (found.illumination, found.trials) == (pytest.approx(shots * model.illumination()), 0)
@@ -73,6 +78,9 @@ def test_sampled_agrees_with_exact(shots):
     assert abs(sampled.accuracy_mean - exact.accuracy_mean) < 5 * exact.accuracy_std / math.sqrt(400)
     click_sigma = math.sqrt(shots * (light.probability * (1 - light.probability)).sum() / 60 / (60 * 400))
     assert abs(sampled.clicks_mean - exact.clicks_mean) < 5 * click_sigma
+    assert sampled.bits == pytest.approx(
+        exact.bits, abs=5 * 1.5 / math.sqrt(60 * 400)
+    )  # a decision's bits vary by about one
     assert sampled.photons_mean == exact.photons_mean
     assert sampled.accuracy_std == pytest.approx(exact.accuracy_std, rel=5 / math.sqrt(2 * 400))
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pans.trainer.evaluate.information import (
+    conveyed,
     fisher,
     mutual_information_bits,
     posterior_information,
@@ -56,6 +57,25 @@ def test_held_out_objects_are_judged_by_the_table_of_the_training_objects() -> N
     fair = word_information(train, labels, train, labels, 2)
     assert swapped.heldout_bayes_accuracy == pytest.approx(1 - fair.heldout_bayes_accuracy, abs=1e-12)
     assert swapped.heldout_bits < 0 < fair.heldout_bits <= fair.bits + 1e-9
+
+
+# ---- what decisions convey ----
+
+
+def test_bits_of_light_and_their_errors_are_those_of_objects_drawn_again() -> None:
+    rng = np.random.default_rng(8)
+    labels, photons = rng.integers(0, 3, 400), rng.gamma(2.0, 4.0, 400)
+    surprise = rng.exponential(0.4, 400) + 0.05 * photons
+    found = conveyed(surprise, labels, photons, 30.0)
+    drawn = [rng.integers(0, 400, 400) for _ in range(3000)]
+    again = [conveyed(surprise[some], labels[some], photons[some], 30.0) for some in drawn]
+    for name in ("bits", "bits_per_photon", "bits_per_illumination"):
+        assert found[f"{name}_se"] == pytest.approx(np.std([one[name] for one in again]), rel=0.06)
+    assert found["bits_per_illumination"] == pytest.approx(found["bits"] / 30)
+    # (classes - 1) / (2 n ln 2) below the entropy of three equal classes
+    fair = [conveyed(np.zeros(60), rng.integers(0, 3, 60), np.ones(60), 1.0)["bits"] for _ in range(4000)]
+    assert math.log2(3) - np.mean(fair) == pytest.approx(2 / (2 * 60 * math.log(2)), rel=0.1)
+    assert "bits_per_photon" not in conveyed(np.zeros(4), np.arange(4) % 2, np.zeros(4), 0.0)
 
 
 # ---- frames: one pixel, two objects, exact sums ----

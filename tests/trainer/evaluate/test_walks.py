@@ -41,7 +41,7 @@ def by_hand(model: Bundle, dark: float, eta: float, confidence: float) -> dict[s
     automaton = decider.automaton
     seen = object_transmission(PROFILE, IMAGES.reshape(60, -1))
     law = law_of(model, PROFILE, dark=dark)
-    sums = dict.fromkeys(("right", "decided", "clicks", "photons", "illumination", "exposures"), 0.0)
+    sums = dict.fromkeys(("right", "decided", "clicks", "photons", "illumination", "exposures", "bits"), 0.0)
     for row, label in zip(seen, LABELS):
         whole = model.pattern_levels[automaton.pattern] * (eta * model.photons_per_level)
         states = whole * (automaton.dwell / automaton.dwell_steps)[:, None]
@@ -52,6 +52,8 @@ def by_hand(model: Bundle, dark: float, eta: float, confidence: float) -> dict[s
         sums["photons"] += float(np.dot(found["shown"], light))
         sums["illumination"] += float(np.dot(found["shown"], states.sum(axis=1)))
         sums["right"] += sum(p for leaf, p in enumerate(found["leaves"]) if decider.decide_leaf(leaf).label == label)
+        said = automaton.posteriors[automaton.n_states :, label]
+        sums["bits"] += math.log2(60 / (label == LABELS).sum()) + float(np.dot(found["leaves"], np.log2(said)))
         sums["decided"] += sum(p for leaf, p in enumerate(found["leaves"]) if decider.decide_leaf(leaf).label < 3)
     return sums
 
@@ -68,6 +70,9 @@ def test_exact_figures_are_sums_over_all_words(dark: float, eta: float, confiden
     assert [60 * mean for mean in means] == pytest.approx(
         [wanted[name] for name in ("clicks", "photons", "illumination", "exposures")], rel=1e-9
     )
+    bits, photons, sent = (wanted[name] for name in ("bits", "photons", "illumination"))
+    of_light = (found.bits, found.bits_per_photon, found.bits_per_illumination)
+    assert of_light == pytest.approx((bits / 60, bits / photons, bits / sent), rel=1e-6)
     assert confusion_of(walks).sum() == pytest.approx(wanted["decided"], rel=1e-9)
     assert np.trace(confusion_of(walks)) == pytest.approx(wanted["right"], rel=1e-9)
 
@@ -109,7 +114,10 @@ def test_calibration_compares_probability_and_accuracy() -> None:
         (only,) = calibration_bins(walks)
         assert (only.share, only.accuracy) == pytest.approx((1.0, 0.75), abs=1e-9)
         assert only.probability == pytest.approx(sure, abs=1e-6)
-        assert measured_walks(walks).expected_calibration_error == pytest.approx(sure - 0.75, abs=1e-6)
+        found = measured_walks(walks)
+        assert found.expected_calibration_error == pytest.approx(sure - 0.75, abs=1e-6)
+        # what is claimed too surely conveys less, down to nothing
+        assert found.bits == pytest.approx(1 + 0.75 * math.log2(sure) + 0.25 * math.log2(1 - sure), abs=1e-6)
 
 
 @pytest.fixture

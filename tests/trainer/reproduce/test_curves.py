@@ -138,7 +138,15 @@ def test_readouts_of_the_shipped_patterns_stand_beside_frames(asked, tmp_path, m
     monkeypatch.setattr(readouts, "PHOTONS", (3.0, 1e4))
     page, _ = asked
     made = readouts.information_page(page)
-    frames, _, words, more = made.rows
+    by_way = {way: [row for row in made.rows if row["way"] == way] for way in readouts.WAYS}
+    (words, more), (walks,) = by_way[readouts.WAYS[1]], by_way[readouts.WAYS[2]]
+    frames, *_, same_light = sorted(
+        by_way[readouts.WAYS[0]],
+        key=lambda row: (row["photons"] != 3.0, row["illumination"] == pytest.approx(walks["illumination"])),
+    )
+    assert same_light["illumination"] == pytest.approx(walks["illumination"])
+    assert any(row["photons"] == walks["photons"] for row in by_way[readouts.WAYS[0]])
+    assert walks["bits_per_photon"] == pytest.approx(walks["bits"] / walks["photons"])
     assert words["bits"] < np.log2(10)
     assert words["photons"] == frames["photons"] == 3.0
     assert words["ahead"] == pytest.approx(words["value"] - frames["value"])
