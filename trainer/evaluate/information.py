@@ -46,7 +46,7 @@ class Conveyed:
     bits_per_illumination_se: float | None = None
 
 
-def conveyed(surprise: F64, labels: I64, photons: F64, illumination: F64 | float) -> dict[str, float | None]:
+def conveyed(surprise: F64, labels: I64, photons: F64, illumination: F64 | float) -> dict[str, Any]:
     """Return the fields of `Conveyed` from the mean -log2 q(label) of each object, its photons and its illumination, all (n,).
 
     H(label) - E[-log2 q(label)], a lower bound of I(label; readings) whatever the posterior q. These objects chose nothing in q: their
@@ -54,9 +54,10 @@ def conveyed(surprise: F64, labels: I64, photons: F64, illumination: F64 | float
     """
     n = len(labels)
     gain = -np.log2((np.bincount(labels) / n)[labels]) - surprise
-    found: dict[str, float | None] = {}
-    for name, light in {"bits": 1.0, "bits_per_photon": photons, "bits_per_illumination": illumination}.items():
-        total = float(np.broadcast_to(light, n).sum())
+    found: dict[str, Any] = {}
+    lights = {"bits": np.ones(n), "bits_per_photon": photons, "bits_per_illumination": np.broadcast_to(illumination, n)}
+    for name, light in lights.items():
+        total = float(light.sum())
         if total:
             found[name] = ratio = float(gain.sum()) / total
             # the ratio's error by its derivative

@@ -321,7 +321,8 @@ def beside_direct(name: str, figures: Row, dark: float, direct: Rows) -> Row:
 def bound_page(asked: Asked) -> Made:
     """Return automata on all 1024 strings, each with a camera at its photons and at its illumination, beside bounds of any scheme."""
     bars, labels = task_barcode.all_strings()
-    objects, rows = Objects((bars * np.uint8(255))[:, None, :], labels), []
+    objects = Objects((bars * np.uint8(255))[:, None, :], labels)
+    rows: Rows = []
     for point in points(asked.name):
 
         def figures(point: Point = point) -> Row:
