@@ -20,6 +20,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import AutomatonOptions, check_optics
 from pans.trainer.tasks.registry import Task
 
+from .finish import bit_grid
 from .machine import Aim, Spent
 from .tune import SENT, Price, Prices
 
@@ -34,6 +35,9 @@ PRICE_POWER = 1.6  # how the price falls with the budget
 GROWN_PRICE = 0.7  # of the last level grown, over the price of the budget: tuning saves light
 DEFAULT_PHOTONS = 10.0
 GREY_EPOCHS = 3
+# over the steps of the brightness: by which part of a cap the doses of walks to one state differ (8 and 12 were measured); and what is
+# allowed of the dose that leaves 1/e, as of `pans evaluate`
+ROUNDED, FADES_WITHIN = 12.0, 1e-3
 # by task, where they helped on held-back objects (docs/how-to/automaton.md)
 COPIES_OF = {"mnist": 20}
 SOFT_OF = {"fashion-mnist": 0.5}
@@ -197,6 +201,15 @@ def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None
             )
         if options.optics is not None:
             raise UsageError("--bleach: of an automaton under perfect optics", remedy="leave one of them out")
+        rounding = (
+            ROUNDED / bit_grid(1.0, profile).steps * options.dose_cap / fades_of(options, math.prod(task.image_shape))
+        )
+        if rounding > FADES_WITHIN:
+            raise PlanError(
+                f"--bleach: by the steps of {profile.name} doses of walks to one state would differ by about {rounding:.1%} of that which "
+                f"leaves 1/e, allowed {FADES_WITHIN:.1%}",
+                remedy="a smaller --dose-cap, or a profile with finer steps (projector.dwell_steps, or levels)",
+            )
     if options.dose_cap is None:
         return
     if options.illumination is not None:

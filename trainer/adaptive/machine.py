@@ -330,8 +330,8 @@ class Sight:
 class Step:
     """One level of a pass: probability of the states, light by rows, chances of all outcomes but the last, and how fast these fall.
 
-    `whole` is the light of a state, all its channels together, and `sent` (rows, 1) what each row of pixels sends before anything
-    bleaches. `left` (states, 1) is what bleaching leaves of it.
+    `whole` is the light of a state, all its channels together, and `sent` (rows, 1) what each row of pixels sends. `left` (states, 1) is
+    what bleaching leaves of it.
     """
 
     alpha: Tensor

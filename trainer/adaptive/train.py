@@ -359,7 +359,7 @@ class _Run:
         masses, order = torch.cat(self._masses()), lights.argsort()
         below = masses[order].cumsum(0) / masses.sum()
         top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
-        self._set_top(top * HEADROOM if self.cap < math.inf else top)
+        self._set_top(top if self.cap == math.inf else HEADROOM * top)
 
     def _set_top(self, top: float) -> None:
         set_top(self.machine, min(self._highest_top(), max(top_limits(self.profile)[0], top)), self.profile)
@@ -382,16 +382,16 @@ class _Run:
     def finish(self) -> TrainedAutomaton:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
-        if self.prices.all:  # first without steps: an exposure is no longer than the brightest state then needs
+        grid = None
+        if self.prices.all and not self.options.grey:  # first without steps, see below
             meet_budget(self.machine, self.prices, None, self.sight, self._drawn())
         with torch.no_grad():
             hold_cap(self.machine, self.cap, brighten=not self.prices.all)
-        grid = None
-        if not self.options.grey:
+        if not self.options.grey:  # an exposure is no longer than the brightest state then needs
             self._set_top(max(float(level.light.brightness().max()) for level in self.machine.levels))  # type: ignore[union-attr]
             grid = bit_grid(self.machine.levels[0].light.top, self.profile)
-            if self.cap == math.inf:
-                meet_budget(self.machine, self.prices, grid, self.sight, self._drawn())
+        if self.cap == math.inf:
+            meet_budget(self.machine, self.prices, grid, self.sight, self._drawn())
         if grid is not None:
             to_grid(self.machine, grid)
         sight = self.sight()

@@ -412,6 +412,7 @@ def _measured(
     n = len(right)
     photons, illumination = shots * light.photoelectrons.sum(axis=1), light.illumination * shots
     expected = shots * float(light.probability.sum()) / n
+    known: dict[str, Any] = conveyed(surprise, labels, photons, illumination)
     return Measured(
         accuracy_mean=float(right.mean()),
         accuracy_std=spread,
@@ -422,5 +423,5 @@ def _measured(
         objects=n,
         trials=trials,
         shots=shots,
-        **conveyed(surprise, labels, photons, illumination),
+        **known,
     )

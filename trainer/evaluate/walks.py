@@ -43,7 +43,7 @@ _LIGHT_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
 OF_OBJECTS = ("right", "decided", "clicks", "photons", "illumination", "exposures", "surprise", "labels")
-ONE_DOSE = 0.01  # of the dose that leaves 1/e: by so much the doses of walks to one state may differ, by steps of the dwell time
+ONE_DOSE = 1e-3  # of the dose that leaves 1/e: by so much the doses of walks to one state may differ, by steps of the dwell time
 BLEACHED_AT_ONCE = 512  # objects, whose pixels stand in memory
 
 
