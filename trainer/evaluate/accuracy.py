@@ -412,7 +412,6 @@ def _measured(
     n = len(right)
     photons, illumination = shots * light.photoelectrons.sum(axis=1), light.illumination * shots
     expected = shots * float(light.probability.sum()) / n
-    known: dict[str, Any] = conveyed(surprise, labels, photons, illumination)
     return Measured(
         accuracy_mean=float(right.mean()),
         accuracy_std=spread,
@@ -423,5 +422,5 @@ def _measured(
         objects=n,
         trials=trials,
         shots=shots,
-        **known,
+        **conveyed(surprise, labels, photons, illumination),
     )
