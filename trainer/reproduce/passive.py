@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pans.runtime.bundle.model import load_bundle
 from pans.runtime.bundle.optics import incident_field
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.outputs import replace_file
@@ -29,7 +28,6 @@ from pans.trainer.baselines.bayes import bayes
 from pans.trainer.baselines.common import measure as measure_frames
 from pans.trainer.baselines.common import run_trials
 from pans.trainer.evaluate.accuracy import row_of
-from pans.trainer.export.automaton import measure_walks
 from pans.trainer.export.writer import analyser_of, export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination
@@ -48,7 +46,6 @@ from . import plots
 from .active import PROFILE
 from .page import (
     FIRST_OBJECTS,
-    UNITS,
     Asked,
     Draw,
     Made,
@@ -62,7 +59,6 @@ from .page import (
     sampling_error,
 )
 from .printed import PASSIVE, PassiveRow, recipe, recipe_facts
-from .ways import Point, points, trained_automaton
 
 TRIALS = 5
 SAMPLE_SEED = 2  # of pictures that are drawn: not the clicks that the table is made of
@@ -313,40 +309,6 @@ def beside_direct(name: str, figures: Row, dark: float, direct: Rows) -> Row:
             found |= against(figures["value"], as_many["value"], PRINTED, prefix="clicks_")
         return found
     return beside_curve(figures, direct, "photons", "direct_")
-
-
-# ---- what no scheme is above ----
-
-
-def bound_page(asked: Asked) -> Made:
-    """Return automata on all 1024 strings, each with a camera at its photons and at its illumination, beside bounds of any scheme."""
-    bars, labels = task_barcode.all_strings()
-    objects = Objects((bars * np.uint8(255))[:, None, :], labels)
-    rows: Rows = []
-    for point in points(asked.name):
-
-        def figures(point: Point = point) -> Row:
-            bundle = load_bundle(trained_automaton(asked, point, 0))[0]
-            found = row_of(measure_walks(bundle, objects, load_profile(PROFILE)))
-            return found | {
-                "value": 100 * found["accuracy_mean"],
-                "clicks": found["clicks_mean"],
-                "photons": found["photons_mean"],
-            }
-
-        found = asked.kept(f"{point.stem}-all", point.made_with(0), figures)
-        if found is not None:
-            del found["made_with"]
-            cameras = strings.at_photons(found["photons"]), strings.imaged(found["illumination"] / task_barcode.N_BARS)
-            ways = point.way, "camera, at its photons", "camera, at its illumination"
-            rows += [
-                {"table": "bound", "way": way, "level": point.level} | one for way, one in zip(ways, (found, *cameras))
-            ]
-    for light, unit in UNITS.items() if rows else ():
-        for row, most in zip(rows, strings.bounds([row[light] for row in rows], light)):
-            row |= {f"{light}_{key}": value for key, value in most.items()}
-            row[f"bits_per_{unit}"] = row["bits"] / row[light]
-    return Made(rows)
 
 
 # ---- digits behind a fibre as a field ----

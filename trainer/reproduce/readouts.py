@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 from pans.runtime.instrument.profile import load_profile
+from pans.trainer.baselines import strings
 from pans.trainer.baselines.bayes import log_joint
 from pans.trainer.baselines.common import Measurement, detect, measure
-from pans.trainer.evaluate.accuracy import light_of
+from pans.trainer.evaluate.accuracy import light_of, row_of
 from pans.trainer.evaluate.information import (
     fisher,
     fisher_of_frames,
@@ -29,13 +30,15 @@ from pans.trainer.evaluate.information import (
 )
 from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.export.automaton import measure_walks
-from pans.trainer.tasks.registry import Task, load_task
+from pans.trainer.tasks import barcode
+from pans.trainer.tasks.registry import Objects, Task, load_task
 
 from . import plots
 from .active import PROFILE
 from .curves import CLEAN, EXACT, curve_rows
 from .page import FIRST_OBJECTS, UNITS, Asked, Draw, Made, Row, Rows, against, sampling_error
 from .trained import neighbours_agree
+from .ways import Point, points, trained_automaton
 
 PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5)  # of the page fig-2c
 POSTERIOR_MAX = 1e3  # beyond it the mixture of the training objects is a nearest neighbour and knows nothing new
@@ -46,7 +49,7 @@ MAP_PHOTONS = (10.0, 30.0)  # of the page fig-2f
 SHOWN = {1e6: 1, 1e3: 3, 1e2: 3, 1e1: 3}  # photons: frames drawn of each object, on the page direct-frames
 MAPPED = (1e6, 1e2, 1e1)
 MAPPED_FRAMES = 600
-WAYS = ("camera frames", "clicks of ten patterns", "clicks of an automaton")
+WAYS = ("frames", "ten patterns", "automaton")
 
 F64 = NDArray[np.float64]
 
@@ -134,6 +137,40 @@ def _information_of_words(task: Task) -> Rows:
         right = 100 * known.heldout_bayes_accuracy
         rows.append(row | {"bits": known.heldout_bits, "value": right, "clicks": known.clicks})
     return rows
+
+
+# ---- what no scheme is above ----
+
+
+def bound_page(asked: Asked) -> Made:
+    """Return automata on all 1024 strings, each with a camera at its photons and at its illumination, beside bounds of any scheme."""
+    bars, labels = barcode.all_strings()
+    objects = Objects((bars * np.uint8(255))[:, None, :], labels)
+    rows: Rows = []
+    for point in points(asked.name):
+
+        def figures(point: Point = point) -> Row:
+            bundle = load_bundle(trained_automaton(asked, point, 0))[0]
+            found = row_of(measure_walks(bundle, objects, load_profile(PROFILE)))
+            return found | {
+                "value": 100 * found["accuracy_mean"],
+                "clicks": found["clicks_mean"],
+                "photons": found["photons_mean"],
+            }
+
+        found = asked.kept(f"{point.stem}-all", point.made_with(0), figures)
+        if found is not None:
+            del found["made_with"]
+            cameras = strings.at_photons(found["photons"]), strings.imaged(found["illumination"] / barcode.N_BARS)
+            ways = point.way, "camera, photons", "camera, illumination"
+            rows += [
+                {"table": "bound", "way": way, "level": point.level} | one for way, one in zip(ways, (found, *cameras))
+            ]
+    for light, unit in UNITS.items() if rows else ():
+        for row, most in zip(rows, strings.bounds([row[light] for row in rows], light)):
+            row |= {f"{light}_{key}": value for key, value in most.items()}
+            row[f"bits_per_{unit}"] = row["bits"] / row[light]
+    return Made(rows)
 
 
 # ---- maps of single readouts (Fig. 2F) ----

@@ -132,6 +132,23 @@ def test_frames_are_drawn_mapped_and_judged(task, asked, tmp_path, monkeypatch):
     write(tmp_path, "direct-frames", made)
 
 
+def test_automata_stand_beside_cameras_of_their_light_and_what_no_scheme_is_above(asked, tmp_path, monkeypatch):
+    options = (("illumination", 8.0), ("exposures", 4), ("states", 4), ("epochs", 1), ("tune_epochs", 0))
+    monkeypatch.setattr(readouts, "points", lambda _: [ways.Point("barcode", "automaton", 8.0, "automaton", options)])
+    monkeypatch.setattr(
+        readouts.strings, "bounds", lambda levels, light: [{"value": level, "bits": 0.5} for level in levels]
+    )
+    made = readouts.bound_page(dataclasses.replace(asked[0], name="barcode-bound"))
+    ours, as_bright, as_lit = made.rows
+    assert ours["objects"] == 1024
+    assert as_bright["photons"] == pytest.approx(ours["photons"])
+    assert as_lit["illumination"] == pytest.approx(ours["illumination"])
+    assert (ours["photons_value"], ours["illumination_value"]) == (ours["photons"], ours["illumination"])
+    assert ours["bits_per_illumination"] == pytest.approx(ours["bits"] / ours["illumination"])
+    write(tmp_path, "barcode-bound", made)
+    assert "|8|" in (tmp_path / "barcode.md").read_text()
+
+
 def test_readouts_of_the_shipped_patterns_stand_beside_frames(asked, tmp_path, monkeypatch):
     task = columns_task(500, 200, 10, 28, "fashion-mnist")
     monkeypatch.setattr(readouts, "load_task", lambda *_: task)

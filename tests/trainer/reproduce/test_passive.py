@@ -15,7 +15,6 @@ from pans.trainer.options import Options
 from pans.trainer.reproduce import passive
 from pans.trainer.reproduce.page import Asked, page_of, write_page
 from pans.trainer.reproduce.printed import PASSIVE, recipe
-from pans.trainer.reproduce.ways import Point
 from pans.trainer.tasks import mmf as task_mmf
 from pans.trainer.tasks.registry import Objects, Task, draw_task
 from pans.trainer.train import exact_search
@@ -44,23 +43,6 @@ def few_cells(monkeypatch):
     yield
     passive.load.cache_clear()
     torch.set_num_threads(threads)
-
-
-def test_automata_stand_beside_cameras_of_their_light_and_what_no_scheme_is_above(tmp_path, monkeypatch):
-    options = (("illumination", 8.0), ("exposures", 4), ("states", 4), ("epochs", 1), ("tune_epochs", 0))
-    monkeypatch.setattr(passive, "points", lambda _: [Point("barcode", "automaton", 8.0, "automaton", options)])
-    monkeypatch.setattr(
-        passive.strings, "bounds", lambda levels, light: [{"value": level, "bits": 0.5} for level in levels]
-    )
-    made = passive.bound_page(quiet("barcode-bound", tmp_path))
-    ours, as_bright, as_lit = made.rows
-    assert ours["objects"] == 1024
-    assert as_bright["photons"] == pytest.approx(ours["photons"])
-    assert as_lit["illumination"] == pytest.approx(ours["illumination"])
-    assert (ours["photons_value"], ours["illumination_value"]) == (ours["photons"], ours["illumination"])
-    assert ours["bits_per_illumination"] == pytest.approx(ours["bits"] / ours["illumination"])
-    write_page(tmp_path, page_of("barcode-bound"), made)
-    assert "|8|" in (tmp_path / "barcode.md").read_text()
 
 
 def test_a_barcode_cell_is_judged_on_all_strings_and_kept(tmp_path, monkeypatch):
