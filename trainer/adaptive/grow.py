@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pans.trainer.options import AutomatonOptions
 
-from .machine import COUNT_FLOOR, Aim, Grey, Level, Machine, Sight, Spent, brought, children, sent_by
+from .machine import COUNT_FLOOR, Aim, Grey, Level, Machine, Sight, Spent, brought, children
 from .objects import Block
 from .outcomes import by_row, by_state, channels_of, clicks_of, mean_reading, readings, slope_of
 
@@ -150,7 +150,7 @@ class Growth:
             share = 0.05 if epoch == 0 else 0.03
             for index in torch.randperm(len(self.blocks), generator=self.random).tolist():
                 alpha, block = self.alphas[index], self.blocks[index]
-                shown = brought(light, self.sight, block.grey)
+                shown, sent = brought(light, self.sight, block.grey)
                 chances, falls = readings(shown, self.sight.law)
                 arrived = [(alpha * chance) @ block.one_hot.T for chance in chances]
                 slope = slope_of(falls, _gains(parts, whole, block), self.sight.law)
@@ -160,7 +160,7 @@ class Growth:
                 mask_slope += cost
                 light_slope = None
                 if scale is not None:
-                    light_slope = slope.mul_(shown).sum(dim=1, keepdim=True) + cost * sent_by(light)
+                    light_slope = slope.mul_(shown).sum(dim=1, keepdim=True) + cost * sent
                     mask_slope *= scale
                 light.set_gradients(mask_slope, light_slope)
                 optimiser.param_groups[0]["lr"] = RATE * (1 - done / steps) + 1e-4
@@ -175,7 +175,7 @@ class Growth:
         """Class counts of all outcomes but the last, each (states, classes)."""
         counted = []
         for alpha, block in zip(self.alphas, self.blocks):
-            chances, _ = readings(brought(light, self.sight, block.grey), self.sight.law)
+            chances, _ = readings(brought(light, self.sight, block.grey)[0], self.sight.law)
             counted.append([(alpha * chance) @ block.one_hot.T for chance in chances])
         return [sum_of(parts) for parts in zip(*counted)]
 
@@ -194,11 +194,10 @@ class Growth:
     def _carry(self, light: Grey, successors: Tensor, n_nodes: int) -> None:
         """Carry the probabilities of all objects over one level, and add up its light and clicks."""
         sums = torch.zeros(3, dtype=torch.float64)
-        sent = by_state(sent_by(light), self.channels)
         for index, block in enumerate(self.blocks):
-            alpha, shown = self.alphas[index], brought(light, self.sight, block.grey)
+            alpha, (shown, sent) = self.alphas[index], brought(light, self.sight, block.grey)
             chances, _ = readings(shown, self.sight.law)
-            each = mean_reading(chances, self.clicks), by_state(shown, self.channels), sent
+            each = mean_reading(chances, self.clicks), by_state(shown, self.channels), by_state(sent, self.channels)
             sums += torch.stack([(alpha * one).sum() for one in each]).double()
             self.alphas[index] = children(alpha, chances, successors, n_nodes)
         n = sum(len(block) for block in self.blocks)
