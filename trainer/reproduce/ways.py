@@ -26,7 +26,7 @@ from .page import FIRST_OBJECTS, Asked, Row, Rows, check_cached_bundle, flat, re
 
 WAYS: list[Row] = read_toml("ways.toml")["way"]
 SENT = " sent"  # of a level in ways.toml: light sent, not photons detected
-BY_SENT = ", by light sent"  # of the way's name in a row
+BY_SENT = ", sent"  # of the way's name in a row
 
 
 @dataclass(frozen=True, slots=True)
