@@ -90,14 +90,15 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
             setattr(args, name, 0)
     if any(getattr(args, name, None) is not None for name in ("photons", "clicks", "alpha", "illumination")):
         return []
-    if args.encoder not in (None, "active", AUTOMATON):
+    words = []
+    # fixed patterns would have to meet both budgets, an automaton need not use both up
+    if args.encoder not in (None, "active"):
         args.photons = recipe.photons
-        return [f"{recipe.photons:g} photons per decision: a first guess (--photons N for another budget)"]
-    args.illumination = recipe.illumination
-    return [
-        f"an illumination of {recipe.illumination:g} per decision, which brings a camera {recipe.photons:g} photons: a first guess "
-        "(--illumination N for another budget)"
-    ]
+        words.append(f"{recipe.photons:g} photons")
+    if args.encoder in (None, "active", AUTOMATON):
+        args.illumination = recipe.illumination
+        words.append(f"an illumination of {recipe.illumination:g}, at which a camera detects {recipe.photons:g}")
+    return [f"at most {' and '.join(words)}: a first guess (--photons, --illumination for another budget)"]
 
 
 def finish(

@@ -37,7 +37,7 @@ def test_a_folder_needs_no_option_and_the_next_commands_work(letters, capsys):
     said = capsys.readouterr()
     assert "400 training images from 120" in said.err
     assert "an automaton" in said.err
-    assert "which brings a camera 10 photons" in said.err
+    assert "at which a camera detects 10" in said.err
     assert "class 'H' has 24 training images" in said.err
     assert "direct imaging" in said.out
     following = [shlex.split(line) for line in said.out.partition("next:")[2].split("\n") if line.strip()]
@@ -49,7 +49,7 @@ def test_a_folder_needs_no_option_and_the_next_commands_work(letters, capsys):
     assert bundle.provenance["training_objects"] == 3 * 110 + 120
     assert bundle.provenance["variation"]
     options, camera = bundle.provenance["options"], load_task(letters)
-    assert options["photons"] is None
+    assert options["photons"] == 10.0
     assert options["illumination"] * camera.train.images.mean() / 255 == pytest.approx(10, rel=0.05)
     assert bundle.expected["objects"] == 30
 
