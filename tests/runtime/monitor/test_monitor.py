@@ -185,8 +185,9 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
 def test_a_walk_is_told_pattern_by_pattern(watched: Watched, tmp_path: Path) -> None:
     assert main(["demo", "--pace", "fast", "--seconds", "2", "--out", str(tmp_path / "run")]) == 0
     automaton = watched.run.plan.automaton
-    assert len(watched.pictures) > 3
-    for one in watched.pictures:
+    decided = [one for one in watched.pictures if "word" in one]  # the first may come before the first word
+    assert len(decided) >= max(3, len(watched.pictures) - 1)
+    for one in decided:
         word, node = one["word"], 0
         for pattern, click in zip(word["patterns"], word["clicks"]):
             assert automaton.pattern[node] == pattern
