@@ -15,8 +15,8 @@ Feature-specific imaging: masks trained with a network on photon counts, through
   masks are intensities (positive and negative parts of a component are masks of their own, learnt as squares), the budget is shared freely
   among the masks and held exactly on average, and the gradient passes a Poisson number as lambda + sqrt(lambda) x noise does.
 - `pca`: the same with the masks frozen, conventional feature-specific imaging.
-- `stopping`: as `deep`, but the network sees the counts of those masks that were displayed, and a decision falls as soon as it is sure
-  (stopping.py). Every training object draws how many masks it is shown, so that those that tell most come first.
+- `stopping`: as `deep`, but all masks are displayed in turn, dim, again and again. The network sees the counts so far and how much light
+  there was, and a decision falls as soon as little doubt is left (stopping.py).
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -35,16 +34,16 @@ from torch import Tensor, nn
 from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Task
 
-from .common import Decide, Light, Measurement, Report, Trials, detect, measure, named, silent
+from .common import Decide, Light, Measurement, Report, Trials, measure, named, silent
 from .networks import Inputs, decider, feature_net, fit, seeded, size
-from .stopping import Choice, Course, best_rule, decided, empty, held_back
+from .stopping import Choice, held_back, of_network, stopping
 
 EPOCHS = 15
 ACTIVATION_BITS = 4
 PATTERN_BITS = 5
 PATTERN_RATE = 1e-2
 MASK_RATE = 1e-2
-SPARES = (1.5, 2.5)  # light of all masks that stop, times that of the mean decision
+SPREAD = 6.0  # masks that stop are trained for exposures up to so many times less and more than the mean
 START_LIGHT = 0.03  # of a mask's largest value, on all its pixels: the square of 0 has no gradient
 _LEAST = 0.05  # photoelectrons, below which the gradient of the noise's spread is cut: it grows as 1 / lambda
 
@@ -161,7 +160,7 @@ class FeatureSpecific(nn.Module):
         self.weight = nn.Parameter(start, requires_grad=not frozen)
         self.register_buffer("mean_image", torch.from_numpy(mean_image))
         self.stops = options.method == "stopping"
-        self.head = feature_net(len(masks) * (2 if self.stops else 1), n_classes)
+        self.head = feature_net(2 * len(masks) + 1 if self.stops else len(masks), n_classes)
         self.options, self.level = options, level
 
     def masks(self) -> Tensor:
@@ -172,17 +171,16 @@ class FeatureSpecific(nn.Module):
 
     def forward(self, transmission: Tensor) -> Tensor:
         """Return scores (n, classes) of fresh counts of objects (n, pixels); random numbers are those of torch's own generator."""
-        expected = transmission @ self.masks().T + self.options.dark
-        counts = noisy(expected, self.options.detector)
+        light = transmission @ self.masks().T
         if self.stops:
-            return self.after(counts, torch.randint(1, counts.shape[1] + 1, (len(counts), 1)))
-        scores: Tensor = self.head(counts)
+            exposure = SPREAD ** (2 * torch.rand(len(light), 1) - 1)
+            return self.after(noisy(light * exposure), exposure)
+        scores: Tensor = self.head(noisy(light + self.options.dark, self.options.detector))
         return scores
 
-    def after(self, counts: Tensor, displayed: Tensor) -> Tensor:
-        """Return scores (n, classes) of the counts of the first masks, `displayed` (n, 1) or () of them."""
-        known = (torch.arange(counts.shape[1]) < displayed).to(counts.dtype).expand_as(counts)
-        scores: Tensor = self.head(torch.cat([counts * known, known], dim=1))
+    def after(self, counts: Tensor, exposure: Tensor) -> Tensor:
+        """Return scores (n, classes) of counts after `exposure` (n, 1), 1 at the level that the masks are trained for."""
+        scores: Tensor = self.head(torch.cat([counts, counts / exposure.sqrt(), exposure.log()], dim=1))
         return scores
 
 
@@ -232,43 +230,17 @@ def masks_measured(model: FeatureSpecific, task: Task, brightness: str) -> tuple
 def masks_that_stop(
     task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report = silent
 ) -> Iterator[tuple[Light, Choice, Trials]]:
-    """Yield for every level that can be reached what masks trained for it decide on the test objects, as `stopping.stopping` does.
-
-    All masks together have more light than the level (`SPARES`); how much more is chosen with the rule.
-    """
+    """Yield for every level that can be reached what masks trained for it decide on the test objects, as `stopping.stopping` does."""
     kept = len(task.train) - held_back(len(task.train))
-    fitted = replace(task, train=task.train.first(kept))
     for level in levels:
-        tried = []
-        for spare in SPARES:
-            most = Light(level.of, spare * level.amount)
-            model = train_masks(fitted, options, most, report)
-            measurement, _ = masks_measured(model, task, options.brightness)
-            follow = partial(_mask_by_mask, model, measurement, most.photons(measurement))
-            course, photons, sent = follow(measurement.train[kept:], np.random.default_rng([options.seed, 2]))
-            spent = photons if level.of == "photons" else sent
-            found = best_rule(course, spent, level.amount, measurement.train_labels[kept:])
-            if found is not None:
-                tried.append((found, spare, measurement, follow))
-        if tried:
-            (_, rule), spare, measurement, follow = max(tried, key=lambda one: one[0][0])
-            rng = np.random.default_rng([options.seed, 1])
-            shown = [follow(measurement.test, rng) for _ in range(options.trials or 1)]
-            courses, detected, _ = zip(*shown)
-            done, confidence = decided(measurement, courses, detected, shown[0][2], rule)
-            yield level, Choice(rule, confidence, {"spare": spare}), done
+        model = train_masks(replace(task, train=task.train.first(kept)), options, level, report)
+        measurement, _ = masks_measured(model, task, options.brightness)
+        middle = level.photons(measurement)
+        network = of_network(partial(_log_chances, model, middle), options.features, middle / SPREAD, middle * SPREAD)
+        yield from stopping(measurement, [level], network, seed=options.seed, trials=options.trials or 1, report=report)
 
 
-def _mask_by_mask(
-    model: FeatureSpecific, measurement: Measurement, most: float, rows: NDArray[Any], rng: np.random.Generator
-) -> tuple[Course, F64, F64]:
-    """What the network says of `rows` after each mask, photons detected and light sent until then, (objects, masks)."""
-    counts = detect(measurement.photoelectrons(rows, most), "counting", rng)
-    light = measurement.full.cumsum(dtype=np.float64)
-    course = empty(len(rows), light * (measurement.illumination(most) / light[-1]), len(light))
+def _log_chances(model: FeatureSpecific, middle: float, counts: NDArray[np.float32], exposure: float) -> F64:
     with torch.no_grad():
-        for k in range(len(light)):
-            scores = model.after(torch.from_numpy(counts), torch.tensor(k + 1))
-            course.tell(np.arange(len(rows)), k, torch.softmax(scores.double(), dim=1).numpy())
-    sent = measurement.sent(rows, most)[:, None] * (light / light[-1])
-    return course, counts.cumsum(axis=1, dtype=np.float64), sent
+        scores = model.after(torch.from_numpy(counts), torch.full((len(counts), 1), exposure / middle))
+        return torch.log_softmax(scores.double(), dim=1).numpy()

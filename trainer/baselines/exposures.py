@@ -6,6 +6,7 @@ Readouts are float32 (n, pixels + 1): the counts of a frame, then its exposure i
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from pans.trainer.tasks.changes import SIDE_MIN_PX, distorted
 
 from .common import F32, F64, Measurement, Report, named, silent
 from .networks import CHUNK, FRAME_SIDE, Inputs, fit, seeded
+from .stopping import Source, held_back, of_network
 
 SHORTEST, LONGEST = 3.0, 600.0  # exposures that it is trained for, uniform in the logarithm
 EPOCHS = {"fashion-mnist": 30}  # chosen on held-back training images
@@ -109,3 +111,12 @@ def log_chances(net: ExposureNet, counts: F32, exposure: float) -> F64:
             for part in torch.from_numpy(counts).split(CHUNK)
         ]
     return torch.cat(parts).numpy().astype(np.float64)
+
+
+def of_exposure_net(
+    measurement: Measurement, name: str, *, seed: int, epochs: int | None = None, report: Report = silent
+) -> Source:
+    """Return the source of doubt that such a network is, trained on all but the objects held back."""
+    n, n_pixels = measurement.train.shape
+    net = exposure_net(measurement, n - held_back(n), name, seed=seed, epochs=epochs, report=report)
+    return of_network(partial(log_chances, net), n_pixels, SHORTEST)

@@ -90,6 +90,7 @@ Level = tuple[Light, int, Trials, dict[str, Any]]  # asked for, readouts per obj
 
 def _stopping(task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report) -> Iterator[Level]:
     from .end_to_end import masks_that_stop
+    from .exposures import of_exposure_net
     from .stopping import stopping
 
     if options.detector != "counting" or options.dark:
@@ -97,12 +98,10 @@ def _stopping(task: Task, options: BaselineOptions, levels: Iterable[Light], rep
     if options.paradigm == "fsi":
         n_readouts, found = options.features, masks_that_stop(task, options, levels, report)
     else:
-        measurement = measure(task, None, options.brightness)
-        shared: dict[str, Any] = {"seed": options.seed, "epochs": options.epochs, "trials": options.trials or 1}
-        n_readouts, found = (
-            measurement.train.shape[1],
-            stopping(measurement, levels, task.name, report=report, **shared),
-        )
+        measurement, seed = measure(task, None, options.brightness), options.seed
+        network = of_exposure_net(measurement, task.name, seed=seed, epochs=options.epochs, report=report)
+        n_readouts = measurement.train.shape[1]
+        found = stopping(measurement, levels, network, seed=seed, trials=options.trials or 1, report=report)
     for level, choice, done in found:
         yield level, n_readouts, done, choice.facts | {"confidence": choice.confidence} | asdict(choice.rule)
 

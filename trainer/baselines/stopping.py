@@ -66,11 +66,9 @@ def arrivals(measurement: Measurement, rows: NDArray[np.generic], rng: np.random
 class Course:
     """What a source says at every reading, (objects, readings): the likeliest label and `doubt`, 1 - its probability.
 
-    Doubt is inf before the source says anything; what is as sure as `SURE` stays so. `exposures` (readings,) grow; every rule stops at
-    the reading `last`.
+    Doubt is inf before the source says anything; what is as sure as `SURE` stays so. Every rule stops at the reading `last`.
     """
 
-    exposures: F64
     labels: NDArray[np.int16]
     doubt: F32
     last: int
@@ -87,23 +85,25 @@ class Course:
 Source = Callable[[Arrivals, Report], Course]
 
 
-def empty(n: int, exposures: F64, readings: int) -> Course:
-    """Return a course of `n` objects of which nothing is known yet; the source knows the first `readings` alone."""
-    shape = n, len(exposures)
-    return Course(exposures, np.zeros(shape, np.int16), np.full(shape, np.inf, np.float32), readings - 1)
+def _empty(n: int, latest: float) -> Course:
+    """A course of `n` objects of which nothing is known yet, to the last reading until the exposure `latest`."""
+    shape, last = (n, len(GRID)), int(np.searchsorted(GRID, latest, side="right")) - 1
+    return Course(np.zeros(shape, np.int16), np.full(shape, np.inf, np.float32), last)
 
 
-def of_network(log_chances: Callable[[F32, float], F64], n_pixels: int, earliest: float) -> Source:
-    """Return the source that asks log P(class | counts, exposure) from the exposure `earliest` on."""
+def of_network(
+    log_chances: Callable[[F32, float], F64], n_pixels: int, earliest: float, latest: float = math.inf
+) -> Source:
+    """Return the source that asks log P(class | counts, exposure) from the exposure `earliest` to `latest`."""
 
     def follow(heard: Arrivals, report: Report) -> Course:
-        course = empty(len(heard.photons), GRID, len(GRID))
+        course = _empty(len(heard.photons), latest)
         for rows in blocks(len(heard.photons), n_pixels):
             size = len(course.labels[rows])
             counts, unsure = np.zeros((size, n_pixels), np.float32), np.ones(size, bool)
             for k, (pixels, who) in enumerate(heard.between(rows)):
                 np.add.at(counts, (who, pixels), 1)
-                if GRID[k] >= earliest and unsure.any():
+                if earliest <= GRID[k] <= latest and unsure.any():
                     place = np.arange(size)[unsure] + rows.start
                     course.tell(place, k, np.exp(log_chances(counts[unsure], GRID[k])))
                     unsure[unsure] = course.doubt[place, k] > SURE
@@ -126,7 +126,7 @@ def of_posterior(measurement: Measurement, floor: float, known: int) -> Source:
     waits = np.diff(GRID[GRID <= POSTERIOR_LONGEST], prepend=0.0).astype(np.float32)
 
     def follow(heard: Arrivals, report: Report) -> Course:
-        course, first = empty(len(heard.photons), GRID, len(waits)), 0
+        course, first = _empty(len(heard.photons), POSTERIOR_LONGEST), 0
         for i, photons in enumerate(heard.photons):
             log_joint, came = np.zeros(len(totals), np.float32), np.diff(photons, prepend=0)
             for k, wait in enumerate(waits):
@@ -166,7 +166,7 @@ class Rule:
     def stops(self, course: Course) -> I64:
         """Return the number of the reading at which each object is decided: the last where doubt remains."""
         with np.errstate(over="ignore"):
-            limit = np.maximum(SURE, self.doubt * (course.exposures / _MIDDLE) ** self.growth)
+            limit = np.maximum(SURE, self.doubt * (GRID / _MIDDLE) ** self.growth)
         sure = course.doubt <= limit
         sure[:, course.last :] = True
         return sure.argmax(axis=1)
@@ -216,24 +216,19 @@ def held_back(n: int) -> int:
 def stopping(
     measurement: Measurement,
     levels: Iterable[Light],
-    task: str,
+    network: Source,
     *,
     seed: int,
-    epochs: int | None = None,
     trials: int = 1,
     report: Report = silent,
 ) -> Iterator[tuple[Light, Choice, Trials]]:
     """Yield for every level that can be reached what was decided on the test objects, each `trials` times.
 
-    `task` is a name, by which the network is trained. Clicks, photons and illumination are those until the decision (every photon is a
-    click of its own).
+    `network` does not know the objects held back. Clicks, photons and illumination are those until the decision (every photon is a click
+    of its own).
     """
-    from .exposures import SHORTEST, exposure_net, log_chances
-
-    n, n_pixels = measurement.train.shape
+    n = len(measurement.train)
     known = n - held_back(n)
-    net = exposure_net(measurement, known, task, seed=seed, epochs=epochs, report=report)
-    network = of_network(lambda counts, exposure: log_chances(net, counts, exposure), n_pixels, SHORTEST)
     rows, wanted, rng = measurement.train[known:], measurement.train_labels[known:], np.random.default_rng([seed, 2])
     held = arrivals(measurement, rows, rng)
     share = measurement.photoelectrons(rows, 1.0).sum(axis=1, dtype=np.float64).mean()  # beside the test objects' mean

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def test_stopping_is_the_exact_sum_over_differences_of_two_counts() -> None:
 def test_a_rule_meets_its_level_from_below() -> None:
     rng = np.random.default_rng(2)
     doubt = np.exp(-GRID * rng.uniform(0.05, 0.5, (400, 1))).astype(np.float32)
-    course = Course(GRID, (doubt < 0.1).astype(np.int16), doubt, len(GRID) - 1)
+    course = Course((doubt < 0.1).astype(np.int16), doubt, len(GRID) - 1)
     spent = np.broadcast_to(GRID, doubt.shape)
     for level in (3.0, 10.0, 20.0):
         found = best_rule(course, spent, level, np.ones(400, np.int64))
@@ -154,7 +155,7 @@ def test_the_network_knows_what_the_truth_allows_and_is_calibrated() -> None:
         divergence = (np.exp(log_truth) * (log_truth - found)).sum(axis=1).mean()
         assert 0 <= divergence < 0.05  # of up to 1.1 nats
     heard = arrivals(measurement, measurement.test, rng)
-    course = of_network(lambda counts, exposure: log_chances(net, counts, exposure), 36, SHORTEST)(heard, silent)
+    course = of_network(partial(log_chances, net), 36, SHORTEST)(heard, silent)
     sent = measurement.sent(measurement.test, 1.0)[:, None] * GRID
     done, confidence = decided(measurement, [course], [heard.photons], sent, Rule(0.1, 0.0))
     found_right = done.measured()
