@@ -1,8 +1,9 @@
-"""Direct imaging that stops when it is sure: a frame is read again and again while it is exposed, until little doubt is left.
+"""Measurements that stop when they are sure: counts are read again and again while light is collected, until little doubt is left.
 
-Doubt has two sources: a network of all exposures (exposures.py) and the exact posterior over the training objects, which is better where
-photons are few. The source and its rule, from which doubt on it stops at which exposure, are chosen for each level of light on training
-objects that neither knew. SIMULATED: an ideal camera, without dark counts, whose frame can be read while it is exposed.
+The counts are those of a frame's pixels, or of masks that are displayed in turn, again and again. Doubt has two sources: a network that
+knows the exposure (exposures.py, end_to_end.py), and the exact posterior over the training objects. The source and its rule, from which
+doubt on it stops at which exposure, are chosen for each level of light on training objects that neither knew. SIMULATED: ideal detectors
+without dark counts, which can be read at any time.
 
 Exposures are in photons of the mean test object.
 """
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from .bayes import FLOORS
 from .common import F32, F64, I64, Light, Measurement, Report, Trials, blocks, silent
 
-GRID = np.geomspace(1.0, 600.0, 65)  # exposures at which the frame is read
+GRID = np.geomspace(1.0, 600.0, 65)  # exposures at which the counts are read
 POSTERIOR_LONGEST = 100.0  # exposure; later the posterior is no rival of the network
 SURE = 1e-5  # doubt at which every rule stops
 HELD_BACK = 5000  # last training objects, which choose source and rule
