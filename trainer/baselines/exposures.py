@@ -20,7 +20,7 @@ from .networks import CHUNK, FRAME_SIDE, Inputs, fit, seeded
 from .stopping import Source, held_back, of_network
 
 SHORTEST, LONGEST = 3.0, 600.0  # exposures that it is trained for, uniform in the logarithm
-EPOCHS = {"fashion-mnist": 30}  # chosen on held-back training images
+EPOCHS = {"fashion-mnist": 30}  # what minutes of one core allow; longer was not tried
 OTHER_EPOCHS = 12
 STRENGTHS = {"mnist": 1.0}  # of the distortions of training images
 OTHER_STRENGTH = 0.3
