@@ -200,7 +200,9 @@ def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None
                 remedy=f"--bleach {law.dose:g}:mixed --dose-cap D: every walk then sends the same light, exposure by exposure",
             )
         if options.optics is not None:
-            raise UsageError("--bleach: of an automaton under perfect optics", remedy="leave one of them out")
+            raise UsageError(
+                "--bleach: an automaton is trained for it on perfect optics only", remedy="leave out --optics"
+            )
         rounding = (
             ROUNDED / bit_grid(1.0, profile).steps * options.dose_cap / fades_of(options, math.prod(task.image_shape))
         )
@@ -214,13 +216,13 @@ def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None
         return
     if options.illumination is not None:
         raise UsageError(
-            "--dose-cap: every walk sends that light, --illumination adds nothing", remedy="leave one of them out"
+            "--dose-cap is the light that every walk sends: --illumination adds nothing", remedy="leave one of them out"
         )
     if options.channels > 1:
-        raise UsageError("--dose-cap: of one detector", remedy="leave out --channels")
+        raise UsageError("--dose-cap: allowed with one detector only", remedy="leave out --channels")
     if options.grey or (profile.projector.levels == 2 and profile.projector.dwell_steps == 1):
         raise UsageError(
-            "--dose-cap: states have one-bit patterns and a brightness of their own",
+            "--dose-cap: each state needs a one-bit pattern and a brightness of its own",
             remedy="leave out --grey, or choose a profile with levels or projector.dwell_steps",
         )
     exposures, states = with_defaults(options, profile)
