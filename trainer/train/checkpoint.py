@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,6 +64,11 @@ def _identity(options: DataclassInstance, data_sha256: str) -> dict[str, Any]:
     return plain | {"restarts": "1"} if "restarts" in plain else plain
 
 
+def _defaults(options: DataclassInstance) -> dict[str, str]:
+    """What a checkpoint means by options that its version did not have."""
+    return {field.name: str(field.default) for field in fields(options) if field.default is not MISSING}
+
+
 def write_checkpoint(path: Path, options: DataclassInstance, data_sha256: str, state: dict[str, Any]) -> None:
     """Write `state` (nested dicts and lists of tensors and plain values) to `path`, whole or not at all."""
     file, watch = io.BytesIO(), _WATCH.get()
@@ -78,7 +83,7 @@ def read_checkpoint(path: Path, options: DataclassInstance, data_sha256: str) ->
         raise UsageError(f"{path} is not there", remedy="leave --resume out to start anew")
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        found = dict(saved["identity"])
+        found = _defaults(options) | dict(saved["identity"])
     except Exception as error:  # a damaged or foreign file makes torch raise almost anything
         raise DamagedFileError(
             f"{path}: not a checkpoint: {error}", remedy="leave --resume out to start anew"

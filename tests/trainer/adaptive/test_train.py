@@ -96,6 +96,18 @@ def test_an_interrupted_training_ends_at_the_same_automaton(task, trained, tmp_p
     np.testing.assert_array_equal(went_on.arrays.posteriors, trained.arrays.posteriors)
 
 
+def test_a_checkpoint_from_before_an_option_existed_means_its_default(task, trained, tmp_path):
+    path = tmp_path / "bars.checkpoint"
+    interrupted(8, task, IDEAL, SMALL, checkpoint=path)
+    kept = torch.load(path, weights_only=True)
+    del kept["identity"]["dose_cap"]
+    torch.save(kept, path)
+    with pytest.raises(UsageError, match=r"another training: dose_cap None \(now 9.0\)"):
+        train_automaton(task, IDEAL, replace(SMALL, dose_cap=9.0), checkpoint=path, resume=True)
+    went_on = train_automaton(task, IDEAL, SMALL, checkpoint=path, resume=True)
+    np.testing.assert_array_equal(went_on.arrays.pattern_levels, trained.arrays.pattern_levels)
+
+
 def test_a_price_per_exposure_ends_walks_early(task, trained):
     found = train_automaton(task, IDEAL, replace(SMALL, exposure_price=0.03))
     bundle = export_bundle(found, task)
