@@ -248,12 +248,12 @@ def stopping(
         ]
         if not rules:
             continue
-        (_, rule), floor = max(rules, key=lambda one: one[0][0])
+        (right, rule), floor = max(rules, key=lambda one: one[0][0])
         if floor not in told:
             source = network if floor is None else of_posterior(measurement, floor, n)
             told[floor] = [source(each, report) for each in heard]
         done, confidence = decided(measurement, told[floor], [each.photons for each in heard], sent, rule)
-        facts = {"source": "network" if floor is None else "posterior", "floor": floor}
+        facts = {"source": "network" if floor is None else "posterior", "floor": floor, "accuracy_held_back": right}
         yield level, Choice(rule, confidence, facts), done
 
 

@@ -178,6 +178,7 @@ def test_the_command_stops_when_sure(tmp_path, capsys) -> None:
         assert found == pytest.approx(asked, rel=0.3)
         assert row["clicks_mean"] == row["photons_mean"]
         assert row["source"] in ("network", "posterior")
+        assert row["accuracy_held_back"] == pytest.approx(row["accuracy_mean"], abs=0.15)  # of 80 objects, and of 200
     assert rows[0]["accuracy_mean"] < rows[1]["accuracy_mean"]
     assert rows[0]["confidence"] < rows[1]["confidence"]
     assert main([*words, "--photons", "1000"]) == EXIT_USAGE
