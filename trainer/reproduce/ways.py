@@ -27,6 +27,7 @@ from .page import FIRST_OBJECTS, Asked, Row, Rows, check_cached_bundle, flat, re
 WAYS: list[Row] = read_toml("ways.toml")["way"]
 SENT = " sent"  # of a level in ways.toml: light sent, not photons detected
 BY_SENT = ", sent"  # of the way's name in a row
+START_AT = "start_at"  # the level of the automaton that it starts from, where that is another
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +77,16 @@ def points(page: str) -> Iterator[Point]:
     for way in (way for way in WAYS if way.get("page", "frontier") == page):
         for task, levels in way["levels"].items():
             for text, more in levels.items():
-                start = known[task, way["start"], text] if "start" in way else None
+                start = known[task, way["start"], more.get(START_AT, text)] if "start" in way else None
                 shared: dict[bool, list[float]] = {False: [], True: []}
                 for other in (other for other, options in levels.items() if options == more):
                     shared[other.endswith(SENT)].append(float(other.removesuffix(SENT)))
-                level, options = float(text.removesuffix(SENT)), tuple((way["options"] | more).items())
+                level, options = float(text.removesuffix(SENT)), way["options"] | more
+                options.pop(START_AT, None)
                 alike = tuple(shared[False]), start, tuple(shared[True])
-                point = Point(task, way["name"], level, way["kind"], options, *alike, text.endswith(SENT))
+                point = Point(
+                    task, way["name"], level, way["kind"], tuple(options.items()), *alike, text.endswith(SENT)
+                )
                 known[task, way["name"], text] = point
     yield from known.values()
 

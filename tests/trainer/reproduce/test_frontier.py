@@ -57,6 +57,8 @@ def test_the_points_can_be_trained_and_every_start_is_there():
     twice = next(point for point in found if point.way == "larger automaton, trained on twice")
     assert twice.start.start.way == "larger automaton"
     assert twice.training_seed(0) == 2  # other distortions each time
+    brighter = next(point for point in found if point.way == "automaton, held to light sent, trained on twice")
+    assert (brighter.level, brighter.start.level, brighter.start.start.level) == (250, 115, 115)
 
 
 def test_seeds_are_put_together_with_their_standard_error():
