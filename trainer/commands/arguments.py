@@ -62,14 +62,10 @@ def warn_of_laws(bundle: Bundle, profile: Profile, *, eta: float = 1.0, one_by_o
 
 def torch_with(threads: int, what: str = "training") -> Any:
     """Return torch, set to that many threads; UsageError where it is not installed."""
-    try:
+    with needing(what, "train"):
         import torch
 
         import pans.trainer.device  # noqa: F401  # it sets what torch needs on this processor
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            f"{what} needs the package torch, which is not installed", remedy="pip install 'pans-runtime[train]'"
-        ) from error
     torch.set_num_threads(threads)
     return torch
 
@@ -80,15 +76,6 @@ def stated_tolerance(profile: Profile) -> str | None:
         return None
     tolerance = profile.optics.tolerance()
     return None if tolerance == Tolerance() else tolerance.spelled()
-
-
-@contextmanager
-def usage_errors() -> Iterator[None]:
-    """Turn a ValueError of the numeric code into a UsageError: what the user asked for cannot be computed."""
-    try:
-        yield
-    except ValueError as error:
-        raise UsageError(str(error)) from error
 
 
 @contextmanager

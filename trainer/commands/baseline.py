@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.cli.option_fields import add_options, options_from
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.ranges import Range
 from pans.trainer.options import LIGHT, METHODS, BaselineOptions
 
-from .arguments import add_data_dir, add_threads, displayed_parts, torch_with, usage_errors
+from .arguments import add_data_dir, add_threads, displayed_parts, torch_with
 
 if TYPE_CHECKING:
     from pans.trainer.tasks.registry import Task
@@ -59,7 +59,7 @@ def _run(args: argparse.Namespace) -> int:
     rows: list[dict[str, Any]] = []
     code = EXIT_FINE
     try:
-        with usage_errors(), displayed_parts() as report:
+        with as_usage_error(), displayed_parts() as report:
             for row in baseline_rows(task, options, levels, report):
                 of = "illumination" if row["photons_asked"] is None else "photons"
                 first, words = row["first_200"], f"{row[f'{of}_asked']:>9g} {of}: {100 * row['accuracy_mean']:6.2f} %  "

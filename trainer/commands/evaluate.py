@@ -19,14 +19,14 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.optics import amplification
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, note, warn
 from pans.runtime.cli.option_fields import add_options, options_from
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of, imaging_of, tolerance_of
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 from pans.runtime.safe_text import one_line
 from pans.trainer.options import LEAST_PHOTONS, Conditions
 
-from .arguments import add_data_dir, displayed_parts, displayed_progress, needing, usage_errors, warn_of_laws
+from .arguments import add_data_dir, displayed_parts, displayed_progress, needing, warn_of_laws
 
 if TYPE_CHECKING:
     from pans.trainer.evaluate.accuracy import Measured, MeasuredPictures
@@ -124,7 +124,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     if trials is None and not args.exact and bundle.automaton is None:
         trials = h.default_trials(bundle)
     more: dict[str, Any] = {}
-    with usage_errors():
+    with as_usage_error():
         given = args.optics is not None and args.draws is None and args.optics != CURVES_WORD
         imaging = imaging_of(args.optics) if given else None
         conditions = options_from(args, Conditions, imaging=imaging, bleaching=bleaching_given(args))

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, Command, add_new_bundle, emit, note
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.outputs import check_outputs
 
-from .arguments import add_data_dir, needing, usage_errors
+from .arguments import add_data_dir, needing
 from .evaluate import DOSE_CAP, bleaching_given
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def _order(args: argparse.Namespace) -> int:
             f"{bundle.name} was trained through bleaching: its back end expects what the patterns before have left",
             remedy="--by none --dose-cap N keeps the first patterns",
         )
-    with usage_errors():
+    with as_usage_error():
         bleaching = bleaching_given(args)
         task = args.task or remembered_task(bundle.provenance, bundle.task, bundle_path(args.bundle))
         held_out = held_out_of(bundle, task, 1, args.data_dir, Conditions(args.profile))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_new_bundle, emit, say
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.outputs import check_outputs
 from pans.trainer.options import ENCODERS, SEED, AutomatonOptions, Options, add_unset_options, flag_of, option_names
 
@@ -23,7 +23,6 @@ from .arguments import (
     interruptible,
     needing,
     torch_with,
-    usage_errors,
     warn_of_laws,
 )
 from .evaluate import warn_of_majority
@@ -122,7 +121,7 @@ def _train(args: argparse.Namespace) -> int:
     training = kind(args, task, varied, profile)
     try:
         with (
-            usage_errors(),
+            as_usage_error(),
             displayed_progress(training.quantity) as show,
             computing_on(args.device),
             timed(checkpoint, resume=args.resume) as watch,
@@ -131,7 +130,7 @@ def _train(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say(f"interrupted; the last whole step is in {checkpoint}\n  continue with the same command and --resume")
         return EXIT_INTERRUPTED
-    with usage_errors(), computing_on(args.device if automaton else "cpu"):
+    with as_usage_error(), computing_on(args.device if automaton else "cpu"):
         digest, answer, lines = training.export(_provenance(args, watch.seconds()) | facts)
     warn_of_laws(training.bundle, profile, one_by_one=not automaton)
     checkpoint.unlink(missing_ok=True)
