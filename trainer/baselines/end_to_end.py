@@ -25,6 +25,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ from pans.trainer.tasks.registry import Task
 
 from .common import Decide, Light, Measurement, Report, Trials, measure, named, silent
 from .networks import Inputs, decider, feature_net, fit, seeded, size
-from .stopping import Choice, held_back, of_network, stopping
+from .stopping import held_back, of_network, stopping
 
 EPOCHS = 15
 ACTIVATION_BITS = 4
@@ -101,11 +102,8 @@ def train_conventionally(
     """Return patterns and head trained together on the expected values of the training objects of `task`."""
     n_pixels = math.prod(task.image_shape)
     model = seeded(lambda: EndToEnd(n_features, n_pixels, len(task.classes), bits), seed)
-    assert isinstance(model, EndToEnd)
-    images = task.train.images.reshape(len(task.train), n_pixels)
-
-    labels, rates = torch.from_numpy(task.train.labels), {"weight": PATTERN_RATE, "head": 1e-3}
-    progress = named("end-to-end", report)
+    images, rates = task.train.images.reshape(len(task.train), n_pixels), {"weight": PATTERN_RATE, "head": 1e-3}
+    labels, progress = task.train.labels, named("end-to-end", report)
     fit(model, transmissions(images), labels, epochs=epochs, seed=seed, batch=512, rates=rates, report=progress)
     return model
 
@@ -206,10 +204,8 @@ def train_masks(task: Task, options: BaselineOptions, level: Light, report: Repo
     mean_image = (images.mean(axis=0) / 255).astype(np.float32)
     masks = principal_masks(images, options.features)
     model = seeded(lambda: FeatureSpecific(masks, mean_image, len(task.classes), options, level), options.seed)
-    assert isinstance(model, FeatureSpecific)
-
     progress = named(f"{options.features} masks at {level.amount:g} {level.of}", report)
-    labels, epochs, rates = torch.from_numpy(task.train.labels), options.epochs or EPOCHS, {"weight": MASK_RATE}
+    labels, epochs, rates = task.train.labels, options.epochs or EPOCHS, {"weight": MASK_RATE}
     fit(model, transmissions(images), labels, epochs=epochs, seed=options.seed, rates=rates, report=progress)
     return model
 
@@ -229,7 +225,7 @@ def masks_measured(model: FeatureSpecific, task: Task, brightness: str) -> tuple
 
 def masks_that_stop(
     task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report = silent
-) -> Iterator[tuple[Light, Choice, Trials]]:
+) -> Iterator[tuple[Light, dict[str, Any], Trials]]:
     """Yield for every level that can be reached what masks trained for it decide on the test objects, as `stopping.stopping` does."""
     kept = len(task.train) - held_back(len(task.train))
     for level in levels:

@@ -6,7 +6,6 @@ Readouts are float32 (n, pixels + 1): the counts of a frame, then its exposure i
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import numpy as np
 import torch
@@ -16,8 +15,7 @@ import pans.trainer.device  # noqa: F401  # before a convolution: it sets what t
 from pans.trainer.tasks.changes import SIDE_MIN_PX, distorted
 
 from .common import F32, F64, Measurement, Report, named, silent
-from .networks import CHUNK, FRAME_SIDE, Inputs, fit, seeded
-from .stopping import Source, held_back, of_network
+from .networks import CHUNK, FRAME_SIDE, Inputs, convolution, fit, seeded
 
 SHORTEST, LONGEST = 3.0, 600.0  # exposures that it is trained for, uniform in the logarithm
 EPOCHS = {"fashion-mnist": 30}  # what minutes of one core allow; longer was not tried
@@ -41,12 +39,8 @@ class ExposureNet(nn.Module):
         self.features = nn.Sequential(
             nn.BatchNorm2d(first),
             nn.ReLU(),
-            nn.Conv2d(first, second, 3, 2, 1, bias=False),
-            nn.BatchNorm2d(second),
-            nn.ReLU(),
-            nn.Conv2d(second, third, 3, 1, 1, bias=False),
-            nn.BatchNorm2d(third),
-            nn.ReLU(),
+            *convolution(first, second, 3, 2),
+            *convolution(second, third, 3),
             nn.AdaptiveAvgPool2d(7),  # 28 x 28 pixels arrive as 7 x 7
             nn.Flatten(),
         )
@@ -72,13 +66,11 @@ def exposure_net(
     shape = measurement.image_shape
     assert shape is not None, "direct imaging measures frames"
     net = seeded(lambda: ExposureNet(shape, measurement.n_classes), seed)
-    assert isinstance(net, ExposureNet)
     net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # a fifth less time
-    labels = torch.from_numpy(measurement.train_labels[:fitted])
     fit(
         net,
         _frames(measurement, shape, STRENGTHS.get(name, OTHER_STRENGTH), seed),
-        labels,
+        measurement.train_labels[:fitted],
         epochs=epochs or EPOCHS.get(name, OTHER_EPOCHS),
         seed=seed,
         rates={"": PEAK_RATE},
@@ -111,12 +103,3 @@ def log_chances(net: ExposureNet, counts: F32, exposure: float) -> F64:
             for part in torch.from_numpy(counts).split(CHUNK)
         ]
     return torch.cat(parts).numpy().astype(np.float64)
-
-
-def of_exposure_net(
-    measurement: Measurement, name: str, *, seed: int, epochs: int | None = None, report: Report = silent
-) -> Source:
-    """Return the source of doubt that such a network is, trained on all but the objects held back."""
-    n, n_pixels = measurement.train.shape
-    net = exposure_net(measurement, n - held_back(n), name, seed=seed, epochs=epochs, report=report)
-    return of_network(partial(log_chances, net), n_pixels, SHORTEST)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ FRAME_SIDE = 28  # pixels; larger frames are reduced to about this by the first 
 RATE = 2e-3
 CONV_KERNEL, CONV_CHANNELS = 15, ((1, 32), (32, 64))  # of the convolutional back end: before and after each layer
 
+Net = TypeVar("Net", bound=nn.Module)
 Inputs = Callable[[Tensor, torch.Generator], Tensor]  # (which objects, random numbers) -> what the network sees
 FAMILIES = ("binary", "hadamard", "gaussian", "binning")
 EPOCHS = {"cnn": 5, "clean-cnn": 5, "mlp": 10, "clean-mlp": 10, "differences": 10, "counts": 10}
@@ -54,13 +55,13 @@ class FrameNet(nn.Module):
         self.shape, self.spread = shape, spread
         stride = max(1, round(max(shape) / FRAME_SIDE))
         self.features = nn.Sequential(
-            *_convolution(1, 16, 2 * stride + 3, stride),
+            *convolution(1, 16, 2 * stride + 3, stride),
             nn.MaxPool2d(2, ceil_mode=True),
-            *_convolution(16, 32, 3),
+            *convolution(16, 32, 3),
             nn.MaxPool2d(2, ceil_mode=True),
-            *_convolution(32, 48, 3),
-            *_convolution(48, 48, 3),
-            *_convolution(48, 32, 3),
+            *convolution(32, 48, 3),
+            *convolution(48, 48, 3),
+            *convolution(48, 32, 3),
             nn.AdaptiveAvgPool2d(4),
             nn.Flatten(),
         )
@@ -78,14 +79,14 @@ class FrameNet(nn.Module):
         return scores
 
 
-def _convolution(before: int, after: int, kernel: int, stride: int = 1) -> tuple[nn.Module, ...]:
+def convolution(before: int, after: int, kernel: int, stride: int = 1) -> tuple[nn.Module, ...]:
+    """Return a convolution that keeps the size but for its stride, batch normalisation and ReLU."""
     layer = nn.Conv2d(before, after, kernel, stride, kernel // 2, bias=False)
     return layer, nn.BatchNorm2d(after), nn.ReLU()
 
 
-Watch = Callable[
-    [float, float, Decide], None
-]  # loss and accuracy, means over an epoch while it learnt, and the network now
+# loss and accuracy, means over an epoch while it learnt, and the network now
+Watch = Callable[[float, float, Decide], None]
 
 
 def feature_net(n_features: int, n_classes: int, n_hidden: int = 512) -> nn.Module:
@@ -104,7 +105,7 @@ def feature_conv_net(n_features: int, n_classes: int, n_hidden: int = 512) -> nn
     return nn.Sequential(*first, *layers, nn.Flatten(), hidden, nn.ReLU(), nn.Linear(n_hidden, n_classes))
 
 
-def seeded(make: Callable[[], nn.Module], seed: int) -> nn.Module:
+def seeded(make: Callable[[], Net], seed: int) -> Net:
     """Return `make()` with its initial values drawn from `seed`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -114,21 +115,21 @@ def seeded(make: Callable[[], nn.Module], seed: int) -> nn.Module:
 def fit(
     net: nn.Module,
     inputs: Inputs,
-    labels: Tensor,
+    labels: I64,
     *,
     epochs: int,
     seed: int,
     batch: int = 256,
     rates: dict[str, float] | None = None,
     report: Report = silent,
-    watch: Callable[[float, float], None] = lambda _loss, _accuracy: None,
+    watch: Watch = lambda _loss, _accuracy, _decide: None,
 ) -> None:
     """Train `net` on fresh `inputs` of every batch by cross-entropy, Adam and one cycle of the learning rate.
 
     `rates` gives parameters whose name begins with a key a peak rate of their own; the others have `RATE`. `watch` is called after
     every epoch, with `net` as for use.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator, wanted = torch.Generator().manual_seed(seed), torch.from_numpy(labels)
     of_rate = _by_rate(net, rates or {})
     peaks = list(of_rate)
     optimiser = torch.optim.Adam([{"params": parameters} for parameters in of_rate.values()])
@@ -144,17 +145,17 @@ def fit(
                 for group, peak in zip(optimiser.param_groups, peaks):
                     group["lr"] = peak * _one_cycle(step / steps)
                 scores = net(inputs(which, generator))
-                loss = nn.functional.cross_entropy(scores, labels[which])
+                loss = nn.functional.cross_entropy(scores, wanted[which])
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
-                right = (scores.argmax(dim=1) == labels[which]).sum()
+                right = (scores.argmax(dim=1) == wanted[which]).sum()
                 sums += torch.stack([loss.detach() * len(which), right])
                 step += 1
                 if step % 20 == 0 or step == steps:
                     report(f"loss {float(loss.detach()):.3f}", step / steps)
             net.eval()
-            watch(*(sums / len(labels)).tolist())
+            watch(*(sums / len(labels)).tolist(), decider(net))
 
 
 def _by_rate(net: nn.Module, rates: dict[str, float]) -> dict[float, list[nn.Parameter]]:
@@ -198,13 +199,8 @@ def fitted(
     watch: Watch = lambda _loss, _accuracy, _decide: None,
 ) -> Decide:
     """Train `net` on `inputs` of the training objects and return its decision; `watch` gets it after every epoch."""
-    decide, labels = decider(net), torch.from_numpy(measurement.train_labels)
-
-    def each(loss: float, accuracy: float) -> None:
-        watch(loss, accuracy, decide)
-
-    fit(net, inputs, labels, epochs=epochs, seed=seed, report=report, watch=each)
-    return decide
+    fit(net, inputs, measurement.train_labels, epochs=epochs, seed=seed, report=report, watch=watch)
+    return decider(net)
 
 
 def decider(net: Callable[[Tensor], Tensor]) -> Decide:
@@ -292,10 +288,8 @@ def aware_net(
         net = seeded(lambda: Differences(n // 2, n_classes), seed)
     else:
         net = seeded(lambda: feature_net(n, n_classes), seed)
-    progress, inputs = (
-        named(f"{WORDS[method]} at {photons:g} photons", report),
-        shown(measurement, photons, detector, dark),
-    )
+    progress = named(f"{WORDS[method]} at {photons:g} photons", report)
+    inputs = shown(measurement, photons, detector, dark)
     return fitted(net, measurement, inputs, seed=seed, epochs=epochs or EPOCHS[method], report=progress)
 
 

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -90,8 +91,8 @@ Level = tuple[Light, int, Trials, dict[str, Any]]  # asked for, readouts per obj
 
 def _stopping(task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report) -> Iterator[Level]:
     from .end_to_end import masks_that_stop
-    from .exposures import of_exposure_net
-    from .stopping import stopping
+    from .exposures import SHORTEST, exposure_net, log_chances
+    from .stopping import held_back, of_network, stopping
 
     if options.detector != "counting" or options.dark:
         raise ValueError("stopping counts every photon: allowed with a counting detector without dark counts only")
@@ -99,11 +100,12 @@ def _stopping(task: Task, options: BaselineOptions, levels: Iterable[Light], rep
         n_readouts, found = options.features, masks_that_stop(task, options, levels, report)
     else:
         measurement, seed = measure(task, None, options.brightness), options.seed
-        network = of_exposure_net(measurement, task.name, seed=seed, epochs=options.epochs, report=report)
-        n_readouts = measurement.train.shape[1]
+        n, n_readouts = measurement.train.shape
+        net = exposure_net(measurement, n - held_back(n), task.name, seed=seed, epochs=options.epochs, report=report)
+        network = of_network(partial(log_chances, net), n_readouts, SHORTEST)
         found = stopping(measurement, levels, network, seed=seed, trials=options.trials or 1, report=report)
-    for level, choice, done in found:
-        yield level, n_readouts, done, choice.facts | {"confidence": choice.confidence} | asdict(choice.rule)
+    for level, facts, done in found:
+        yield level, n_readouts, done, facts
 
 
 def _by_level(task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report) -> Iterator[Level]:
@@ -118,10 +120,11 @@ def _by_level(task: Task, options: BaselineOptions, levels: Iterable[Light], rep
 
 def _paradigm(task: Task, options: BaselineOptions, report: Report) -> AtLevel:
     """What gives measurement and decision at a level of light, with facts about them."""
-    if options.paradigm == "fsi":
-        return _masks(task, options, report)
-    makers = {"e2e": _end_to_end, "hadamard": _hadamard}
-    measurement, at = makers.get(options.paradigm, _patterns)(task, options, report)
+    if options.paradigm == "fsi":  # masks are trained anew for every level: the measurement is of the level too
+        from .end_to_end import masks_measured, train_masks
+
+        return lambda level: (*masks_measured(train_masks(task, options, level, report), task, options.brightness), {})
+    measurement, at = (_end_to_end if options.paradigm == "e2e" else _patterns)(task, options, report)
     return lambda level: (measurement, *at(level.photons(measurement)))
 
 
@@ -134,6 +137,10 @@ def _patterns(task: Task, options: BaselineOptions, report: Report) -> tuple[Mea
 
         patterns = fixed_patterns(options.patterns, options.features, task.image_shape, options.seed)
         facts = {"patterns": options.patterns}
+    elif options.paradigm == "hadamard":
+        from .networks import pairs
+
+        patterns = pairs(options.features, task.image_shape)
     measurement = measure(task, patterns, options.brightness)
     if options.method != "bayes":
         return measurement, _network(measurement, options, facts, report)
@@ -194,20 +201,3 @@ def _end_to_end(task: Task, options: BaselineOptions, report: Report) -> tuple[M
     )
     measurement, of_level = patterns_measured(model, task, options.brightness)
     return measurement, lambda photons: (of_level(photons, options.detector), {"bits": bits})
-
-
-def _hadamard(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
-    from .networks import pairs
-
-    measurement = measure(task, pairs(options.features, task.image_shape), options.brightness)
-    return measurement, _network(measurement, options, {}, report)
-
-
-def _masks(task: Task, options: BaselineOptions, report: Report) -> AtLevel:
-    """Masks are trained anew for every level: the measurement is of the level too."""
-    from .end_to_end import masks_measured, train_masks
-
-    def at(level: Light) -> tuple[Measurement, Decide, dict[str, Any]]:
-        return *masks_measured(train_masks(task, options, level, report), task, options.brightness), {}
-
-    return at

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numba
@@ -200,15 +200,6 @@ def best_rule(course: Course, spent: F64, level: float, wanted: I64) -> tuple[fl
     return max(found, key=lambda one: one[0], default=None)
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """How a level is met: the rule, its mean confidence on test objects, and facts about the source."""
-
-    rule: Rule
-    confidence: float
-    facts: dict[str, Any]
-
-
 def held_back(n: int) -> int:
     """Return how many of `n` training objects, the last ones, choose the rule."""
     return min(HELD_BACK, n // 5)
@@ -222,8 +213,8 @@ def stopping(
     seed: int,
     trials: int = 1,
     report: Report = silent,
-) -> Iterator[tuple[Light, Choice, Trials]]:
-    """Yield for every level that can be reached what was decided on the test objects, each `trials` times.
+) -> Iterator[tuple[Light, dict[str, Any], Trials]]:
+    """Yield for every level that can be reached source, rule and mean confidence, and what was decided on the test objects, `trials` times.
 
     `network` does not know the objects held back. Clicks, photons and illumination are those until the decision (every photon is a click
     of its own).
@@ -254,7 +245,7 @@ def stopping(
             told[floor] = [source(each, report) for each in heard]
         done, confidence = decided(measurement, told[floor], [each.photons for each in heard], sent, rule)
         facts = {"source": "network" if floor is None else "posterior", "floor": floor, "accuracy_held_back": right}
-        yield level, Choice(rule, confidence, facts), done
+        yield level, facts | {"confidence": confidence} | asdict(rule), done
 
 
 def decided(

@@ -123,10 +123,10 @@ def test_masks_that_stop_spend_their_level_are_calibrated_and_above_those_that_d
     task = Task("halves", ("a", "b"), *parts, "0" * 64, "made here")
     options = BaselineOptions("fsi", "stopping", features=6, epochs=16, trials=2)
     for level in (Light("photons", 3.0), Light("illumination", 6.0)):  # the mean object is 0.5 everywhere
-        ((asked, choice, trials),) = masks_that_stop(task, options, [level])
+        ((asked, facts, trials),) = masks_that_stop(task, options, [level])
         found = trials.measured()
         assert asked == level
         assert found.illumination == pytest.approx(2 * found.photons_mean, rel=0.05)
         assert 2.4 < found.photons_mean < 3.1  # six masks cannot come nearer
-        assert choice.confidence == pytest.approx(found.accuracy_mean, abs=0.03)
+        assert facts["confidence"] == pytest.approx(found.accuracy_mean, abs=0.03)
         assert found.accuracy_mean > best_of_two_pixels() + 3 * found.accuracy_se_objects
