@@ -56,13 +56,10 @@ def photons_wanted(options: AutomatonOptions) -> float:
 
 def first_prices(options: AutomatonOptions) -> Prices:
     """Return the prices at which training spends about the budgets of `options`; each of two begins with half of it."""
-    budgets = budgets_of(options)
-    return Prices(
-        [
-            Price(kind, price_of(budget * DETECTED_PER[kind]) * _share(kind, len(budgets)), budget)
-            for kind, budget in budgets.items()
-        ]
-    )
+    prices, budgets = [], budgets_of(options)
+    for kind, budget in budgets.items():
+        prices.append(Price(kind, price_of(budget * DETECTED_PER[kind]) * _share(kind, len(budgets)), budget))
+    return Prices(prices)
 
 
 def _share(kind: str, budgets: int) -> float:
@@ -203,9 +200,8 @@ def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None
             raise UsageError(
                 "--bleach: an automaton is trained for it on perfect optics only", remedy="leave out --optics"
             )
-        rounding = (
-            ROUNDED / bit_grid(1.0, profile).steps * options.dose_cap / fades_of(options, math.prod(task.image_shape))
-        )
+        fades = fades_of(options, math.prod(task.image_shape))
+        rounding = ROUNDED / bit_grid(1.0, profile).steps * options.dose_cap / fades
         if rounding > FADES_WITHIN:
             raise PlanError(
                 f"--bleach: by the steps of {profile.name} doses of walks to one state would differ by about {rounding:.1%} of that which "

@@ -8,6 +8,8 @@ first whose merger loses least information on the class. Growing looks one expos
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from functools import reduce
 
 import numpy as np
 import torch
@@ -206,10 +208,7 @@ class Growth:
 
 def remainder(whole: Tensor, parts: list[Tensor]) -> Tensor:
     """Return what `parts` leave of `whole`, all (states, classes)."""
-    rest = whole - parts[0]
-    for part in parts[1:]:
-        rest = rest - part
-    return rest
+    return reduce(torch.sub, parts, whole)
 
 
 def _gains(parts: list[Tensor], whole: Tensor, block: Block) -> list[Tensor]:
@@ -221,13 +220,9 @@ def _gains(parts: list[Tensor], whole: Tensor, block: Block) -> list[Tensor]:
     return [(last - log_posterior(part)).float() @ block.one_hot for part in parts]
 
 
-def sum_of(parts: object) -> Tensor:
-    """Return the sum of an iterable of tensors."""
-    total: Tensor | None = None
-    for part in parts:  # type: ignore[attr-defined]
-        total = part if total is None else total + part
-    assert total is not None
-    return total
+def sum_of(parts: Iterable[Tensor]) -> Tensor:
+    """Return the sum of tensors, at least one."""
+    return reduce(torch.add, parts)
 
 
 def log_posterior(counts: Tensor) -> Tensor:

@@ -179,13 +179,13 @@ class Tuning:
         self.done = 0
         self.optimiser = torch.optim.Adam(machine.parameters(), lr=rate, fused=True)
 
-    def epoch(self, blocks: list[Block]) -> tuple[float, float, float, float, float]:
+    def epoch(self, blocks: list[Block]) -> list[float]:
         """Pass over `blocks` once; return the means over their objects of loss, accuracy and the fields of `Spent`."""
         sums, n = torch.zeros(5, dtype=torch.float64), sum(len(block) for block in blocks)
         for block in blocks:
             sums += self.step(block, n)
-        loss, accuracy, clicks, photons, illumination = (sums / n).tolist()
-        return loss, accuracy, clicks, photons, illumination
+        found: list[float] = (sums / n).tolist()
+        return found
 
     def state(self) -> dict[str, Any]:
         """Return what `restore` needs to continue."""

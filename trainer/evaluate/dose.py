@@ -8,7 +8,7 @@ Exact expectations, but for automata before samples that bleach: what is left de
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -21,12 +21,14 @@ from pans.runtime.bundle.layers import Layer, read_layers
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.imaging import NO_BLEACHING
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.refit.evidence import log_softmax
 from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects
 
 from .accuracy import Measured, light_of
 from .held_out import HeldOut, measure, trained_bleaching, trials_needed
+from .optics import SHOWN, Figures, Report
 from .readings import vector_chances
 from .walks import MeasuredWalks, left_by_state
 
@@ -39,18 +41,6 @@ F64 = NDArray[np.float64]
 CURVE_PARTS = (1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 1.0)  # of the most that a walk may take
 CAP_MAX = 1e300  # beyond any light
 BLEACHED_TRIALS = 4  # walks per object before samples that bleach
-
-Figures = Measured | MeasuredWalks
-Report = Callable[[int, int], None]
-_SHOWN = (
-    "accuracy_mean",
-    "accuracy_std",
-    "accuracy_se_objects",
-    "clicks_mean",
-    "photons_mean",
-    "illumination",
-    "trials",
-)
 
 
 def patterns_within(bundle: Bundle, cap: float) -> int:
@@ -82,10 +72,7 @@ def marginal_scores(table: NDArray[Any], chances: F64, words_seen: int) -> F64:
 
     `table` (words, classes) are scores of all words, `chances` (words,) how often they come.
     """
-    wide = table.astype(np.float64)
-    posterior = np.exp(wide - wide.max(axis=1, keepdims=True))
-    posterior /= posterior.sum(axis=1, keepdims=True)
-    joint = posterior * (chances + LEAST_WORD)[:, None]
+    joint = np.exp(log_softmax(table.astype(np.float64))) * (chances + LEAST_WORD)[:, None]
     seen = joint.reshape(-1, words_seen, table.shape[1]).sum(axis=0)  # the words that share their lowest digits
     return np.asarray(np.log(seen) - np.log(seen.sum(axis=1, keepdims=True)))
 
@@ -228,16 +215,20 @@ def dose_curve(
     """Return the points of accuracy against dose, from small caps to none; each with light, both spreads and, before samples
     that bleach, the accuracy that it would have without (`accuracy_unbleached`)."""
     known, caps, points = Knowledge(bundle, held_out), caps_of(bundle), []
-    for number, cap in enumerate(caps):
+    for cap in caps:
         found = within_cap(bundle, cap * (conditions.eta or 1.0), held_out, known, conditions.eta)
         measured = asdict(figures_of(found, held_out, conditions))
         steady = None
         if not conditions.bleaching.is_none:
             plain = figures_of(found, held_out, replace(conditions, bleaching=NO_BLEACHING))
             steady = plain.accuracy_mean
-        point = found.facts() | {name: measured[name] for name in _SHOWN} | {"accuracy_unbleached": steady}
+        point = (
+            found.facts()
+            | {name: measured[name] for name in (*SHOWN, "accuracy_std", "trials")}
+            | {"accuracy_unbleached": steady}
+        )
         points.append(point | {"accuracy_se_trials": trial_error(measured)})
-        report(number + 1, len(caps))
+        report(len(points), len(caps))
     return points
 
 

@@ -26,6 +26,7 @@ CURVES: Mapping[str, tuple[float, ...]] = {
 }
 DRAW_STREAM = 0xD7A  # with the seed
 TABLES_MAX = 100_000
+SHOWN = ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")  # of a point
 Figures = Measured | MeasuredWalks
 Report = Callable[[int, int], None]
 
@@ -65,11 +66,10 @@ def over_optics(
     report: Report = lambda done, of: None,
 ) -> OverOptics:
     """Return the means over `tables`, at least one; `report` gets how many are done."""
-    which = list(tables)
-    found = []
-    for number, imaging in enumerate(which):
+    which, found = list(tables), []
+    for imaging in which:
         found.append(figures_under(bundle, held_out, imaging, conditions))
-        report(number + 1, len(which))
+        report(len(found), len(which))
     right = np.array([one.accuracy_mean or 0.0 for one in found])
     spread = float(right.std(ddof=1)) if len(right) > 1 else 0.0
     return OverOptics(
@@ -116,20 +116,13 @@ def misalignment_curves(
 
     A point holds `value`, and of the figures what `pans evaluate` reports of light and accuracy.
     """
-    total, done = sum(len(values) for values in CURVES.values()), 0
-    found: dict[str, list[dict[str, Any]]] = {}
-    for name, values in CURVES.items():
-        points = []
-        for value in values:
-            measured = asdict(figures_under(bundle, held_out, _off(about, name, value), conditions))
-            points.append({"value": value, **{key: measured[key] for key in _SHOWN}})
-            done += 1
-            report(done, total)
-        found[name] = points
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in CURVES}
+    every = [(name, value) for name, values in CURVES.items() for value in values]
+    for done, (name, value) in enumerate(every, start=1):
+        measured = asdict(figures_under(bundle, held_out, _off(about, name, value), conditions))
+        found[name].append({"value": value, **{key: measured[key] for key in SHOWN}})
+        report(done, len(every))
     return found
-
-
-_SHOWN = ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
 
 
 def _off(about: Imaging, name: str, value: float) -> Imaging:

@@ -354,15 +354,11 @@ def calibration_bins(walks: Walks) -> list[CalibrationBin]:
     right = walks.by_class[walks.leaf_labels[leaves], leaves]
     probability = walks.automaton.posteriors[walks.automaton.n_states + leaves].max(axis=1).astype(np.float64)
     place = np.minimum((probability * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
-    total = float(mass.sum())
-    bins = []
-    for number in range(CALIBRATION_BINS):
-        inside = place == number
-        of_bin = float(mass[inside].sum())
-        if of_bin > 0:
-            mean = float(mass[inside] @ probability[inside]) / of_bin
-            bins.append(CalibrationBin(of_bin / total, mean, float(right[inside].sum()) / of_bin))
-    return bins
+    whole = float(mass.sum()) or 1.0
+    share, stated, found = (np.bincount(place, one) / whole for one in (mass, mass * probability, right))
+    kept = np.flatnonzero(share)
+    columns = share[kept], stated[kept] / share[kept], found[kept] / share[kept]
+    return [CalibrationBin(*one) for one in np.stack(columns, axis=1).tolist()]
 
 
 def calibration_error(bins: list[CalibrationBin]) -> float:
@@ -373,10 +369,7 @@ def calibration_error(bins: list[CalibrationBin]) -> float:
 def confusion_of(walks: Walks) -> F64:
     """Return how often, in expectation, truth (rows) is decided as what (columns), float64 (classes, classes)."""
     labels, n_classes = walks.leaf_labels, walks.automaton.n_classes
-    table = np.zeros((n_classes, n_classes))
-    for label in range(n_classes):
-        table[:, label] = walks.by_class[:, labels == label].sum(axis=1)
-    return table
+    return np.stack([walks.by_class[:, labels == label].sum(axis=1) for label in range(n_classes)], axis=1)
 
 
 def expected_figures(found: MeasuredWalks, profile: str, task: str, split: str) -> dict[str, Any]:
@@ -390,9 +383,9 @@ def expected_figures(found: MeasuredWalks, profile: str, task: str, split: str) 
 
 def walk_payload(walks: Walks) -> dict[str, Any]:
     """Return the calibration and the figures of the first objects, for `--json`."""
-    few = len(walks.right) <= FIRST_OBJECTS
-    first = None if few else asdict(measured_walks(walks.first(FIRST_OBJECTS)))
-    if first is not None:
+    first = None
+    if len(walks.right) > FIRST_OBJECTS:
+        first = asdict(measured_walks(walks.first(FIRST_OBJECTS)))
         del first["expected_calibration_error"]  # of so few objects it is mostly noise
     bins = [asdict(one) for one in calibration_bins(walks)]
     return {"exposures_longest": walks.automaton.n_slots, "calibration": bins, f"first_{FIRST_OBJECTS}": first}
