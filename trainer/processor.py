@@ -14,7 +14,6 @@ import platform
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -25,6 +24,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pans.runtime.cli import note, say
+from pans.runtime.errors import UsageError
+from pans.runtime.outputs import make_folder, replace_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -246,8 +247,6 @@ def _keep(choice: Choice) -> None:
     if not choice.works:
         return
     path = _file()
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8") as file:
-            json.dump(asdict(choice), file)
-        os.replace(file.name, path)
+    with suppress(UsageError):
+        make_folder(path.parent)
+        replace_file(path, json.dumps(asdict(choice)).encode())

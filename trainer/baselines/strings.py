@@ -27,6 +27,7 @@ import numpy as np
 from numba import njit
 
 from pans.trainer.evaluate.information import entropy_bits, mutual_information_bits
+from pans.trainer.evaluate.readings import outcome_probabilities
 from pans.trainer.tasks.barcode import N_BARS, all_strings, weights
 
 from .common import F32, F64, I64
@@ -48,12 +49,7 @@ def word_chances(bright: float, dark: float = 0.0) -> F64:
 
     Bar 0 is the highest bit of the string's number, its detector that of the word's.
     """
-    silent = np.exp(-np.array([dark, bright + dark]))
-    of_bar = np.stack([silent, 1 - silent], axis=1)  # (dark or bright, silent or click)
-    chances = np.ones((1, 1))
-    for _ in range(N_BARS):
-        chances = np.kron(chances, of_bar)
-    return chances
+    return outcome_probabilities(-np.expm1(-(bright * all_strings()[0][:, ::-1] + dark)), 1)
 
 
 def imaged(bright: float, dark: float = 0.0) -> dict[str, float]:

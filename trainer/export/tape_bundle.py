@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle, write_bundle
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.trainer.evaluate.readings import outcome_probabilities
 from pans.trainer.tasks.barcode import CLASSES, N_BARS, all_strings
 
 F64 = NDArray[np.float64]
@@ -36,13 +37,7 @@ def bar_patterns(pixels_per_bar: int, lit_px: int) -> NDArray[np.uint8]:
 
 def word_probabilities(photons: float, dark: float) -> F64:
     """Return P(word | string), float64 (strings, words): bit i of a word is the click of bar i, `photons` of a bright bar."""
-    bars, _ = all_strings()
-    p = -np.expm1(-(photons * bars.astype(np.float64) + dark))
-    words = (np.arange(1 << N_BARS)[:, None] >> np.arange(N_BARS)) & 1
-    result = np.ones((len(bars), len(words)))
-    for bar in range(N_BARS):
-        result *= np.where(words[:, bar] == 1, p[:, bar : bar + 1], 1 - p[:, bar : bar + 1])
-    return result
+    return outcome_probabilities(-np.expm1(-(photons * all_strings()[0] + dark)), 1)
 
 
 def exact_table(photons: float, dark: float) -> tuple[NDArray[np.float32], float, float]:

@@ -29,7 +29,7 @@ from torch import Generator, Tensor
 
 from pans.runtime.instrument.click_law import CountLaw, outcome_weights
 
-from .detection import Law, click_probability, click_words, sample_clicks, word_probabilities
+from .detection import Law, click_probability, sample_clicks, word_probabilities
 from .ssim import ssim
 
 LOO_SAMPLES = 4
@@ -166,9 +166,6 @@ class Clicks(Readings):
 
     def word_chances(self, chances: Tensor) -> Tensor:
         return word_probabilities(chances)
-
-    def words(self, n_features: int) -> Tensor:
-        return click_words(n_features)
 
     def local_slope(
         self, chances: Tensor, drawn: Tensor, loss_with: Callable[[Tensor], Tensor], loss: Tensor

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.refit.evidence import log_softmax
 from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Light, decision_shares, light_of, sampled_shares
 from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.tasks.registry import Objects, load_task
@@ -281,15 +282,9 @@ def _trials(bundle: Bundle, lit: Light, chosen: I64) -> Rows:
         facts: Row = {"object": int(index), "class": bundle.classes[i], **light, "illumination": part.illumination}
         facts["words"] = ["".join(map(str, word)) for word in words]
         facts["decided"] = decider.decide_batch(words, 1).tolist()
-        facts["outputs"] = softmax(decider.scores_batch(words, 1)).round(3).tolist()
+        facts["outputs"] = np.exp(log_softmax(decider.scores_batch(words, 1).astype(np.float64))).round(3).tolist()
         found.append(facts | {"expected": expected[i].round(4).tolist()})
     return found
-
-
-def softmax(scores: NDArray[np.floating]) -> F64:
-    """Return the outputs (n, classes) of rows of scores, each summing to 1."""
-    grown = np.exp(scores.astype(np.float64) - scores.max(axis=1, keepdims=True))
-    return np.asarray(grown / grown.sum(axis=1, keepdims=True))
 
 
 def differing(probability: F64, labels: I64) -> dict[str, float]:
