@@ -25,7 +25,7 @@ from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.choosing import choose, kinds_for
 from pans.runtime.refit.evidence import evidence_of, log_softmax
-from pans.trainer.evaluate.accuracy import exposure_of, law_of, light_of
+from pans.trainer.evaluate.accuracy import exposure_of, outcome_law_of, light_of
 from pans.trainer.tasks import load_task
 
 SIZES, DRAWS = (100, 200, 500, 1000, 2000, 4000), 10
@@ -46,7 +46,7 @@ def outcomes(bundle, profile, images):
         for column in clicks.T[:, :, None]:
             chance = np.concatenate([chance * (1 - column), chance * column], axis=1)
         return chance
-    law, parts = law_of(bundle, profile, 1.0, None), []
+    law, parts = outcome_law_of(bundle, profile, 1.0, None), []
     for start in range(0, len(images), 1000):
         seen = object_transmission(profile, images[start : start + 1000].reshape(-1, bundle.n_pixels))
         walk = expected_walk(

@@ -48,10 +48,10 @@ class ClickLaw:
             raise ValueError(f"threshold_e must be above 0 and at most 10, found {self.threshold_e}")
 
 
-def click_law(profile: Profile, exposure_us: float) -> ClickLaw:
-    """The law of one exposure of `exposure_us` microseconds on this profile's detector."""
+def click_law(profile: Profile, exposure_us: float, dark: float | None = None) -> ClickLaw:
+    """The law of one exposure of `exposure_us` microseconds on this profile's detector, with `dark` photoelectrons instead of its own."""
     detector = profile.detector
-    dark = detector.dark_rate_hz * exposure_us * 1e-6
+    dark = detector.dark_rate_hz * exposure_us * 1e-6 if dark is None else dark
     return ClickLaw(dark, detector.read_noise_e, detector.threshold_e, dead_time_of(profile, exposure_us))
 
 
@@ -149,13 +149,13 @@ class CountLaw:
         return self.read_noise_e == 0 and all(j < edge <= j + 1 for j, edge in enumerate(self.edges))
 
 
-def count_law(profile: Profile, exposure_us: float, outcomes: int) -> CountLaw | ClickLaw:
+def count_law(profile: Profile, exposure_us: float, outcomes: int, dark: float | None = None) -> CountLaw | ClickLaw:
     """The law of one exposure of `exposure_us` microseconds whose reading is one of `outcomes`; of two the click law.
 
     The first edge is the profile's threshold, the others lie halfway between whole numbers. ValueError for what the profile's detector
     cannot tell apart, and for dead time and afterpulses.
     """
-    clicks = click_law(profile, exposure_us)
+    clicks = click_law(profile, exposure_us, dark)
     if outcomes == 2:
         return clicks
     why = cannot_count(profile, outcomes)

@@ -10,7 +10,7 @@ Given the light, channels click independently: an outcome's chance is the produc
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -58,9 +58,7 @@ def clicks_of(law: Law) -> tuple[int, ...]:
 
 def law_of(profile: Profile, exposure_us: float, outcomes: int, channels: int, dark: float | None) -> Law:
     """Return the law of an exposure on `profile`, with `dark` photoelectrons instead of its own, if given; ValueError as `count_law`."""
-    law = count_law(profile, exposure_us, outcomes)
-    if dark is not None:
-        law = replace(law, dark_per_exposure=dark)
+    law = count_law(profile, exposure_us, outcomes, dark)
     return WordLaw(law, channels) if channels > 1 and isinstance(law, ClickLaw) else law
 
 

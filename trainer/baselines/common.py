@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.optics import incident_intensity
-from pans.trainer.evaluate.accuracy import Measured
-from pans.trainer.evaluate.information import conveyed, cooled_surprise
+from pans.trainer.evaluate.accuracy import Trials as Trials
+from pans.trainer.evaluate.information import cooled_surprise
 from pans.trainer.tasks.registry import Task
 
 BRIGHTNESS = ("source", "object")
@@ -159,42 +159,6 @@ def detect(photoelectrons: F32, detector: str, rng: np.random.Generator, dark: f
 
 
 # ---- the score ----
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trials:
-    """What was decided: `right` (trials, objects), the readouts' clicks, expected photons and true labels, each (objects,)."""
-
-    right: NDArray[np.bool_]
-    clicks: F64
-    photons: F64
-    illumination: float
-    labels: I64 | None = None
-    surprise: F64 | None = None  # -log2 of the true label's recalibrated posterior, (objects,); None without one
-
-    def measured(self, first: int | None = None) -> Measured:
-        """Return means over the first `first` objects (default: all), with the spread over trials and over objects apart.
-
-        `clicks_mean` counts readouts with at least one photon, for a counting detector too: what a binary one would report.
-        """
-        right = self.right[:, :first].astype(np.float64)
-        of_object, n = right.mean(axis=0), right.shape[1]
-        known: dict[str, Any] = {}
-        if self.surprise is not None and self.labels is not None:
-            parts = (self.surprise[:first], self.labels[:first], self.photons[:first])
-            known = conveyed(*parts, self.illumination)
-        return Measured(
-            accuracy_mean=float(right.mean()),
-            accuracy_std=float(right.mean(axis=1).std(ddof=1)) if len(right) > 1 else 0.0,
-            accuracy_se_objects=float(of_object.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
-            clicks_mean=float(self.clicks[:first].mean()),
-            photons_mean=float(self.photons[:first].mean()),
-            illumination=self.illumination,
-            objects=n,
-            trials=len(right),
-            shots=1,
-            **known,
-        )
 
 
 def run_trials(

@@ -26,10 +26,9 @@ from pans.runtime.instrument.click_law import (
     CountLaw,
     cannot_count,
     cannot_read_at_once,
-    click_law,
     click_probability,
     count_chances,
-    counting,
+    count_law,
     object_transmission,
 )
 from pans.runtime.instrument.profile import Profile
@@ -108,8 +107,51 @@ class Measured(Conveyed):
     illumination: float
     objects: int
     trials: int  # 0: exact, no trials were needed
-    shots: int
+    shots: int = 1
     by_class: ByClass | None = None
+
+
+def figures_of(
+    right: F64, spread: float, clicks: float, photons: F64, illumination: float, *, trials: int = 0, **more: Any
+) -> Measured:
+    """Return the means of objects that are decided `right` with these chances, (n,), and give `photons` (n,); `more` as in `Measured`."""
+    n = len(right)
+    return Measured(
+        accuracy_mean=float(right.mean()),
+        accuracy_std=spread,
+        accuracy_se_objects=float(right.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
+        clicks_mean=clicks,
+        photons_mean=float(photons.mean()),
+        illumination=illumination,
+        objects=n,
+        trials=trials,
+        **more,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trials:
+    """What was decided: `right` (trials, objects), the readouts' clicks, expected photons and true labels, each (objects,)."""
+
+    right: NDArray[np.bool_]
+    clicks: F64
+    photons: F64
+    illumination: float
+    labels: NDArray[np.int64] | None = None
+    surprise: F64 | None = None  # -log2 of the true label's posterior, (objects,); None without one
+
+    def measured(self, first: int | None = None) -> Measured:
+        """Return means over the first `first` objects (default: all), with the spread over trials and over objects apart.
+
+        `clicks_mean` counts readouts with at least one photon, for a counting detector too: what a binary one would report.
+        """
+        right, photons, light = self.right[:, :first], self.photons[:first], self.illumination
+        spread = float(right.mean(axis=1).std(ddof=1)) if len(right) > 1 else 0.0
+        known: dict[str, Any] = {}
+        if self.surprise is not None and self.labels is not None:
+            known = conveyed(self.surprise[:first], self.labels[:first], photons, light)
+        clicks = float(self.clicks[:first].mean())
+        return figures_of(right.mean(axis=0), spread, clicks, photons, light, trials=len(right), **known)
 
 
 def row_of(measured: Any) -> dict[str, Any]:
@@ -222,17 +264,6 @@ def demand_sequence(profile: Profile) -> None:
         )
 
 
-def law_of(bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | None = None) -> ClickLaw:
-    """Return the click law of one exposure of `bundle` on `profile`, with `dark` photoelectrons in place of the profile's if given.
-
-    ValueError for an `eta` or `dark` that is not finite or below 0.
-    """
-    if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
-        raise ValueError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
-    law = click_law(profile, exposure_of(bundle, profile))
-    return law if dark is None else replace(law, dark_per_exposure=dark)
-
-
 def exposure_of(bundle: Bundle, profile: Profile) -> float:
     """Return the exposure time of `bundle` on `profile`, microseconds."""
     if bundle.analyser is not None:
@@ -243,20 +274,18 @@ def exposure_of(bundle: Bundle, profile: Profile) -> float:
 def outcome_law_of(
     bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | None = None
 ) -> ClickLaw | CountLaw:
-    """Return the law of what `bundle` gets of an exposure: of clicks as `law_of`, or of photon numbers.
+    """Return the law of one exposure of `bundle` on `profile`, of clicks or photon numbers; `dark` photoelectrons replace the profile's.
 
-    ValueError for what `law_of` refuses, and for a profile that cannot tell so many photon numbers apart.
+    ValueError for an `eta` or `dark` that is not finite or below 0, and for a profile that cannot tell so many photon numbers apart, or
+    read so many channels at once.
     """
-    law, outcomes = law_of(bundle, profile, eta, dark), bundle.largest + 1
-    if outcomes == 2:
-        why = cannot_read_at_once(profile, bundle.n_channels) if bundle.n_channels > 1 else ""
-        if why:
-            raise ValueError(f"{bundle.name} needs {why}")
-        return law
-    why = cannot_count(profile, outcomes)
+    if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
+        raise ValueError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
+    outcomes, channels = bundle.largest + 1, bundle.n_channels
+    why = cannot_count(profile, outcomes) or (cannot_read_at_once(profile, channels) if channels > 1 else "")
     if why:
         raise ValueError(f"{bundle.name} needs {why}")
-    return counting(law, outcomes)
+    return count_law(profile, exposure_of(bundle, profile), outcomes, dark)
 
 
 def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1) -> Measured:
@@ -271,8 +300,17 @@ def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *,
     )
     right = np.clip(right, 0.0, 1.0)
     over_trials = math.sqrt(float((right * (1 - right)).sum())) / len(labels)
-    found = _measured(light, right, over_trials, labels, surprise, trials=0, shots=shots)
-    return replace(found, by_class=among_classes(right, labels, bundle.classes))
+    photons, illumination = shots * light.photoelectrons.sum(axis=1), light.illumination * shots
+    return figures_of(
+        right,
+        over_trials,
+        shots * float(light.probability.sum()) / len(right),
+        photons,
+        illumination,
+        shots=shots,
+        by_class=among_classes(right, labels, bundle.classes),
+        **conveyed(surprise, labels, photons, illumination),
+    )
 
 
 def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
@@ -330,23 +368,17 @@ def evaluate_sampled(
     bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1, trials: int = 30, seed: int = 0
 ) -> Measured:
     """Sample `trials` independent decisions per object, each from `shots` shots."""
-    decider = make_decider(bundle, shots=shots)
-    rng = np.random.default_rng(seed)
-    right, surprise, objects = np.zeros(len(labels)), np.zeros(len(labels)), np.arange(len(labels))
-    of_trial = np.empty(trials)
-    clicks = 0
+    decider, rng, n = make_decider(bundle, shots=shots), np.random.default_rng(seed), len(labels)
+    right, clicks, surprise = np.empty((trials, n), bool), np.zeros(n), np.zeros(n)
     for trial in range(trials):
         counts = light.counts(shots, rng)
-        clicks += int(counts.sum())
+        clicks += counts.sum(axis=1) / trials
         scores = decider.scores_batch(counts, shots)
-        hit = scores.argmax(axis=1) == labels
-        right += hit
-        surprise += surprises(scores)[objects, labels] / trials
-        of_trial[trial] = hit.mean()
-    spread = float(of_trial.std(ddof=1)) if trials > 1 else 0.0
-    clicks_mean = clicks / (trials * len(labels))
-    found = _measured(light, right / trials, spread, labels, surprise, trials=trials, shots=shots, clicks=clicks_mean)
-    return replace(found, by_class=among_classes(right / trials, labels, bundle.classes))
+        right[trial] = scores.argmax(axis=1) == labels
+        surprise += surprises(scores)[np.arange(n), labels] / trials
+    photons = shots * light.photoelectrons.sum(axis=1)
+    found = Trials(right, clicks, photons, light.illumination * shots, labels, surprise).measured()
+    return replace(found, shots=shots, by_class=among_classes(right.mean(axis=0), labels, bundle.classes))
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,32 +427,4 @@ def evaluate_pictures(
         objects=n,
         trials=trials,
         shots=shots,
-    )
-
-
-def _measured(
-    light: Light,
-    right: F64,
-    spread: float,
-    labels: NDArray[np.int64],
-    surprise: F64,
-    *,
-    trials: int,
-    shots: int,
-    clicks: float | None = None,
-) -> Measured:
-    n = len(right)
-    photons, illumination = shots * light.photoelectrons.sum(axis=1), light.illumination * shots
-    expected = shots * float(light.probability.sum()) / n
-    return Measured(
-        accuracy_mean=float(right.mean()),
-        accuracy_std=spread,
-        accuracy_se_objects=float(right.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
-        clicks_mean=expected if clicks is None else clicks,
-        photons_mean=float(photons.mean()),
-        illumination=illumination,
-        objects=n,
-        trials=trials,
-        shots=shots,
-        **conveyed(surprise, labels, photons, illumination),
     )

@@ -20,7 +20,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -166,8 +166,7 @@ def solve_patterns(options: Options, profile: Profile, prior: str = "uniform") -
 
 def _law(profile: Profile, exposure_us: float, options: Options) -> ClickLaw:
     """The click law of an exposure, of the shortest where it is shorter, with the dark counts that are asked for."""
-    law = click_law(profile, max(profile.exposure.min_us, exposure_us))
-    return law if options.dark is None else replace(law, dark_per_exposure=options.dark)
+    return click_law(profile, max(profile.exposure.min_us, exposure_us), options.dark)
 
 
 def solve(options: Options, profile: Profile) -> Trained:

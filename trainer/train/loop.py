@@ -27,7 +27,7 @@ from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
 from pans.runtime.detector import Afterpulses
 from pans.runtime.detector.crosstalk import crosstalk_of
 from pans.runtime.errors import as_usage_error
-from pans.runtime.instrument.click_law import CountLaw, click_law, counting
+from pans.runtime.instrument.click_law import CountLaw, count_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
 from pans.trainer.model.detection import Law, trained_through, with_crosstalk, with_mean_memory
@@ -271,9 +271,7 @@ class Run:
         """The law at the exposure that the present brightest pixel needs; of passive sensing, at the shortest one."""
         if self.own_law is not None:
             return self.own_law
-        law = click_law(self.profile, self._exposure_us())
-        law = law if self.options.dark is None else replace(law, dark_per_exposure=self.options.dark)
-        return law if self.options.outcomes == 2 else counting(law, self.options.outcomes)
+        return count_law(self.profile, self._exposure_us(), self.options.outcomes, self.options.dark)
 
     def afterpulses(self) -> Afterpulses | None:
         """What the clicks before add to a click at the same exposure, where that is trained through."""

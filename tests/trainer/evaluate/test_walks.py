@@ -19,7 +19,7 @@ from pans.runtime.decide import make_decider
 from pans.runtime.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate import evaluate
-from pans.trainer.evaluate.accuracy import law_of
+from pans.trainer.evaluate.accuracy import outcome_law_of
 from pans.trainer.evaluate.walks import calibration_bins, confusion_of, expected_differences, measured_walks, walks_of
 from pans.trainer.options import Conditions
 
@@ -40,7 +40,7 @@ def by_hand(model: Bundle, dark: float, eta: float, confidence: float) -> dict[s
     decider: Any = make_decider(model, confidence=confidence)
     automaton = decider.automaton
     seen = object_transmission(PROFILE, IMAGES.reshape(60, -1))
-    law = law_of(model, PROFILE, dark=dark)
+    law = outcome_law_of(model, PROFILE, dark=dark)
     sums = dict.fromkeys(("right", "decided", "clicks", "photons", "illumination", "exposures", "bits"), 0.0)
     for row, label in zip(seen, LABELS):
         whole = model.pattern_levels[automaton.pattern] * (eta * model.photons_per_level)
