@@ -25,7 +25,7 @@ from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.choosing import choose, kinds_for
 from pans.runtime.refit.evidence import evidence_of, log_softmax
-from pans.trainer.evaluate.accuracy import exposure_of, outcome_law_of, light_of
+from pans.trainer.evaluate.accuracy import exposure_of, light_of, outcome_law_of
 from pans.trainer.tasks import load_task
 
 SIZES, DRAWS = (100, 200, 500, 1000, 2000, 4000), 10

@@ -117,7 +117,7 @@ class Bars:
             values = (chances.astype(np.float32) @ values.reshape(2, -1)).T.reshape(-1)
         _solve(values, n, lit, mass, cost, gain, bits)
         prior = self.labels.mean()
-        return float(values[0]) + (entropy_bits(np.array([prior, 1 - prior])) if bits else 0.0)
+        return float(values[0]) + (float(entropy_bits(np.array([prior, 1 - prior]))) if bits else 0.0)
 
 
 def _gain(high: float, low: float) -> float:

@@ -106,10 +106,12 @@ def mutual_information_bits(joint: F64) -> float:
     return max(0.0, float((joint[there] * np.log2(ratio[there])).sum()))
 
 
-def entropy_bits(distribution: F64) -> float:
-    """Return the entropy of a distribution, in bits."""
-    there = distribution[distribution > 0]
-    return float(-(there * np.log2(there)).sum())
+def entropy_bits(weights: F64) -> F64:
+    """Return the entropy in bits of weights along the last axis, whatever they sum to; 0 where they are all 0."""
+    total = weights.sum(axis=-1, keepdims=True)
+    share = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
+    logs = np.log2(share, out=np.zeros_like(share), where=share > 0)
+    return np.asarray(-(share * logs).sum(axis=-1))
 
 
 def word_information(
@@ -131,7 +133,7 @@ def word_information(
     log_posterior = np.log2(smooth / smooth.sum(axis=1, keepdims=True))
     decided = log_posterior.argmax(axis=1)
     heldout = word_joint(p_test, test_labels, n_classes)
-    label_bits = entropy_bits(heldout.sum(axis=0))
+    label_bits = float(entropy_bits(heldout.sum(axis=0)))
     return Information(
         photons=float(test.sum()) / len(test),
         clicks=float(p_test.sum()) / len(test),
@@ -167,14 +169,12 @@ def posterior_information(log_joint: F64, labels: I64) -> PosteriorInformation:
     log_posterior = _log_softmax(log_joint)
     n, n_classes = log_joint.shape
     surprise, temperature = cooled_surprise(log_posterior, labels)
-    label_bits = entropy_bits(np.bincount(labels, minlength=n_classes) / n)
-    plain = np.exp(log_posterior)
-    entropy = -(plain * np.maximum(log_posterior, -1e4)).sum(axis=1) / np.log(2)
+    label_bits = float(entropy_bits(np.bincount(labels, minlength=n_classes) / n))
     return PosteriorInformation(
         label_bits=label_bits,
         lower_bits=label_bits - float(surprise.mean()),
         lower_bits_se=float(surprise.std(ddof=1)) / float(np.sqrt(n)),
-        believed_bits=label_bits - float(entropy.mean()),
+        believed_bits=label_bits - float(entropy_bits(np.exp(log_posterior)).mean()),
         temperature=temperature,
     )
 

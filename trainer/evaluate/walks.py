@@ -122,7 +122,7 @@ def walks_of(
     step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
     step = step if conditions.bleaching.is_none else min(step, BLEACHED_AT_ONCE)
     afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
-    patterns, scale = _patterns(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
+    patterns, scale = patterns_met(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
 
     sent = patterns.sum(axis=1, dtype=np.float64)[automaton.rows].sum(axis=1) * automaton.dwell / automaton.dwell_steps
     left = None
@@ -196,8 +196,8 @@ def left_by_state(automaton: Automaton, light: F64, law: Bleaching, pixels: int)
     return np.asarray(np.exp(-most[:n] / fades) * mean_left(light / fades))
 
 
-def _patterns(bundle: Bundle, imaging: Imaging) -> NDArray[Any]:
-    """The patterns in levels, as they meet the object."""
+def patterns_met(bundle: Bundle, imaging: Imaging) -> NDArray[Any]:
+    """Return the patterns in levels, (patterns, pixels), as they meet the object."""
     if imaging.is_identity:
         return bundle.pattern_levels
     return met(imaging, bundle.pattern_levels.astype(np.float64), bundle.image_shape, bundle.levels - 1.0)

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.layers import Int8Head, Layer
 from pans.runtime.bundle.model import BackEnd, Bundle
-from pans.runtime.imaging import NO_BLEACHING, Bleaching, mean_left, met
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, mean_left
 from pans.runtime.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import demand_sequence, outcome_law_of
 from pans.trainer.evaluate.dose import demand_fixed_patterns, plain_layers, rebuilt
-from pans.trainer.evaluate.information import mutual_information_bits
+from pans.trainer.evaluate.information import entropy_bits, mutual_information_bits
 from pans.trainer.evaluate.readings import vector_chances
+from pans.trainer.evaluate.walks import patterns_met
 from pans.trainer.tasks.registry import Objects
 
 EXACT_WORDS_MAX = 1 << 12  # per object
@@ -54,11 +55,7 @@ class _Readings:
     def __init__(self, bundle: Bundle, profile: Profile, objects: Objects, bleaching: Bleaching) -> None:
         demand_fixed_patterns(bundle)
         demand_sequence(profile)
-        imaging = profile.imaging()
-        self.light = bundle.patterns()
-        if not imaging.is_identity:
-            full = bundle.photons_per_level * (bundle.levels - 1)
-            self.light = met(imaging, self.light, bundle.image_shape, full)
+        self.light = patterns_met(bundle, profile.imaging()) * bundle.photons_per_level
         self._seen = object_transmission(profile, objects.images.reshape(len(objects), -1))
         self._law, self._bleaching = outcome_law_of(bundle, profile), bleaching
         self._dose = np.zeros((1, self.light.shape[1]))
@@ -150,7 +147,7 @@ class _Samples:
         self._of_class = (labels[:, None] == np.arange(n_classes)).astype(np.float64)
         self._log = np.zeros((len(labels), len(labels)))  # (words, objects)
         self._random = np.random.default_rng(seed)
-        self._label_bits = float(_entropy(self._of_class.sum(axis=0)[None, :])[0])
+        self._label_bits = float(entropy_bits(self._of_class.sum(axis=0)))
 
     def bits_with(self, chances: F64) -> F64:
         """See `_Words.bits_with`: an estimate."""
@@ -161,7 +158,7 @@ class _Samples:
         lit = (weight @ each).reshape(n, k, outcomes - 1, -1)
         dark = np.maximum(plain[:, None, :] - lit.sum(axis=2), 0.0)
         of_reading = lit.sum(axis=3) / plain.sum(axis=1)[:, None, None]
-        rest = (of_reading * _entropy(lit)).sum(axis=2) + (1 - of_reading.sum(axis=2)) * _entropy(dark)
+        rest = (of_reading * entropy_bits(lit)).sum(axis=2) + (1 - of_reading.sum(axis=2)) * entropy_bits(dark)
         return np.asarray(self._label_bits - rest.mean(axis=0))
 
     def take(self, chances: F64) -> None:
@@ -170,14 +167,6 @@ class _Samples:
         from_the_most = sure[:, ::-1].cumsum(axis=1)[:, :-1]
         behind = (self._random.random(len(sure))[:, None] >= from_the_most).sum(axis=1)  # word i is drawn from object i
         self._log += np.log(sure).T[sure.shape[1] - 1 - behind]
-
-
-def _entropy(rows: F64) -> F64:
-    """Entropy in bits of weights along the last axis, whatever they sum to; 0 where they are all 0."""
-    total = rows.sum(axis=-1, keepdims=True)
-    share = np.divide(rows, total, out=np.zeros_like(rows), where=total > 0)
-    logs = np.log2(share, out=np.zeros_like(share), where=share > 0)
-    return np.asarray(-(share * logs).sum(axis=-1))
 
 
 def reordered(bundle: Bundle, order: Sequence[int], facts: Mapping[str, Any]) -> Bundle:

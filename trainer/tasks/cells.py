@@ -77,22 +77,20 @@ class _Cell:
     def __init__(self, rng: np.random.Generator, n: int) -> None:
         self.radius_px = uniform(rng, *RADIUS_PX, n)
         self.centre_y, self.centre_x = uniform(rng, -OFFSET_PX, OFFSET_PX, n), uniform(rng, -OFFSET_PX, OFFSET_PX, n)
-        v, u = places(SIDE_PX, SIDE_PX, self.centre_y, self.centre_x, uniform(rng, 0, np.pi, n))
+        v, u = places(SIDE_PX, self.centre_y, self.centre_x, uniform(rng, 0, np.pi, n))
         v = v / per_image(uniform(rng, 0.72, 1, n))
         r_px = np.sqrt(v * v + u * u) + 1e-3
         self.sin, self.cos = v / r_px, u / r_px
         outline = 1 + waviness(rng, self.sin, self.cos, range(2, 6), 0.07)
         self.rho = r_px / (per_image(self.radius_px) * outline)
-        self.body = soft_inside((self.rho - 1) * per_image(self.radius_px), 2.0) * (
-            1 + 0.35 * smooth_noise(rng, n, SIDE_PX, SIDE_PX, 4.0)
-        )
+        inside = soft_inside((self.rho - 1) * per_image(self.radius_px), 2.0)
+        self.body = inside * (1 + 0.35 * smooth_noise(rng, n, SIDE_PX, 4.0))
         self.nucleus_px = self.radius_px * uniform(rng, 0.38, 0.58, n)
         off, turn = self.radius_px * uniform(rng, 0, 0.3, n), uniform(rng, 0, 2 * np.pi, n)
         self.nucleus_y, self.nucleus_x = self.centre_y + off * np.sin(turn), self.centre_x + off * np.cos(turn)
-        v, u = places(SIDE_PX, SIDE_PX, self.nucleus_y, self.nucleus_x, uniform(rng, 0, np.pi, n))
+        v, u = places(SIDE_PX, self.nucleus_y, self.nucleus_x, uniform(rng, 0, np.pi, n))
         v = v / per_image(uniform(rng, 0.75, 1, n))
-        away_px = np.sqrt(v * v + u * u) - per_image(self.nucleus_px)
-        self.nucleus = soft_inside(away_px, 1.5)
+        self.nucleus = soft_inside(np.sqrt(v * v + u * u) - per_image(self.nucleus_px), 1.5)
 
 
 def _stained(rng: np.random.Generator, stain: Floats, cell: _Cell) -> Floats:
@@ -155,7 +153,7 @@ def _mitochondria(rng: np.random.Generator, n: int) -> Floats:
 
 
 def _null(rng: np.random.Generator, n: int) -> Floats:
-    haze = 1 + per_image(uniform(rng, 0.2, 0.9, n)) * smooth_noise(rng, n, SIDE_PX, SIDE_PX, 14.0)
+    haze = 1 + per_image(uniform(rng, 0.2, 0.9, n)) * smooth_noise(rng, n, SIDE_PX, 14.0)
     debris = spots(
         *(SIDE_PX, SIDE_PX),
         uniform(rng, -48, 48, n, 4),

@@ -71,10 +71,9 @@ def axis(size: int) -> Floats:
     return (np.arange(size) - (size - 1) / 2).astype(np.float32)
 
 
-def places(height: int, width: int, centre_y: Floats, centre_x: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    """Return pixel coordinates (v, u), each (n, height, width), in frames centred and turned per image (radians)."""
-    y = axis(height)[None, :, None] - per_image(centre_y)
-    x = axis(width)[None, None, :] - per_image(centre_x)
+def places(side: int, centre_y: Floats, centre_x: Floats, angle: Floats) -> tuple[Floats, Floats]:
+    """Return pixel coordinates (v, u), each (n, side, side), in frames centred and turned per image (radians)."""
+    y, x = axis(side)[None, :, None] - per_image(centre_y), axis(side)[None, None, :] - per_image(centre_x)
     cos, sin = per_image(np.cos(angle)), per_image(np.sin(angle))
     return (y * cos - x * sin).astype(np.float32), (y * sin + x * cos).astype(np.float32)
 
@@ -137,19 +136,19 @@ def some_of(rng: np.random.Generator, n: int, low: int, high: int) -> Floats:
 # ---- random textures ----
 
 
-def smooth_noise(rng: np.random.Generator, n: int, height: int, width: int, grain_px: float) -> Floats:
-    """Return Gaussian noise smoothed over `grain_px` (sigma), mean 0, expected variance 1; periodic at the edges."""
-    transfer = _gaussian_transfer(height, width, grain_px)
-    return _filtered(normal(rng, n, height, width), transfer / np.sqrt((transfer**2).mean()))
+def smooth_noise(rng: np.random.Generator, n: int, side: int, grain_px: float) -> Floats:
+    """Return Gaussian noise (n, side, side) smoothed over `grain_px` (sigma), mean 0, expected variance 1; periodic at the edges."""
+    transfer = _gaussian_transfer(side, side, grain_px)
+    return _filtered(normal(rng, n, side, side), transfer / np.sqrt((transfer**2).mean()))
 
 
-def cloud_noise(rng: np.random.Generator, n: int, height: int, width: int, slope: float) -> Floats:
-    """Return noise with amplitudes falling as 1 / frequency**slope (turbulent clouds), mean 0, variance 1; periodic."""
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None, :])
+def cloud_noise(rng: np.random.Generator, n: int, side: int, slope: float) -> Floats:
+    """Return noise (n, side, side) with amplitudes falling as 1 / frequency**slope (turbulent clouds), mean 0, variance 1; periodic."""
+    frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.fftfreq(side)[None, :])
     frequency[0, 0] = 1.0
     transfer = frequency**-slope
     transfer[0, 0] = 0.0
-    return _filtered(normal(rng, n, height, width), transfer / np.sqrt((transfer**2).mean()))
+    return _filtered(normal(rng, n, side, side), transfer / np.sqrt((transfer**2).mean()))
 
 
 def speckle(rng: np.random.Generator, n: int, height: int, width: int, grain_px: float) -> NDArray[np.complex64]:

@@ -125,7 +125,7 @@ class _Frame:
 
     def __init__(self, rng: np.random.Generator, n: int) -> None:
         v, u = places(
-            *(SIDE_PX, SIDE_PX),
+            SIDE_PX,
             uniform(rng, -PLACE_PX, PLACE_PX, n),
             uniform(rng, -PLACE_PX, PLACE_PX, n),
             uniform(rng, 0, np.pi, n),
@@ -153,8 +153,8 @@ def _emission(rng: np.random.Generator, n: int) -> Floats:
     frame = _Frame(rng, n)
     outline = 1 + waviness(rng, frame.sin, frame.cos, range(1, 6), 0.25)
     envelope = np.exp(-0.5 * (frame.rho / np.maximum(outline, 0.3)) ** 2 * 2.4)
-    turbulence = cloud_noise(rng, n, SIDE_PX, SIDE_PX, 1.7)
-    lanes = 1 / (1 + np.exp(4 * (cloud_noise(rng, n, SIDE_PX, SIDE_PX, 1.7) - 0.7)))
+    turbulence = cloud_noise(rng, n, SIDE_PX, 1.7)
+    lanes = 1 / (1 + np.exp(4 * (cloud_noise(rng, n, SIDE_PX, 1.7) - 0.7)))
     gas: Floats = envelope * np.exp(0.75 * turbulence) * lanes
     return gas
 
@@ -180,11 +180,11 @@ def draw_fiber(seed: int, part: str, n: int) -> tuple[NDArray[np.uint8], Labels]
 def _end_faces(rng: np.random.Generator, labels: Labels) -> NDArray[np.uint8]:
     n = len(labels)
     centre_y, centre_x = uniform(rng, -MISALIGNED_PX, MISALIGNED_PX, n), uniform(rng, -MISALIGNED_PX, MISALIGNED_PX, n)
-    v, u = places(SIDE_PX, SIDE_PX, centre_y, centre_x, uniform(rng, 0, np.pi, n))
+    v, u = places(SIDE_PX, centre_y, centre_x, uniform(rng, 0, np.pi, n))
     v = v / per_image(uniform(rng, 0.94, 1, n))
     mode_px = uniform(rng, *MODE_PX, n)
     mode = np.exp(-(u**2 + v**2) / per_image(mode_px) ** 2)
-    passed = 1 + ROUGHNESS * smooth_noise(rng, n, SIDE_PX, SIDE_PX, 1.5)
+    passed = 1 + ROUGHNESS * smooth_noise(rng, n, SIDE_PX, 1.5)
     many = rng.integers(2, DEFECTS_MAX + 1, n)
     for i in range(DEFECTS_MAX):
         there = (labels == 1) & (many > i)
@@ -199,7 +199,7 @@ def _defects(rng: np.random.Generator, y: Floats, x: Floats) -> Floats:
     """Return how much of the amplitude one defect takes, (n, 64, 64): dirt, a pit or a scratch at (y, x) per image."""
     n = len(y)
     kind = per_image(rng.integers(0, 3, n).astype(np.float32))
-    v, u = places(SIDE_PX, SIDE_PX, y, x, uniform(rng, 0, np.pi, n))
+    v, u = places(SIDE_PX, y, x, uniform(rng, 0, np.pi, n))
     r = np.sqrt(u * u + v * v)
     dirt = per_image(uniform(rng, 0.5, 1.0, n)) * bell(r, per_image(uniform(rng, 2.0, 4.0, n)))
     ring_px = per_image(uniform(rng, 2.0, 4.0, n))
@@ -224,7 +224,7 @@ def _tissues(rng: np.random.Generator, labels: Labels) -> NDArray[np.uint8]:
         mine = grain == i
         if mine.any():
             intensity[mine] = _exposure(rng, static_share[mine], n_patterns[mine], grain_px)
-    uneven = np.clip(1 + 0.2 * smooth_noise(rng, n, SIDE_PX, SIDE_PX, 14.0), 0.3, None)
+    uneven = np.clip(1 + 0.2 * smooth_noise(rng, n, SIDE_PX, 14.0), 0.3, None)
     mean = np.exp(uniform(rng, *np.log(TISSUE_INTENSITY).tolist(), n))
     return to_grey(np.sqrt(intensity * uneven * per_image(mean)))
 
@@ -248,10 +248,10 @@ def draw_transient(seed: int, part: str, n: int) -> tuple[NDArray[np.uint8], Lab
 
 def _scenes(rng: np.random.Generator, labels: Labels) -> NDArray[np.uint8]:
     n = len(labels)
-    slow = np.clip(1 + UNEVENNESS * smooth_noise(rng, n, SIDE_PX, SIDE_PX, UNEVEN_PX), 0.3, 1.9)
+    slow = np.clip(1 + UNEVENNESS * smooth_noise(rng, n, SIDE_PX, UNEVEN_PX), 0.3, 1.9)
     background = slow * MEAN_AMPLITUDE * per_image(np.sqrt(uniform(rng, *POWER, n)))
     v, u = places(
-        *(SIDE_PX, SIDE_PX),
+        SIDE_PX,
         uniform(rng, -REACH_PX, REACH_PX, n),
         uniform(rng, -REACH_PX, REACH_PX, n),
         uniform(rng, 0, np.pi, n),
