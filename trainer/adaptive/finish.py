@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.automaton import Automaton, reachable_automaton
+from pans.runtime.bundle.model import Shown
 from pans.runtime.instrument.profile import Profile
 
 from .grow import sum_of
@@ -95,20 +97,6 @@ def calibration_error(posterior: F64, arrived: F64) -> float:
     stated = np.bincount(bins, mass * confidence, BINS)
     found = np.bincount(bins, right, BINS)
     return float(np.abs(stated - found).sum() / mass.sum())
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Finished:
-    """Arrays as `pans.runtime.bundle.automaton.Automaton` and `Shown` take them; posteriors by node, states first."""
-
-    pattern_levels: NDArray[np.uint16]
-    photons_per_level: float
-    levels: int
-    pattern: NDArray[np.int64]
-    dwell: NDArray[np.int64]
-    dwell_steps: int
-    successors: NDArray[np.int64]
-    posteriors: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,8 +209,13 @@ def scale_light(machine: Machine, factor: float) -> None:
                 light.top *= factor
 
 
-def finished(machine: Machine, posteriors: Posteriors, profile: Profile, grid: Grid | None) -> Finished:
-    """Return the arrays of `machine`, whose patterns are whole levels (no `grid`) or bits on the grid."""
+def finished(
+    machine: Machine, posteriors: Posteriors, profile: Profile, grid: Grid | None, counts: bool
+) -> tuple[Shown, Automaton]:
+    """Return what `machine` is in a bundle; its patterns are whole levels (no `grid`) or bits on the grid, `counts` as of `Automaton`.
+
+    States and leaves that no walk reaches are left out, and patterns that none shows.
+    """
     rows, dwells, top, channels = [], [], 0.0, 1
     levels = profile.projector.levels
     for level in machine.levels:
@@ -241,17 +234,12 @@ def finished(machine: Machine, posteriors: Posteriors, profile: Profile, grid: G
         dwells.append(np.ones(level.n_states, np.int64) if grid.by_level else units[::channels, 0])
     n_pixels = rows[0].shape[1]  # what a state shows on all its channels is one
     of_states = np.concatenate(rows).reshape(-1, channels * n_pixels)
-    shown, pattern = np.unique(of_states, axis=0, return_inverse=True)
-    return Finished(
-        shown.reshape(-1, n_pixels),
-        top / (levels - 1),
-        levels,
-        channels * pattern.reshape(-1),
-        np.concatenate(dwells),
-        1 if grid is None or grid.by_level else grid.steps,
-        _numbered(machine),
-        _by_node(machine, posteriors),
-    )
+    steps = 1 if grid is None or grid.by_level else grid.steps
+    nodes = _numbered(machine), _by_node(machine, posteriors)
+    automaton = reachable_automaton(np.arange(len(of_states)), np.concatenate(dwells), steps, *nodes, counts)
+    shown, pattern = np.unique(of_states[automaton.pattern], axis=0, return_inverse=True)
+    automaton = replace(automaton, pattern=channels * pattern.reshape(-1))
+    return Shown(levels, shown.reshape(-1, n_pixels), top / (levels - 1)), automaton
 
 
 def _numbered(machine: Machine) -> NDArray[np.int64]:

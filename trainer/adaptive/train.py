@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.model import Bundle
+from pans.runtime.bundle.automaton import Automaton
+from pans.runtime.bundle.model import Bundle, Shown
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
 from pans.trainer.model.detection import trained_through
@@ -40,7 +41,6 @@ from .budget import (
     with_defaults,
 )
 from .finish import (
-    Finished,
     Posteriors,
     bit_grid,
     calibrated,
@@ -88,9 +88,10 @@ FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch rep
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainedAutomaton:
-    """The arrays of a bundle, and figures of the held-back objects; `prices` are nats per photoelectron detected and sent in the end."""
+    """What a bundle holds, and figures of the held-back objects; `prices` are nats per photoelectron detected and sent in the end."""
 
-    arrays: Finished
+    shown: Shown
+    automaton: Automaton
     machine: Machine
     posteriors: Posteriors
     sight: Sight
@@ -397,10 +398,9 @@ class _Run:
         sight = self.sight()
         posteriors = self._posteriors(sight, held_back)
         measured = figures(self.machine, sight, held_back)
-        arrays = finished(self.machine, posteriors, self.profile, grid)
-        return TrainedAutomaton(
-            arrays, self.machine, posteriors, sight, self.objects.wide, measured, self._prices(), self.options
-        )
+        found = finished(self.machine, posteriors, self.profile, grid, self.options.outcomes > 2)
+        how = self._prices(), self.options
+        return TrainedAutomaton(*found, self.machine, posteriors, sight, self.objects.wide, measured, *how)
 
     def _drawn(self) -> list[Block]:
         """Objects drawn from all that were fitted: the last ones of a file need not be like the others (those of MNIST are darker)."""

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import DOSE_ROUNDING, log_scores, reachable_automaton, walk_nodes
-from pans.runtime.bundle.model import Bundle, Shown, load_bundle, make_bundle, with_expected, write_bundle
+from pans.runtime.bundle.automaton import DOSE_ROUNDING, log_scores, walk_nodes
+from pans.runtime.bundle.model import Bundle, load_bundle, make_bundle, with_expected, write_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import PansError, PlanError
@@ -89,14 +89,7 @@ def export_automaton(
 def bundle_of(
     trained: TrainedAutomaton, task: Task, profile: Profile, name: str, provenance: Mapping[str, Any]
 ) -> Bundle:
-    """Return the bundle of a trained automaton: states and leaves that no walk reaches are left out, and patterns that none shows."""
-    arrays = trained.arrays
-    parts = arrays.pattern, arrays.dwell, arrays.dwell_steps, arrays.successors, arrays.posteriors
-    automaton = reachable_automaton(*parts, trained.options.outcomes > 2)
-    first, pattern = np.unique(automaton.pattern, return_inverse=True)
-    channels = automaton.channels
-    automaton = replace(automaton, pattern=(channels * pattern).astype(np.uint16))
-    shown = (first.astype(np.int64)[:, None] + np.arange(channels)).reshape(-1)
+    """Return the bundle of a trained automaton."""
     facts = {
         **origin(task, profile),
         "held_back": {key: round(value, 6) for key, value in asdict(trained.held_back).items()},
@@ -109,8 +102,8 @@ def bundle_of(
         task=task.name,
         classes=task.classes,
         image_shape=task.image_shape,
-        optics=Shown(arrays.levels, arrays.pattern_levels[shown], arrays.photons_per_level),
-        automaton=automaton,
+        optics=trained.shown,
+        automaton=trained.automaton,
         provenance=facts,
     )
 

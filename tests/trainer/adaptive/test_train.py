@@ -79,8 +79,9 @@ def export_bundle(trained, task, profile=IDEAL):
 
 def test_the_same_seed_gives_the_same_automaton_and_another_seed_another(task, trained):
     again = train_automaton(task, IDEAL, SMALL)
-    for name in ("pattern_levels", "dwell", "successors", "posteriors"):
-        np.testing.assert_array_equal(getattr(again.arrays, name), getattr(trained.arrays, name))
+    np.testing.assert_array_equal(again.shown.pattern_levels, trained.shown.pattern_levels)
+    for name in ("dwell", "successors", "posteriors"):
+        np.testing.assert_array_equal(getattr(again.automaton, name), getattr(trained.automaton, name))
     other = train_automaton(task, IDEAL, replace(SMALL, seed=1))
     assert other.held_back != trained.held_back
 
@@ -92,8 +93,8 @@ def test_an_interrupted_training_ends_at_the_same_automaton(task, trained, tmp_p
     resumed = path.is_file()
     went_on = train_automaton(task, IDEAL, SMALL, checkpoint=path, resume=resumed)
     assert resumed == (stop_at > 7)  # the first state is kept after the first whole epoch of tuning
-    np.testing.assert_array_equal(went_on.arrays.pattern_levels, trained.arrays.pattern_levels)
-    np.testing.assert_array_equal(went_on.arrays.posteriors, trained.arrays.posteriors)
+    np.testing.assert_array_equal(went_on.shown.pattern_levels, trained.shown.pattern_levels)
+    np.testing.assert_array_equal(went_on.automaton.posteriors, trained.automaton.posteriors)
 
 
 def test_a_checkpoint_from_before_an_option_existed_means_its_default(task, trained, tmp_path):
@@ -105,7 +106,7 @@ def test_a_checkpoint_from_before_an_option_existed_means_its_default(task, trai
     with pytest.raises(UsageError, match=r"another training: dose_cap None \(now 9.0\)"):
         train_automaton(task, IDEAL, replace(SMALL, dose_cap=9.0), checkpoint=path, resume=True)
     went_on = train_automaton(task, IDEAL, SMALL, checkpoint=path, resume=True)
-    np.testing.assert_array_equal(went_on.arrays.pattern_levels, trained.arrays.pattern_levels)
+    np.testing.assert_array_equal(went_on.shown.pattern_levels, trained.shown.pattern_levels)
 
 
 def test_a_price_per_exposure_ends_walks_early(task, trained):
@@ -131,7 +132,7 @@ def test_soft_targets_are_kept_and_go_on_from_a_checkpoint(task, tmp_path):
     assert "network" not in stages
     again = train_automaton(task, IDEAL, options, teacher=file, report=lambda p: stages.append(p.stage))
     assert "network" not in stages
-    np.testing.assert_array_equal(went_on.arrays.posteriors, again.arrays.posteriors)
+    np.testing.assert_array_equal(went_on.automaton.posteriors, again.automaton.posteriors)
     assert went_on.options.soft == 1.0
     with pytest.raises(UsageError, match="another file"):
         train_automaton(task, IDEAL, replace(options, teacher_epochs=4), teacher=file)
@@ -142,20 +143,20 @@ def test_dwell_is_in_whole_steps_of_the_profile(task, steps):
     """Without steps a one-bit projector shows one brightness."""
     profile = load_profile("dmd-spad")
     profile = replace(profile, projector=replace(profile.projector, dwell_steps=steps))
-    arrays = train_automaton(task, profile, SMALL).arrays
-    assert set(np.unique(arrays.pattern_levels)) <= {0, 1}
-    assert arrays.dwell_steps == steps
-    assert 1 <= arrays.dwell.min() <= arrays.dwell.max() <= steps
-    assert len(set(arrays.dwell)) > 3 or steps == 1
+    found = train_automaton(task, profile, SMALL)
+    dwell = found.automaton.dwell
+    assert set(np.unique(found.shown.pattern_levels)) <= {0, 1}
+    assert found.automaton.dwell_steps == steps
+    assert 1 <= dwell.min() <= dwell.max() <= steps
+    assert len(set(dwell)) > 3 or steps == 1
     low = profile.projector.peak_photoelectrons_hz * profile.exposure.min_us * 1e-6
-    assert arrays.photons_per_level >= low * (1 - 1e-9)
+    assert found.shown.photons_per_level >= low * (1 - 1e-9)
 
 
 def test_export_refuses_an_automaton_that_is_not_the_models(task, trained, tmp_path):
-    arrays = trained.arrays
-    swapped = replace(arrays, successors=arrays.successors[:, ::-1].copy())
+    swapped = replace(trained.automaton, successors=trained.automaton.successors[:, ::-1].copy())
     with pytest.raises(PansError, match="differ from the trained automaton"):
-        export_automaton(tmp_path / "x.pans", replace(trained, arrays=swapped), task, IDEAL, name="x", provenance={})
+        export_automaton(tmp_path / "x.pans", replace(trained, automaton=swapped), task, IDEAL, name="x", provenance={})
     assert not list(tmp_path.iterdir())
 
 
@@ -202,8 +203,8 @@ def test_a_training_under_a_cap_that_is_resumed_ends_at_the_same_automaton(task,
         train_automaton(task, IDEAL, options, checkpoint=path, resume=True),
         train_automaton(task, IDEAL, options),
     )
-    np.testing.assert_array_equal(resumed.arrays.pattern_levels, whole.arrays.pattern_levels)
-    np.testing.assert_array_equal(resumed.arrays.dwell, whole.arrays.dwell)
+    np.testing.assert_array_equal(resumed.shown.pattern_levels, whole.shown.pattern_levels)
+    np.testing.assert_array_equal(resumed.automaton.dwell, whole.automaton.dwell)
 
 
 def free_bundle(task, profile):
@@ -279,14 +280,14 @@ def test_tasks_that_no_automaton_solves(task, changes, words):
 def test_states_share_few_patterns_and_a_resumed_training_still_does(task, tmp_path):
     options, path, profile = replace(SMALL, patterns=5), tmp_path / "few.checkpoint", load_profile("dmd-spad")
     whole = train_automaton(task, profile, options)
-    assert len(whole.arrays.pattern_levels) <= 5
-    assert len(whole.arrays.pattern) > 20
+    assert len(whole.shown.pattern_levels) <= 5
+    assert len(whole.automaton.pattern) > 20
     compare_walks(export_bundle(whole, task, profile), whole, task, profile)
     assert whole.held_back.accuracy > 0.6
     interrupted(12, task, profile, options, checkpoint=path)
     resumed = train_automaton(task, profile, options, checkpoint=path, resume=True)
-    np.testing.assert_array_equal(resumed.arrays.pattern_levels, whole.arrays.pattern_levels)
-    np.testing.assert_array_equal(resumed.arrays.dwell, whole.arrays.dwell)
+    np.testing.assert_array_equal(resumed.shown.pattern_levels, whole.shown.pattern_levels)
+    np.testing.assert_array_equal(resumed.automaton.dwell, whole.automaton.dwell)
 
 
 def test_one_bright_state_does_not_set_the_exposure(task):
@@ -346,9 +347,9 @@ def test_a_start_that_is_hardly_trained_walks_as_the_bundle_does(task, first):
 def test_dimmed_to_its_budget_no_exposure_is_longer_than_the_brightest_state_needs(task, first):
     bundle, digest = first
     options = started_from(replace(FREE, epochs=1, rate=0.0, photons=2.0), bundle, digest, task, IDEAL)
-    arrays = train_automaton(task, IDEAL, options, start=bundle).arrays
-    assert arrays.photons_per_level < 0.8 * bundle.photons_per_level
-    assert arrays.dwell.max() == arrays.dwell_steps
+    found = train_automaton(task, IDEAL, options, start=bundle)
+    assert found.shown.photons_per_level < 0.8 * bundle.photons_per_level
+    assert found.automaton.dwell.max() == found.automaton.dwell_steps
 
 
 def test_what_cannot_be_started_from_is_refused(task, first):
