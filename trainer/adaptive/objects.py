@@ -52,7 +52,7 @@ class TrainingObjects:
         if n_fit < 1:
             raise ValueError(f"{n_back} of {len(task.train)} training objects held back, allowed: all but one")
         self._fit = task.train.first(n_fit)
-        self._back = Objects(task.train.images[n_fit:], task.train.labels[n_fit:])
+        self._back = task.train.take(slice(n_fit, None))
         self.n_classes, self.n_fit, self.n_pixels = len(task.classes), n_fit, task.image_shape[0] * task.image_shape[1]
         self.image_shape = task.image_shape
         modulator = profile.object_modulator
@@ -89,8 +89,7 @@ class TrainingObjects:
         order = random.permutation(self.n_fit)
         objects = self._moved(self._fit if plain else self._copied(number), number)
         targets = None if self._targets is None else self._targets[order]
-        chosen = Objects(objects.images[order], objects.labels[order])
-        return list(self._blocks(chosen, size, dtype, targets, draw=number))
+        return list(self._blocks(objects.take(order), size, dtype, targets, draw=number))
 
     def held_back(self, size: int, dtype: torch.dtype) -> list[Block]:
         """Return the objects held back, through moves and optics that no epoch has drawn."""

@@ -176,7 +176,7 @@ class _Judge:
         n = len(task.train)
         n_out = max(1, min(LEFT_OUT_MAX, n // LEFT_OUT_PART))
         self.task, self.seed = task, seed
-        self.out = Objects(task.train.images[n - n_out :], task.train.labels[n - n_out :])
+        self.out = task.train.take(slice(n - n_out, None))
         self.frames = -(-FRAMES // n_out)
         self.known = task.train.first(min(n - n_out, WORLD))
 

@@ -31,7 +31,7 @@ from pans.trainer.evaluate.optics import OverOptics, drawn_tables, over_optics
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.heads import Decoders, Heads
 from pans.trainer.options import Conditions
-from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.tasks.registry import Task
 from pans.trainer.train.data import encoder_input, full_scale_photoelectrons
 from pans.trainer.train.loop import Trained
 
@@ -222,7 +222,7 @@ def compare_optics(bundle: Bundle, trained: Trained, task: Task, profile: Profil
     """Hold the light of a passive bundle against the torch encoder on held-out objects; PansError where it differs by 1e-5."""
     if bundle.analyser is None:
         return
-    objects = Objects(task.test.images[:COMPARED_OBJECTS], task.test.labels[:COMPARED_OBJECTS])
+    objects = task.test.first(COMPARED_OBJECTS)
     shown = encoder_input(task, objects, profile, trained.options)
     with torch.no_grad():
         encoder = copy.deepcopy(trained.encoder).double()

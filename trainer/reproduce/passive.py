@@ -205,9 +205,7 @@ def make_cell(asked: Asked, row: PassiveRow, dark: float) -> Row:
 
 def first_of_each_class(objects: Objects) -> Objects:
     """Return the first object of every class that there is, in the order of the classes: not the best ones."""
-    which = np.unique(objects.labels, return_index=True)[1]
-    behind = None if objects.behind is None else objects.behind[which]
-    return Objects(objects.images[which], objects.labels[which], behind)
+    return objects.take(np.unique(objects.labels, return_index=True)[1])
 
 
 def take_samples(head: Heads, p: Tensor, objects: Objects) -> plots.Samples:

@@ -45,10 +45,13 @@ class Objects:
     def __len__(self) -> int:
         return len(self.labels)
 
+    def take(self, which: slice | NDArray[Any]) -> Objects:
+        """Return the objects of a slice, or of those places."""
+        return Objects(self.images[which], self.labels[which], None if self.behind is None else self.behind[which])
+
     def first(self, count: int | None) -> Objects:
         """Return the first `count` objects, or all of them."""
-        behind = None if self.behind is None else self.behind[:count]
-        return Objects(self.images[:count], self.labels[:count], behind)
+        return self.take(slice(count))
 
     @property
     def pictures(self) -> NDArray[np.uint8]:
@@ -254,8 +257,7 @@ def _split(where: Path, objects: Objects) -> tuple[Objects, Objects]:
     held_out = np.arange(len(objects)) % HOLD_OUT_EVERY == HOLD_OUT_EVERY - 1
     places = np.arange(len(objects))
     parts = [places[part][mixed_order(objects.labels[part])] for part in (~held_out, held_out)]
-    train, test = (Objects(objects.images[part], objects.labels[part]) for part in parts)
-    return train, test
+    return objects.take(parts[0]), objects.take(parts[1])
 
 
 def mixed_order(labels: NDArray[np.int64]) -> NDArray[np.int64]:
