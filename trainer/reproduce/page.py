@@ -11,7 +11,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -217,9 +217,14 @@ class Table:
         mine = self.rows(rows)
         if not mine:
             return []
-        heads, body = [column.header for column in self.columns], self._body(mine)
+        heads, body = [column.header for column in self.columns], [[c.cell(row) for c in self.columns] for row in mine]
         if self.across:
-            heads += dict.fromkeys(self.across.cell(row) for row in mine)
+            wide = dict.fromkeys(self.across.cell(row) for row in mine)
+            groups: dict[tuple[str, ...], dict[str, str]] = {}
+            for row, cells in zip(mine, body):
+                groups.setdefault(tuple(cells), {})[self.across.cell(row)] = Column("", self.cell).cell(row)
+            body = [[*group, *(cells.get(head, "-") for head in wide)] for group, cells in groups.items()]
+            heads += wide
         return [
             *([f"### {self.heading}", ""] if self.heading else []),
             "|".join(heads),
@@ -228,17 +233,6 @@ class Table:
             "",
             *(line for claim in self.claims for line in (_counted(*claim, mine), "")),
         ]
-
-    def _body(self, mine: Rows) -> Iterator[list[str]]:
-        if self.across is None:
-            yield from ([column.cell(row) for column in self.columns] for row in mine)
-            return
-        groups: dict[tuple[str, ...], dict[str, str]] = {}
-        for row in mine:
-            cells = groups.setdefault(tuple(column.cell(row) for column in self.columns), {})
-            cells[self.across.cell(row)] = Column("", self.cell).cell(row)
-        heads = dict.fromkeys(self.across.cell(row) for row in mine)
-        yield from ([*group, *(cells.get(head, "-") for head in heads)] for group, cells in groups.items())
 
 
 def _counted(ours: str, theirs: str, key: str, rows: Rows) -> str:
