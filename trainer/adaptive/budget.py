@@ -49,11 +49,6 @@ def budgets_of(options: AutomatonOptions) -> dict[str, float]:
     return found if options.dose_cap is None else found | {SENT: options.dose_cap}
 
 
-def photons_wanted(options: AutomatonOptions) -> float:
-    """Return the budget in photoelectrons detected, about, however it was given; of two the smaller one."""
-    return min((budget * DETECTED_PER[kind] for kind, budget in budgets_of(options).items()), default=DEFAULT_PHOTONS)
-
-
 def first_prices(options: AutomatonOptions) -> Prices:
     """Return the prices at which training spends about the budgets of `options`; each of two begins with half of it."""
     prices, budgets = [], budgets_of(options)
@@ -87,7 +82,9 @@ def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int
 
     Many cheap exposures beat few dear ones; several channels need fewer, in proportion.
     """
-    photons = photons_wanted(options)
+    # the budget in photoelectrons detected, about, however it was given; of two the smaller one
+    budgets = budgets_of(options).items()
+    photons = min((budget * DETECTED_PER[kind] for kind, budget in budgets), default=DEFAULT_PHOTONS)
     wanted, states = min(96, max(16, 4 * round(photons * 0.45 + 7))), 256 if photons <= 12 else 384
     exposures = options.exposures or -(-wanted // options.channels)
     if options.states:

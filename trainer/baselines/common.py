@@ -112,9 +112,8 @@ def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str =
     flat: list[NDArray[Any]] = [part.images.reshape(len(part), n_pixels) for part in (task.train, task.test)]
     train, test = flat
     full, unit = np.ones(n_pixels, np.float32), 1.0
-    if (
-        task.light != "transmission" or task.optics != "none"
-    ):  # a camera sees the intensity of a field, not its amplitude
+    # a camera sees the intensity of a field, not its amplitude
+    if task.light != "transmission" or task.optics != "none":
         if patterns is not None:
             raise ValueError(f"{task.name} is light that reaches us: it takes no patterns, only a direct image")
         lit = (incident_intensity(part.images, task.light, task.optics) for part in (task.train, task.test))

@@ -43,14 +43,9 @@ DOSE_CAP, DRAWS = Range(1e-9, 1e15), Range(1, 100_000, whole=True)
 COUNT = Range(1, 1 << 30, whole=True)
 
 
-def dose_cap(text: str) -> float | str:
-    """Return what `--dose-cap` stands for: a number, or the word for a curve."""
-    return CURVE_WORD if text == CURVE_WORD else float(DOSE_CAP.option(text))
-
-
-def draws(text: str) -> int | str:
-    """Return what `--draws` stands for: a number, or the word for all shifts by whole pixels."""
-    return WHOLE_WORD if text == WHOLE_WORD else int(DRAWS.option(text))
+def number_or(word: str, allowed: Range) -> Callable[[str], Any]:
+    """Return the `type` of an option that stands for a number or for `word`."""
+    return lambda text: word if text == word else allowed.option(text)
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -82,13 +77,13 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--draws",
-        type=draws,
+        type=number_or(WHOLE_WORD, DRAWS),
         metavar="N|whole",
         help="mean over N tables drawn within --optics, read as a tolerance, or that of the training; whole: over all whole-pixel shifts",
     )
     parser.add_argument(
         "--dose-cap",
-        type=dose_cap,
+        type=number_or(CURVE_WORD, DOSE_CAP),
         metavar="N|curve",
         help="no object receives more than N photoelectrons of illumination; curve: accuracy against dose",
     )

@@ -91,10 +91,8 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
     if any(getattr(args, name, None) is not None for name in ("photons", "clicks", "alpha", "illumination")):
         return []
     words = []
-    if args.encoder not in (
-        None,
-        "active",
-    ):  # fixed patterns would have to meet both budgets, an automaton need not use both up
+    # fixed patterns would have to meet both budgets, an automaton need not use both up
+    if args.encoder not in (None, "active"):
         args.photons = recipe.photons
         words.append(f"{recipe.photons:g} photons")
     if args.encoder in (None, "active", AUTOMATON):

@@ -31,6 +31,7 @@ LEAST_SHARE = 1e-4  # of the decisions, for a point of the reliability diagram: 
 PERPLEXITY = 30.0  # the default of van der Maaten and Hinton's code (2008)
 
 F64 = NDArray[np.float64]
+UNIT = "photoelectrons per exposure\nand unit transmission"
 MARKERS = ("o", "s", "^", "D", "v", "P")
 Points = Sequence[Mapping[str, Any]]
 AXES = {
@@ -51,7 +52,7 @@ def write_pictures(
     """Write the pictures that this bundle has into `folder` and return their paths."""
     make_folder(folder)
     matrix = np.abs(bundle.analyser.matrix) if bundle.analyser is not None else bundle.patterns()
-    unit = "photoelectrons per exposure\nand unit transmission" if bundle.analyser is None else "modulus of W"
+    unit = UNIT if bundle.analyser is None else "modulus of W"
     written = [folder / "patterns.png"]
     drawn = page_figures.patterns(matrix.reshape(-1, *bundle.image_shape).astype(np.float64), unit)
     write_file(written[0], drawn, force=force)
@@ -73,16 +74,12 @@ def write_walk_pictures(folder: Path, bundle: Bundle, walks: Walks, *, force: bo
     bins = [(one.probability, one.accuracy, one.share) for one in counted]
     table, measured = confusion_of(walks), measured_walks(walks)
     right, error = 100 * (measured.accuracy_mean or 0.0), 100 * (measured.expected_calibration_error or 0.0)
-    drawn = {
-        "patterns.png": page_figures.patterns(pictures, "photoelectrons per exposure\nand unit transmission"),
-        "reliability.png": page_figures.reliability(
-            bins, f"{bundle.name}: expected calibration error {error:.2f} points (SIMULATED)"
-        ),
-    }
-    for name, picture in drawn.items():
-        write_file(folder / name, picture, force=force)
+    written = [folder / "patterns.png", folder / "reliability.png"]
+    write_file(written[0], page_figures.patterns(pictures, UNIT), force=force)
+    title = f"{bundle.name}: expected calibration error {error:.2f} points (SIMULATED)"
+    write_file(written[1], page_figures.reliability(bins, title), force=force)
     title = f"{bundle.name}: {right:.1f} % right, exact (SIMULATED)"
-    return [folder / name for name in drawn] + [_shown_confusion(folder / "confusion.png", bundle, table, title, force)]
+    return [*written, _shown_confusion(folder / "confusion.png", bundle, table, title, force)]
 
 
 def _confusion(

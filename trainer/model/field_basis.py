@@ -32,7 +32,8 @@ def discriminant_basis(
     regular = RIDGE * torch.eye(coarse.shape[1], dtype=torch.float64)
     found = []
     for label in range(int(labels.max()) + 1):
-        ours, others = (_second_moment(coarse[mask]) for mask in (labels == label, labels != label))
+        parts = coarse[labels == label], coarse[labels != label]
+        ours, others = (rows.T @ rows / len(rows) for rows in parts)  # second moments
         if turned:
             ours, others = (_turned(moment) for moment in (ours, others))
         lower = torch.linalg.cholesky(others + regular)
@@ -68,10 +69,6 @@ def in_pixels(encoder: Encoder, basis: Tensor) -> CoherentField:
     with torch.no_grad():
         whole.weight.copy_(encoder.weight @ basis.T)
     return whole
-
-
-def _second_moment(rows: Tensor) -> Tensor:
-    return rows.T @ rows / len(rows)
 
 
 def _turned(moment: Tensor) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -83,7 +81,5 @@ def full_scale_photoelectrons(task: Task, options: Options) -> float:
     """Return the photoelectrons that one pixel at full scale brings to a passive encoder: 1, or what `input_photons` asks for."""
     if options.input_photons is None:
         return 1.0
-    given = incident_intensity(task.train.images[:CHUNK], task.light, task.optics).reshape(
-        -1, math.prod(task.image_shape)
-    )
-    return options.input_photons / float(given.sum(axis=1).mean())
+    given = incident_intensity(task.train.images[:CHUNK], task.light, task.optics)
+    return options.input_photons / float(given.reshape(len(given), -1).sum(axis=1).mean())
