@@ -152,8 +152,8 @@ def walks_of(
             found = expected(seen, begins)
             sums = found.clicks, found.photons, found.illumination, found.exposures, found.leaves
         else:
-            lit = _Lit(automaton, patterns, seen, scale, conditions.bleaching)
-            sums = _sampled(lit, (law, afterpulses), trials, rng)
+            light = automaton, patterns, seen, scale
+            sums = _sampled(light, (law, afterpulses), conditions.bleaching, trials, rng)
         parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
     joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in OF_OBJECTS}
     by_class = sum((part.by_class for part in parts[1:]), parts[0].by_class)
@@ -219,60 +219,31 @@ def _judged(sums: _Sums, labels: NDArray[np.int64], automaton: Automaton, leaf_l
     return Walks(np.minimum(right, decided), decided, *sums[:4], surprise, by_class, automaton, leaf_labels, labels)
 
 
-class _Lit:
-    """Objects of transmission `seen` (n, pixels) under the states of an automaton; `patterns` times `scale` are the light.
-
-    What bleaches gives less after each exposure of its own walk.
-    """
-
-    def __init__(
-        self, automaton: Automaton, patterns: NDArray[Any], seen: NDArray[Any], scale: float, law: Bleaching
-    ) -> None:
-        self.n, self.automaton, self._patterns, self._scale, self._law = len(seen), automaton, patterns, scale, law
-        # of one exposure of each pattern
-        self.illumination = np.asarray(patterns.sum(axis=1, dtype=np.float64) * scale)
-        self._share = automaton.dwell / automaton.dwell_steps
-        self._displayed = automaton.rows if automaton.channels > 1 else automaton.pattern
-        self._light = pattern_light(patterns, seen, scale) if law.is_none else np.empty(0)
-        self._first = np.asarray(seen, np.float64)
-        self._left = self._first
-
-    def fresh(self) -> None:
-        """Begin new walks, each with an object that no light has met."""
-        self._left = self._first if self._law.is_none else self._first.copy()
-
-    def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
-        """Display one state to each of the objects `rows` int64 (n,), and return the photoelectrons expected, float64 (n,).
-
-        Of several channels (n, channels).
-        """
-        if not self._law.is_none:
-            return self._bleached(rows, states)
-        displayed, share = self._displayed[states], self._share[states]
-        if displayed.ndim > 1:
-            rows, share = rows[:, None], share[:, None]
-        return np.asarray(self._light[rows, displayed] * share)
-
-    def _bleached(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
-        which, of_row = np.unique(states, return_inverse=True)
-        light = self._patterns[self.automaton.pattern[which]].astype(np.float64)
-        light *= (self._scale * self._share[which])[:, None]
-        dose = self._law.doses(light)
-        left = self._left[rows]
-        found = np.einsum("kp,kp->k", left, (light * mean_left(dose))[of_row])
-        self._left[rows] = left * np.exp(-dose)[of_row]
-        return np.asarray(found)
-
-
 def _sampled(
-    lit: _Lit, detector: tuple[ClickLaw | CountLaw, Afterpulses], trials: int, rng: np.random.Generator
+    light: tuple[Automaton, NDArray[Any], NDArray[Any], float],
+    detector: tuple[ClickLaw | CountLaw, Afterpulses],
+    bleaching: Bleaching,
+    trials: int,
+    rng: np.random.Generator,
 ) -> _Sums:
     """Draw `trials` walks of every object; means per walk, and the share of each leaf.
 
+    `light`: an automaton, patterns, objects of transmission `seen` (n, pixels), and photoelectrons per level of a pattern.
     With a time constant a walk begins with the memory that another object's left, and every walk has its own clicks for memory.
     """
-    (law, afterpulses), automaton = detector, lit.automaton
-    n, rows = lit.n, np.arange(lit.n)
+    (automaton, patterns, seen, scale), (law, afterpulses) = light, detector
+    n, rows, share = len(seen), np.arange(len(seen)), automaton.dwell / automaton.dwell_steps
+    of_pattern = patterns.sum(axis=1, dtype=np.float64) * scale  # sent in one exposure
+    steady = pattern_light(patterns, seen, scale) if bleaching.is_none else np.empty(0)
+    left = np.empty(seen.shape)  # of what bleaches, less after each exposure of its own walk
+
+    def bleached(active: NDArray[np.int64], state: NDArray[np.int64]) -> F64:
+        which, of_row = np.unique(state, return_inverse=True)
+        shown = patterns[automaton.pattern[which]] * (scale * share[which])[:, None]
+        dose, before = bleaching.doses(shown), left[active]
+        left[active] = before * np.exp(-dose)[of_row]
+        return np.asarray(np.einsum("kp,kp->k", before, (shown * mean_left(dose))[of_row]))
+
     sums, leaves = np.zeros((4, n)), np.zeros((n, automaton.n_leaves))
     memory = np.zeros((2, n))
     for trial in range(-BEGIN_ROUNDS if afterpulses.time else 0, trials):
@@ -280,15 +251,21 @@ def _sampled(
             sums[:], leaves[:] = 0.0, 0.0
         node, active = np.zeros(n, np.int64), rows
         memory = rng.permutation(memory, axis=1) if afterpulses.time else np.zeros((2, n))
-        lit.fresh()
+        if not bleaching.is_none:
+            left[:] = seen
         for _ in range(automaton.n_slots):
             if not active.size:
                 memory = afterpulses.in_the_dark(memory)
                 continue
             state = node[active]
-            share = automaton.dwell[state] / automaton.dwell_steps
-            sent = lit.illumination[automaton.rows[state]].sum(axis=1) * share
-            photoelectrons = lit.photoelectrons(active, state)
+            displayed, part = automaton.rows[state], share[state]
+            sent = of_pattern[displayed].sum(axis=1) * part
+            if not bleaching.is_none:
+                photoelectrons = bleached(active, state)
+            elif automaton.channels > 1:
+                photoelectrons = steady[active[:, None], displayed] * part[:, None]
+            else:
+                photoelectrons = steady[active, displayed[:, 0]] * part
             clicks = outcome = _drawn(law, photoelectrons, afterpulses.sight(memory[:, active]), rng)
             if automaton.channels > 1:
                 clicks, outcome = outcome.sum(axis=1), outcome @ (1 << np.arange(automaton.channels))
