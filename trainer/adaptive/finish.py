@@ -219,27 +219,25 @@ def finished(
     rows, dwells, top, channels = [], [], 0.0, 1
     levels = profile.projector.levels
     for level in machine.levels:
-        mask, scale = (None if part is None else part.double().cpu().numpy() for part in level.light.displayed())
-        assert mask is not None
-        channels = len(mask) // level.n_states
-        if grid is None:
-            top = float(level.light.top)
-            rows.append(np.rint(mask).astype(np.uint16))
-            dwells.append(np.ones(level.n_states, np.int64))
-            continue
-        assert scale is not None
-        units = np.broadcast_to(np.rint(scale / grid.top * grid.steps).astype(np.int64), (len(mask), 1))
-        top = grid.top
-        rows.append((mask * (units if grid.by_level else levels - 1)).astype(np.uint16))
-        dwells.append(np.ones(level.n_states, np.int64) if grid.by_level else units[::channels, 0])
+        mask, scale = level.light.displayed()
+        shown, dwell = mask.double().cpu().numpy(), np.ones(level.n_states, np.int64)
+        channels = len(shown) // level.n_states
+        if grid is None or scale is None:
+            top, shown = float(level.light.top), np.rint(shown)
+        else:
+            top, units = grid.top, np.rint(scale.double().cpu().numpy() / grid.top * grid.steps).astype(np.int64)
+            shown = shown * (units if grid.by_level else levels - 1)
+            dwell = dwell if grid.by_level else units[::channels, 0]
+        rows.append(shown.astype(np.uint16))
+        dwells.append(dwell)
     n_pixels = rows[0].shape[1]  # what a state shows on all its channels is one
     of_states = np.concatenate(rows).reshape(-1, channels * n_pixels)
     steps = 1 if grid is None or grid.by_level else grid.steps
     nodes = _numbered(machine), _by_node(machine, posteriors)
     automaton = reachable_automaton(np.arange(len(of_states)), np.concatenate(dwells), steps, *nodes, counts)
-    shown, pattern = np.unique(of_states[automaton.pattern], axis=0, return_inverse=True)
+    different, pattern = np.unique(of_states[automaton.pattern], axis=0, return_inverse=True)
     automaton = replace(automaton, pattern=channels * pattern.reshape(-1))
-    return Shown(levels, shown.reshape(-1, n_pixels), top / (levels - 1)), automaton
+    return Shown(levels, different.reshape(-1, n_pixels), top / (levels - 1)), automaton
 
 
 def _numbered(machine: Machine) -> NDArray[np.int64]:

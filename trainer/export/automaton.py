@@ -73,11 +73,9 @@ def export_automaton(
     found = measure_walks(bundle, task.test, profile, conditions)
     first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, conditions)
     # what a bundle says of itself is of objects that do not bleach, as `pans evaluate` judges unless it is told
-    steady = (
-        found
-        if conditions.bleaching.is_none
-        else measure_walks(bundle, task.test, profile, replace(conditions, bleaching=NO_BLEACHING))
-    )
+    steady = found
+    if not conditions.bleaching.is_none:
+        steady = measure_walks(bundle, task.test, profile, replace(conditions, bleaching=NO_BLEACHING))
     expected = expected_figures(steady, profile.name, task.name, "test")
     with whole_file(path, force=force) as unchecked:
         write_bundle(with_expected(bundle, expected), unchecked)
