@@ -252,11 +252,15 @@ def _check_fits(options: AutomatonOptions, profile: Profile) -> None:
             f"an automaton shows one pattern after another, {profile.name} is a {profile.mode} profile",
             remedy="choose a sequential profile, such as ideal or dmd-spad",
         )
-    why = cannot_count(profile, options.outcomes)
-    if why:
+    if why := cannot_count(profile, options.outcomes):
         raise PlanError(why, remedy="--outcomes 2, or a profile whose detector.photon_number_max is at least one less")
-    if options.channels > 1:
-        _check_channels(options, profile)
+    if options.channels > 1 and options.outcomes > 2:
+        raise UsageError(
+            f"--channels {options.channels} with --outcomes {options.outcomes}: detectors that are read at once click, they do not count",
+            remedy="leave out one of them",
+        )
+    if options.channels > 1 and (why := cannot_read_at_once(profile, options.channels)):
+        raise PlanError(why, remedy="fewer --channels, or a sequential profile with as many detectors: dmd-four-snspd")
     most = states_at_most(exposures, states, options.successors)
     if most > STATES_MAX:
         raise PlanError(
@@ -278,14 +282,3 @@ def _check_fits(options: AutomatonOptions, profile: Profile) -> None:
     clicks = exposures * options.channels
     if options.clicks is not None and options.clicks >= clicks:
         raise UsageError(f"--clicks is {options.clicks}, allowed: below {clicks}, one click per exposure at most")
-
-
-def _check_channels(options: AutomatonOptions, profile: Profile) -> None:
-    if options.outcomes > 2:
-        raise UsageError(
-            f"--channels {options.channels} with --outcomes {options.outcomes}: detectors that are read at once click, they do not count",
-            remedy="leave out one of them",
-        )
-    why = cannot_read_at_once(profile, options.channels)
-    if why:
-        raise PlanError(why, remedy="fewer --channels, or a sequential profile with as many detectors: dmd-four-snspd")

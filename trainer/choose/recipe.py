@@ -74,10 +74,8 @@ class Recipe:
 def choose_encoder(profile: Profile) -> tuple[str, str]:
     """Return the encoder for a user's own images, and the reason: an automaton wherever the profile can show one."""
     if profile.mode == "sequential":
-        return (
-            "automaton",
-            "an automaton: at equal photons it decides better than fixed patterns (--encoder active for those)",
-        )
+        why = "an automaton: at equal photons it decides better than fixed patterns (--encoder active for those)"
+        return "automaton", why
     return "active", f"fixed patterns: {profile.name} is a {profile.mode} profile, an automaton needs a sequential one"
 
 

@@ -56,11 +56,16 @@ def fit_head(
         counts = torch.stack([readings.sample(p[which], random) for _ in range(number)]).sum(dim=0)
         return loss_of(head((counts / number).float()), target[which]).mean()
 
+    def sampled() -> Losses:
+        for epoch in range(SAMPLED_EPOCHS):
+            for which in torch.randperm(len(p), generator=random).split(batch):
+                loss = loss_of(head(readings.sample(p[which], random).float()), target[which]).mean()
+                yield rate * (1 - epoch / SAMPLED_EPOCHS), loss
+
+    losses = sampled()
     if readings.outcomes ** p.shape[1] <= EXACT_WORDS_MAX and loss_of is cross_entropy:
         assert not isinstance(head, PictureHead), "pictures have no cross-entropy"
         losses = exact_losses(head, joint_distribution(p, target, head.output.out_features, readings), readings)
-    else:
-        losses = _sampled_losses(head, p, target, loss_of, random, batch, rate, readings)
     descend(head, losses, of_shots if shots > 1 else None)
 
 
@@ -83,22 +88,6 @@ def exact_losses(head: Heads, joint: Tensor, readings: Readings = CLICKS) -> Los
     for step in range(STEPS):
         rate = RATE * 0.5 * (1 + math.cos(math.pi * step / STEPS))
         yield rate, -(target * torch.log_softmax(head(words), dim=1)).sum()
-
-
-def _sampled_losses(
-    head: Heads,
-    p: Tensor,
-    target: Tensor,
-    loss_of: LossOf,
-    random: torch.Generator,
-    batch: int,
-    rate: float,
-    readings: Readings,
-) -> Losses:
-    for epoch in range(SAMPLED_EPOCHS):
-        for which in torch.randperm(len(p), generator=random).split(batch):
-            loss = loss_of(head(readings.sample(p[which], random).float()), target[which]).mean()
-            yield rate * (1 - epoch / SAMPLED_EPOCHS), loss
 
 
 def descend(head: Heads, losses: Losses, more: Callable[[], Tensor] | None = None) -> None:

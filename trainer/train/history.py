@@ -117,14 +117,11 @@ def draw_evolution(
     size = (1.15 * len(epochs) + 0.4, 1.15 * rows + 0.6)
     figure, axes = pyplot.subplots(rows, len(epochs), figsize=size, layout="constrained", squeeze=False)
     for column, epoch in enumerate(epochs):
+        axes[0, column].set_title(f"{epoch}", fontsize=8)
         for row in range(rows):
-            axis: Any = axes[row, column]
-            axis.imshow(patterns[epoch][row].reshape(image_shape), cmap="magma", vmin=0)
-            axis.set(xticks=[], yticks=[])
-            if row == 0:
-                axis.set_title(f"{epoch}", fontsize=8)
-            if column == 0:
-                axis.set_ylabel(f"pattern {row}", fontsize=8)
+            axes[row, column].imshow(patterns[epoch][row].reshape(image_shape), cmap="magma", vmin=0)
+            axes[row, column].set(xticks=[], yticks=[])
+            axes[row, 0].set_ylabel(f"pattern {row}", fontsize=8)
     figure.suptitle("patterns after so many epochs, each up to its own brightest pixel (SIMULATED)", fontsize=9)
     save_figure(figure, path, force=force)
 
