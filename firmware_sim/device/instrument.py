@@ -72,9 +72,8 @@ class Instrument:
         self._epoch, self._tick, self._tick_hz = epoch, power_on_tick, profile.clock.tick_hz
         self._draws = 0  # exposures drawn in earlier runs
         projector = profile.projector
-        automata = (
-            profile.mode == "sequential" and optics is None
-        )  # what the clicks choose must be shown one after another
+        # what the clicks choose must be shown one after another
+        automata = profile.mode == "sequential" and optics is None
         self.extension = Extension(projector.automaton_states, projector.dwell_steps) if automata else None
         self.number_max = largest_number(profile) if automata else 1  # of a detector that counts photons
         self.channels_max = profile.detector.channels if automata else 1  # detectors that are read at once

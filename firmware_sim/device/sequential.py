@@ -41,9 +41,8 @@ class Timetable:
     def __init__(self, program: Program, arm: Arm) -> None:
         self._program, self._start_tick = program, arm.start_tick
         self._n_cycles = arm.n_cycles or None
-        self.end_tick = (
-            None if self._n_cycles is None else arm.start_tick + self._n_cycles * program.cycle_ticks
-        )  # at which the last cycle is over; None when the run lasts until STOP
+        # at which the last cycle is over; None when the run lasts until STOP
+        self.end_tick = None if self._n_cycles is None else arm.start_tick + self._n_cycles * program.cycle_ticks
 
     @property
     def n_exposures(self) -> int | None:

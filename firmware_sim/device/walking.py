@@ -94,9 +94,8 @@ class PatternLight:
         self._profile, self._scene, self._levels, self._exposure_us = profile, scene, levels, exposure_us
         self._at_a_time = max(1, min(scene.n_objects, BLOCK_ENTRIES // len(levels)))
         self._blocks: dict[int, F64] = {}
-        for block in range(
-            min(MAX_BLOCKS, -(-scene.n_objects // self._at_a_time))
-        ):  # a patternset that does not fit raises here
+        # a patternset that does not fit raises here
+        for block in range(min(MAX_BLOCKS, -(-scene.n_objects // self._at_a_time))):
             self._block(block)
 
     def of(self, number: int) -> F64:

@@ -177,9 +177,8 @@ class ChildLink:
         self._closed = False
         self._child = _spawn(options)
         try:
-            _check_scene(
-                options, profile
-            )  # while the child starts: it has far more to load before it could tell a mistake
+            # while the child starts: it has far more to load before it could tell a mistake
+            _check_scene(options, profile)
             self._url = self._first_line()
             self._connect()
         except BaseException:

@@ -101,9 +101,8 @@ def _correlations(pictures: NDArray[np.float64], patterns: NDArray[np.uint16], o
     n, height, width = pictures.shape
     length = 2 * width  # shifts -width + 1 .. width - 1 do not wrap around
     light = np.fft.rfft(patterns, length, axis=2).transpose(2, 1, 0)  # (frequencies, rows, patterns)
-    passed = np.ascontiguousarray(
-        np.fft.rfft(pictures, length, axis=2).conj().transpose(2, 0, 1)
-    )  # (frequencies, n, rows)
+    # (frequencies, n, rows)
+    passed = np.ascontiguousarray(np.fft.rfft(pictures, length, axis=2).conj().transpose(2, 0, 1))
     sums = np.zeros((n, 2 * offset_px + 1, 2 * width + 1, len(patterns)))
     for index, down in enumerate(range(-offset_px, offset_px + 1)):
         field, picture = slice(max(down, 0), height + min(down, 0)), slice(max(-down, 0), height + min(-down, 0))

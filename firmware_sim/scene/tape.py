@@ -73,9 +73,8 @@ class TapeFlow:
         self._n_marked = 0
         self.probability: F64 | None = None
         self._keep_from = 0  # pitch number; what lies before may be forgotten
-        self._margin = 4 + math.ceil(
-            exposures.longest_period_ticks / self._pitch_ticks
-        )  # a window's exposure may begin so much earlier
+        # a window's exposure may begin so much earlier
+        self._margin = 4 + math.ceil(exposures.longest_period_ticks / self._pitch_ticks)
 
     def take_marks(self, before_tick: int) -> I64:
         """Return the rows (marks.py) of windows whose tick after the start is below `before_tick`, and go on to those after."""

@@ -134,9 +134,8 @@ def pad_float(chain: tuple[Layer, ...]) -> Padded:
     sizes = _padded_sizes([chain[0].weights.shape[0], *(layer.weights.shape[1] for layer in chain)])
     bits, groups = _groups(chain[0], sizes[1])
     n_weights = sum(n_in * n_out for n_in, n_out in pairwise(sizes))
-    numbers = np.zeros(
-        n_weights + sum(sizes[1:]) + len(groups), np.float32
-    )  # large heads are in memory once more, not thrice
+    # large heads are in memory once more, not thrice
+    numbers = np.zeros(n_weights + sum(sizes[1:]) + len(groups), np.float32)
     _lay_out([layer.weights for layer in chain], sizes, numbers)
     start = n_weights
     for n_out, layer in zip(sizes[1:], chain):

@@ -67,9 +67,8 @@ def rows_of(bundle: Bundle, clicks: Labelled) -> Rows:
         vectors, row = np.unique(clicks.counts, axis=0, return_inverse=True)
         seen = vectors / (clicks.shots * bundle.largest)
         of_head = reference_scores(layers, seen)
-        shots = (
-            clicks.shots if bundle.largest == 1 else 1
-        )  # the noise of shots is known of clicks, not of photon numbers
+        # the noise of shots is known of clicks, not of photon numbers
+        shots = clicks.shots if bundle.largest == 1 else 1
         evidence = evidence_of(of_head, seen, row.reshape(-1), clicks.truth, clicks.object_id, shots)
         return Rows(evidence, np.arange(len(vectors)), own_posteriors=False)
     number, row = np.unique(found, return_inverse=True)

@@ -33,9 +33,8 @@ class WalkFigures:
     turn_us: dict[str, float] | None  # from a block's arrival until the next state's name had left; host-driven only
     turn_budget_us: float | None  # from the end of an exposure to the beginning of the next one
     expected: dict[str, Any] | None  # as the bundle says it: for its profile, task and split
-    expected_off_stderr: (
-        float | None
-    )  # measured accuracy less the expected one, in standard errors, on the same profile
+    # measured accuracy less the expected one, in standard errors, on the same profile
+    expected_off_stderr: float | None
 
     def as_json(self) -> dict[str, Any]:
         """Return the figures under the contract's keys."""
