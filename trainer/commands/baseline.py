@@ -24,19 +24,12 @@ OBJECTS = Range(1, 1 << 30, whole=True)
 def _configure(parser: argparse.ArgumentParser) -> None:
     add_options(parser, BaselineOptions, defaults={"method": None})
     parser.add_argument("--task", required=True, metavar="T", help="as of `pans train`")
-    parser.add_argument(
-        "--photons",
-        type=LIGHT.option,
-        nargs="+",
-        default=[],
-        metavar="N",
-        help="photoelectrons detected per decision, averaged over the test objects (default: 5 10 17 30 100 300)",
-    )
+    words = "photoelectrons detected per decision, averaged over the test objects (default: 5 10 17 30 100 300)"
+    parser.add_argument("--photons", type=LIGHT.option, nargs="+", default=[], metavar="N", help=words)
     words = "photoelectrons sent per decision, instead or besides: what a clear object would give"
     parser.add_argument("--illumination", type=LIGHT.option, nargs="+", default=[], metavar="L", help=words)
-    parser.add_argument(
-        "--objects", type=OBJECTS.option, metavar="N", help="only the first N test objects (default: all)"
-    )
+    words = "only the first N test objects (default: all)"
+    parser.add_argument("--objects", type=OBJECTS.option, metavar="N", help=words)
     words = "only the first N training objects, 10 or more"
     parser.add_argument("--train-objects", type=Range(10, 1 << 30, whole=True).option, metavar="N", help=words)
     add_threads(parser)

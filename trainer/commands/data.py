@@ -24,9 +24,8 @@ PARTS = ("test", "train")
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "action", choices=("list", "fetch", "scene"), help="what is there, fetch what is not, or write a scene"
-    )
+    words = "what is there, fetch what is not, or write a scene"
+    parser.add_argument("action", choices=("list", "fetch", "scene"), help=words)
     parser.add_argument("names", nargs="*", metavar="NAME", help="public sets (default: all), or the scene's one task")
     parser.add_argument("-o", "--out", type=new_file, metavar="FILE.npz", help="the scene to write")
     parser.add_argument("--objects", type=int, metavar="N", help="the first N objects of the part (default: all)")

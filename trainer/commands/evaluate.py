@@ -51,52 +51,29 @@ def number_or(word: str, allowed: Range) -> Callable[[str], Any]:
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bundle", metavar="BUNDLE", help="a .pans file, or the name of a shipped bundle")
     parser.add_argument("--task", metavar="T", help="as of `pans train` (default: what the bundle was trained on)")
-    parser.add_argument(
-        "--shots", type=COUNT.option, default=1, metavar="K", help="exposures of every pattern (default 1)"
-    )
+    words = "exposures of every pattern (default 1)"
+    parser.add_argument("--shots", type=COUNT.option, default=1, metavar="K", help=words)
     way = parser.add_mutually_exclusive_group()
-    way.add_argument(
-        "--trials",
-        type=COUNT.option,
-        metavar="N",
-        help="sampled decisions per object (default 30; of an automaton: exact)",
-    )
-    way.add_argument(
-        "--exact", action="store_true", help="sum over all click words or walks: no trials, no sampling error"
-    )
+    words = "sampled decisions per object (default 30; of an automaton: exact)"
+    way.add_argument("--trials", type=COUNT.option, metavar="N", help=words)
+    words = "sum over all click words or walks: no trials, no sampling error"
+    way.add_argument("--exact", action="store_true", help=words)
     words = "only the first N held-out objects (default: all)"
     parser.add_argument("--objects", type=COUNT.option, metavar="N", help=words)
     add_options(parser, Conditions)
     words = "draw confusion, a map of the clicks, patterns, reliability (extra plot)"
     parser.add_argument("--pictures", type=Path, metavar="DIR", help=words)
     add_force(parser)
-    parser.add_argument(
-        "--optics",
-        metavar="SPEC",
-        help="where objects stand on the pattern grid, like shift=0.7,0.3:rotate=1.5:psf=0.7:black=0.002; tolerance: a curve of each",
-    )
-    parser.add_argument(
-        "--draws",
-        type=number_or(WHOLE_WORD, DRAWS),
-        metavar="N|whole",
-        help="mean over N tables drawn within --optics, read as a tolerance, or that of the training; whole: over all whole-pixel shifts",
-    )
-    parser.add_argument(
-        "--dose-cap",
-        type=number_or(CURVE_WORD, DOSE_CAP),
-        metavar="N|curve",
-        help="no object receives more than N photoelectrons of illumination; curve: accuracy against dose",
-    )
-    parser.add_argument(
-        "--bleach",
-        metavar="D0[:mixed]",
-        help="objects bleach: 1/e of a pixel's light is left after D0 photoelectrons of illumination; mixed: after that mean of all pixels",
-    )
-    parser.add_argument(
-        "--compare",
-        action=argparse.BooleanOptionalAction,
-        help="with direct imaging, an ideal camera, at equal photons and equal illumination (default: where that takes seconds)",
-    )
+    words = "where objects stand on the pattern grid, like shift=0.7,0.3:rotate=1.5:psf=0.7:black=0.002; tolerance: a curve of each"
+    parser.add_argument("--optics", metavar="SPEC", help=words)
+    words = "mean over N tables drawn within --optics, read as a tolerance, or that of the training; whole: over all whole-pixel shifts"
+    parser.add_argument("--draws", type=number_or(WHOLE_WORD, DRAWS), metavar="N|whole", help=words)
+    words = "no object receives more than N photoelectrons of illumination; curve: accuracy against dose"
+    parser.add_argument("--dose-cap", type=number_or(CURVE_WORD, DOSE_CAP), metavar="N|curve", help=words)
+    words = "objects bleach: 1/e of a pixel's light is left after D0 photoelectrons of illumination; mixed: after that mean of all pixels"
+    parser.add_argument("--bleach", metavar="D0[:mixed]", help=words)
+    words = "with direct imaging, an ideal camera, at equal photons and equal illumination (default: where that takes seconds)"
+    parser.add_argument("--compare", action=argparse.BooleanOptionalAction, help=words)
     add_data_dir(parser)
 
 

@@ -23,18 +23,12 @@ WAYS = ("information", "dose")
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bundle", metavar="BUNDLE", help="a .pans file, or the name of a shipped bundle")
-    parser.add_argument(
-        "--by",
-        choices=(*WAYS, "none"),
-        default="information",
-        help="most information per pattern, or per light that it sends; none: leave the order as it is (default information)",
+    words = (
+        "most information per pattern, or per light that it sends; none: leave the order as it is (default information)"
     )
-    parser.add_argument(
-        "--dose-cap",
-        type=DOSE_CAP.option,
-        metavar="N",
-        help="keep only the first patterns, as many as stay below N photoelectrons of illumination",
-    )
+    parser.add_argument("--by", choices=(*WAYS, "none"), default="information", help=words)
+    words = "keep only the first patterns, as many as stay below N photoelectrons of illumination"
+    parser.add_argument("--dose-cap", type=DOSE_CAP.option, metavar="N", help=words)
     parser.add_argument("--bleach", metavar="D0[:mixed]", help="order for objects that bleach, as of `pans evaluate`")
     parser.add_argument("--task", metavar="T", help="as of `pans train` (default: what the bundle was trained on)")
     parser.add_argument("--profile", metavar="P", help="default: what the bundle was trained for")

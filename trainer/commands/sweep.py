@@ -31,9 +31,8 @@ HEARTBEAT_S = 60  # a trial without a sign of life for twice that time is closed
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", metavar="TASK", help="as of `pans train`")
-    parser.add_argument(
-        "--storage", required=True, metavar="FILE or URL", help="a journal file, or a database URL that machines share"
-    )
+    words = "a journal file, or a database URL that machines share"
+    parser.add_argument("--storage", required=True, metavar="FILE or URL", help=words)
     parser.add_argument("--study", metavar="NAME", help="default: from task, profile and patterns")
     words = "finished trials of the whole study (default 20)"
     parser.add_argument("--trials", type=TRIALS.option, default=20, metavar="N", help=words)

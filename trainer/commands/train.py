@@ -38,59 +38,33 @@ ONLY_FIXED = (*(name for name in option_names(Options) if name not in SHARED), "
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "task", metavar="TASK", help="a name (`pans data list`), a .npz file, or a folder of class folders"
-    )
+    words = "a name (`pans data list`), a .npz file, or a folder of class folders"
+    parser.add_argument("task", metavar="TASK", help=words)
     parser.add_argument("--profile", metavar="P", help="default: oled-qcmos; of an automaton ideal")
-    parser.add_argument(
-        "--encoder",
-        choices=(*ENCODERS, AUTOMATON),
-        help="how light meets the object (default: what the task's is); automaton: each pattern follows from the clicks before it",
-    )
+    words = "how light meets the object (default: what the task's is); automaton: each pattern follows from the clicks before it"
+    parser.add_argument("--encoder", choices=(*ENCODERS, AUTOMATON), help=words)
     add_unset_options(parser, Options)
-    parser.add_argument(
-        "--unconstrained",
-        action="store_true",
-        help="a passive encoder may give more light than it gets, as the paper's does",
-    )
-    parser.add_argument(
-        "--order",
-        choices=("information", "dose"),
-        help="display the patterns in the order that tells most first, per pattern or per light that it sends",
-    )
+    words = "a passive encoder may give more light than it gets, as the paper's does"
+    parser.add_argument("--unconstrained", action="store_true", help=words)
+    words = "display the patterns in the order that tells most first, per pattern or per light that it sends"
+    parser.add_argument("--order", choices=("information", "dose"), help=words)
     automata = parser.add_argument_group("of an automaton")
     add_unset_options(automata, AutomatonOptions, omit=SHARED)
-    automata.add_argument(
-        "--teacher",
-        type=Path,
-        metavar="FILE.npz",
-        help="the network's answers are read from there; where nothing is, they are made and kept there",
-    )
-    automata.add_argument(
-        "--start",
-        type=Path,
-        metavar="OLD.pans",
-        help="train on the patterns and states of that one, instead of growing new ones",
-    )
-    parser.add_argument(
-        "--data-seed", type=SEED.option, default=0, metavar="N", help="of a drawn task's images (default 0)"
-    )
+    words = "the network's answers are read from there; where nothing is, they are made and kept there"
+    automata.add_argument("--teacher", type=Path, metavar="FILE.npz", help=words)
+    words = "train on the patterns and states of that one, instead of growing new ones"
+    automata.add_argument("--start", type=Path, metavar="OLD.pans", help=words)
+    words = "of a drawn task's images (default 0)"
+    parser.add_argument("--data-seed", type=SEED.option, default=0, metavar="N", help=words)
     parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
-    parser.add_argument(
-        "--device",
-        choices=("cpu", "cuda"),
-        default="cpu",
-        help="where to compute (default cpu); changes the random numbers",
-    )
+    words = "where to compute (default cpu); changes the random numbers"
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help=words)
     add_threads(parser)
     parser.add_argument("--resume", action="store_true", help="continue from OUT.pans.checkpoint")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     add_data_dir(parser)
-    parser.add_argument(
-        "--as-is",
-        action="store_true",
-        help="of your own images: choose nothing from them, take the options and defaults as they are",
-    )
+    words = "of your own images: choose nothing from them, take the options and defaults as they are"
+    parser.add_argument("--as-is", action="store_true", help=words)
     add_new_bundle(parser)
 
 
