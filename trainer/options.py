@@ -343,23 +343,17 @@ def _check_together(options: Options) -> None:
     if options.optics is not None:
         check_optics(options.optics)
         if not active:
-            raise UsageError(
-                f"--optics: a {options.encoder} encoder shows no patterns that could miss the object",
-                remedy="leave it out, or use --encoder active or automaton",
-            )
+            what = f"--optics: a {options.encoder} encoder shows no patterns that could miss the object"
+            raise UsageError(what, remedy="leave it out, or use --encoder active or automaton")
     if options.bleach is not None:
         with as_usage_error():
             bleaching_of(options.bleach)
         if not active or options.optics is not None or options.shots > 1:
-            raise UsageError(
-                "--bleach is for patterns that are sent once each, on perfect optics: not for a passive encoder, --optics or --shots",
-                remedy="leave --bleach out, or the other one",
-            )
+            what = "--bleach is for patterns that are sent once each, on perfect optics: not for a passive encoder, --optics or --shots"
+            raise UsageError(what, remedy="leave --bleach out, or the other one")
     if counted and (not active or options.head in PICTURE_HEADS or options.bleach is not None):
-        raise UsageError(
-            f"--outcomes {options.outcomes} is for patterns that are sent, and classes: not for a passive encoder, pictures or --bleach",
-            remedy="leave --outcomes out, or the other one",
-        )
+        what = f"--outcomes {options.outcomes} is for patterns that are sent, and classes: not for a passive encoder, pictures or --bleach"
+        raise UsageError(what, remedy="leave --outcomes out, or the other one")
     if counted and options.estimator not in COUNTED_ESTIMATORS:
         raise UsageError(
             f"--estimator {options.estimator} knows clicks alone, allowed with --outcomes {options.outcomes}: "
@@ -373,10 +367,8 @@ def _check_together(options: Options) -> None:
 def check_order(order: str | None, options: Options) -> None:
     """Refuse --order where there is none, before anything is trained."""
     if order and (options.encoder != "active" or options.head != "mlp" or options.bleach):
-        raise UsageError(
-            "--order is for patterns that are sent and the head mlp; trained through bleaching, they have an order already",
-            remedy="leave --order out",
-        )
+        what = "--order is for patterns that are sent and the head mlp; trained through bleaching, they have an order already"
+        raise UsageError(what, remedy="leave --order out")
 
 
 def _check_fits(options: Options, profile: Profile) -> None:
@@ -390,21 +382,15 @@ def _check_fits(options: Options, profile: Profile) -> None:
             remedy="use a profile whose detector counts: --profile dmd-qcmos",
         )
     if options.bleach is not None and not sequential:
-        raise UsageError(
-            f"--bleach: {profile.name} displays all patterns at once, none meets what another has left",
-            remedy="leave it out",
-        )
+        what = f"--bleach: {profile.name} displays all patterns at once, none meets what another has left"
+        raise UsageError(what, remedy="leave it out")
     channels, memory = profile.detector.channels, profile.projector.pattern_memory
     if not sequential and options.features > channels:
-        raise PlanError(
-            f"{options.features} patterns at once, {profile.name} has {channels} detector channels",
-            remedy=f"--features {channels}, or fewer",
-        )
+        what = f"{options.features} patterns at once, {profile.name} has {channels} detector channels"
+        raise PlanError(what, remedy=f"--features {channels}, or fewer")
     if options.encoder == "active" and options.features > memory:
-        raise PlanError(
-            f"{options.features} patterns, the pattern memory of {profile.name} holds {memory}",
-            remedy=f"--features {memory}, or fewer",
-        )
+        what = f"{options.features} patterns, the pattern memory of {profile.name} holds {memory}"
+        raise PlanError(what, remedy=f"--features {memory}, or fewer")
 
 
 def plain_options(options: Options) -> dict[str, Any]:

@@ -144,10 +144,8 @@ def started_from(
     found = {"exposures": exposures, "states": states, "outcomes": outcomes, "channels": automaton.channels}
     for name, value in found.items():
         if getattr(options, name) not in (0, value):
-            raise UsageError(
-                f"--{name} is {getattr(options, name)}, the automaton of --start has {value}",
-                remedy=f"--{name} {value}",
-            )
+            what = f"--{name} is {getattr(options, name)}, the automaton of --start has {value}"
+            raise UsageError(what, remedy=f"--{name} {value}")
     if (start.classes, start.image_shape) != (task.classes, task.image_shape):
         raise UsageError(
             f"--start: {start.name} tells {len(start.classes)} classes of images {start.image_shape}, "
@@ -168,9 +166,8 @@ def check_automaton_options(options: AutomatonOptions, task: Task, profile: Prof
     """Raise UsageError or PlanError for what cannot be trained for this task on this profile."""
     check_ranges(options)
     if options.photons is not None and options.clicks is not None:
-        raise UsageError(
-            "an automaton is trained for --photons or --clicks, not for both", remedy="leave one of them out"
-        )
+        what = "an automaton is trained for --photons or --clicks, not for both"
+        raise UsageError(what, remedy="leave one of them out")
     if not budgets_of(options):
         raise UsageError(
             "an automaton is trained for a budget of light",
@@ -194,9 +191,8 @@ def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None
                 remedy=f"--bleach {law.dose:g}:mixed --dose-cap D: every walk then sends the same light, exposure by exposure",
             )
         if options.optics is not None:
-            raise UsageError(
-                "--bleach: an automaton is trained for it on perfect optics only", remedy="leave out --optics"
-            )
+            what = "--bleach: an automaton is trained for it on perfect optics only"
+            raise UsageError(what, remedy="leave out --optics")
         fades = fades_of(options, math.prod(task.image_shape))
         rounding = ROUNDED / bit_grid(1.0, profile).steps * options.dose_cap / fades
         if rounding > FADES_WITHIN:
@@ -208,23 +204,18 @@ def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None
     if options.dose_cap is None:
         return
     if options.illumination is not None:
-        raise UsageError(
-            "--dose-cap is the light that every walk sends: --illumination adds nothing", remedy="leave one of them out"
-        )
+        what = "--dose-cap is the light that every walk sends: --illumination adds nothing"
+        raise UsageError(what, remedy="leave one of them out")
     if options.channels > 1:
         raise UsageError("--dose-cap: allowed with one detector only", remedy="leave out --channels")
     if options.grey or (profile.projector.levels == 2 and profile.projector.dwell_steps == 1):
-        raise UsageError(
-            "--dose-cap: each state needs a one-bit pattern and a brightness of its own",
-            remedy="leave out --grey, or choose a profile with levels or projector.dwell_steps",
-        )
+        what = "--dose-cap: each state needs a one-bit pattern and a brightness of its own"
+        raise UsageError(what, remedy="leave out --grey, or choose a profile with levels or projector.dwell_steps")
     exposures, states = with_defaults(options, profile)
     most = states_at_most(exposures, states, options.successors)
     if patterns_at_most(options, profile) < most:
-        raise UsageError(
-            f"--dose-cap: states share no patterns, up to {most} may be needed, {patterns_at_most(options, profile)} are allowed",
-            remedy="fewer --exposures or --states, or leave out --patterns",
-        )
+        what = f"--dose-cap: states share no patterns, up to {most} may be needed, {patterns_at_most(options, profile)} are allowed"
+        raise UsageError(what, remedy="fewer --exposures or --states, or leave out --patterns")
 
 
 def fades_of(options: AutomatonOptions, pixels: int) -> float:
@@ -234,45 +225,33 @@ def fades_of(options: AutomatonOptions, pixels: int) -> float:
 
 def _check_task(task: Task) -> None:
     if task.target == "image":
-        raise UsageError(
-            f"--encoder automaton: {task.name} asks for a picture, the leaves of an automaton hold classes",
-            remedy="use --encoder coherent",
-        )
+        what = f"--encoder automaton: {task.name} asks for a picture, the leaves of an automaton hold classes"
+        raise UsageError(what, remedy="use --encoder coherent")
     if task.light != "transmission" or task.optics != "none":
-        raise UsageError(
-            f"--encoder automaton: in {task.name} the light is the scene's own, no pattern of ours can follow the clicks",
-            remedy="use a passive encoder: coherent or incoherent",
-        )
+        what = f"--encoder automaton: in {task.name} the light is the scene's own, no pattern of ours can follow the clicks"
+        raise UsageError(what, remedy="use a passive encoder: coherent or incoherent")
 
 
 def _check_fits(options: AutomatonOptions, profile: Profile) -> None:
     exposures, states = with_defaults(options, profile)
     if profile.mode != "sequential":
-        raise PlanError(
-            f"an automaton shows one pattern after another, {profile.name} is a {profile.mode} profile",
-            remedy="choose a sequential profile, such as ideal or dmd-spad",
-        )
+        what = f"an automaton shows one pattern after another, {profile.name} is a {profile.mode} profile"
+        raise PlanError(what, remedy="choose a sequential profile, such as ideal or dmd-spad")
     if why := cannot_count(profile, options.outcomes):
         raise PlanError(why, remedy="--outcomes 2, or a profile whose detector.photon_number_max is at least one less")
     if options.channels > 1 and options.outcomes > 2:
-        raise UsageError(
-            f"--channels {options.channels} with --outcomes {options.outcomes}: detectors that are read at once click, they do not count",
-            remedy="leave out one of them",
-        )
+        what = f"--channels {options.channels} with --outcomes {options.outcomes}: detectors that are read at once click, they do not count"
+        raise UsageError(what, remedy="leave out one of them")
     if options.channels > 1 and (why := cannot_read_at_once(profile, options.channels)):
         raise PlanError(why, remedy="fewer --channels, or a sequential profile with as many detectors: dmd-four-snspd")
     most = states_at_most(exposures, states, options.successors)
     if most > STATES_MAX:
-        raise PlanError(
-            f"{exposures} exposures of {states} states are up to {most} states, allowed at most {STATES_MAX}",
-            remedy=f"--states {STATES_MAX // exposures}, or fewer",
-        )
+        what = f"{exposures} exposures of {states} states are up to {most} states, allowed at most {STATES_MAX}"
+        raise PlanError(what, remedy=f"--states {STATES_MAX // exposures}, or fewer")
     few = patterns_at_most(options, profile)
     if options.channels > 1 and few < most * options.channels:
-        raise PlanError(
-            f"up to {most} states show {options.channels} patterns each, {few} patterns are allowed, and channels share none",
-            remedy="fewer --exposures or --states, or leave out --patterns",
-        )
+        what = f"up to {most} states show {options.channels} patterns each, {few} patterns are allowed, and channels share none"
+        raise PlanError(what, remedy="fewer --exposures or --states, or leave out --patterns")
     if few < most and (options.grey or (profile.projector.dwell_steps == 1 and profile.projector.levels > 2)):
         raise PlanError(
             f"{few} patterns for up to {most} states: on {profile.name} a state's brightness is part of its pattern, so "

@@ -578,10 +578,8 @@ def _bits_of(bundle: Bundle, states: NDArray[np.int64]) -> Bits:
     shown = bundle.pattern_levels[bundle.automaton.rows[states]].astype(np.int64).reshape(len(states), -1)
     lit, most = shown > 0, shown.max(axis=1, keepdims=True)
     if (lit & (shown != most)).any():
-        raise UsageError(
-            f"{bundle.name} has grey patterns, a training starts from patterns of one bit and a brightness",
-            remedy="start from an automaton trained without --grey",
-        )
+        what = f"{bundle.name} has grey patterns, a training starts from patterns of one bit and a brightness"
+        raise UsageError(what, remedy="start from an automaton trained without --grey")
     part = bundle.automaton.dwell[states, None] / bundle.automaton.dwell_steps
     brightness = np.maximum(BRIGHTNESS_MIN, most * bundle.photons_per_level * part)
     lean = torch.from_numpy(np.where(lit, LEAN, -LEAN).astype(np.float32).reshape(-1, n_pixels))

@@ -84,10 +84,8 @@ def needing(option: str, extra: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise UsageError(
-            f"{option} needs the package {error.name}, which is not installed",
-            remedy=f"pip install 'pans-runtime[{extra}]'",
-        ) from error
+        what = f"{option} needs the package {error.name}, which is not installed"
+        raise UsageError(what, remedy=f"pip install 'pans-runtime[{extra}]'") from error
 
 
 def curve(values: Sequence[float], width: int = CURVE_WIDTH) -> str:

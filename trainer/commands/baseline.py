@@ -66,10 +66,8 @@ def _run(args: argparse.Namespace) -> int:
         payload = rows[0] | shared | {"rows": rows, "interrupted": code != EXIT_FINE, "simulated": True}
         emit(args, payload, _table(task, args, rows))
     elif code == EXIT_FINE:
-        raise UsageError(
-            f"--photons {args.photons} --illumination {args.illumination}: none can be reached by stopping",
-            remedy="ask for fewer photons, from 1 on",
-        )
+        what = f"--photons {args.photons} --illumination {args.illumination}: none can be reached by stopping"
+        raise UsageError(what, remedy="ask for fewer photons, from 1 on")
     return code
 
 
@@ -79,9 +77,8 @@ def _options(args: argparse.Namespace) -> BaselineOptions:
     if args.method not in methods:
         raise UsageError(f"--method is {args.method!r}, allowed with {args.paradigm}: {', '.join(methods)}")
     if args.information and (args.method != "bayes" or args.detector != "counting" or args.brightness != "source"):
-        raise UsageError(
-            "--information is allowed with --method bayes, --detector counting and --brightness source only"
-        )
+        what = "--information is allowed with --method bayes, --detector counting and --brightness source only"
+        raise UsageError(what)
     return options_from(args, BaselineOptions)
 
 

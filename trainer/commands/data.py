@@ -39,9 +39,8 @@ def _data(args: argparse.Namespace) -> int:
     if args.action != "scene":
         return _sets(args)
     if len(args.names) != 1 or args.out is None:
-        raise UsageError(
-            "a scene is made of one task and written to one file", remedy="pans data scene TASK -o FILE.npz"
-        )
+        what = "a scene is made of one task and written to one file"
+        raise UsageError(what, remedy="pans data scene TASK -o FILE.npz")
     if args.out.suffix != ".npz":
         raise UsageError(f"{args.out}: a scene's name ends in .npz", remedy=f"-o {args.out.with_suffix('.npz')}")
     if args.objects is not None and args.objects < 1:

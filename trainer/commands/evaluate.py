@@ -395,10 +395,8 @@ def _over_draws(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, con
     moved = f"shift=-{right}..{right},-{down}..{down}" if whole and (right or down) else None
     text = args.optics or trained.get("optics") or moved
     if not isinstance(text, str):
-        raise UsageError(
-            f"--draws: {bundle.name} was trained on perfect optics, and no tolerance is given",
-            remedy="--optics shift=1:rotate=2:psf=0.5..0.8:black=0.002, say",
-        )
+        what = f"--draws: {bundle.name} was trained on perfect optics, and no tolerance is given"
+        raise UsageError(what, remedy="--optics shift=1:rotate=2:psf=0.5..0.8:black=0.002, say")
     tolerance = tolerance_of(text)
     with _counted("table") as report:
         tables = whole_shifts(tolerance) if whole else drawn_tables(tolerance, args.draws, args.seed)
@@ -437,10 +435,8 @@ def _within_dose(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, co
     from pans.trainer.evaluate.dose import Capped, Knowledge, depends_on_walk, figures_of, trial_error, within_cap
 
     if args.exact and depends_on_walk(bundle, conditions):
-        raise UsageError(
-            "--exact: what is left of a bleached sample depends on the walk, and walks are sampled",
-            remedy="use --trials",
-        )
+        what = "--exact: what is left of a bleached sample depends on the walk, and walks are sampled"
+        raise UsageError(what, remedy="use --trials")
     found = Capped(bundle, 0.0, bundle.n_features, None)
     if args.dose_cap is not None:
         found = within_cap(bundle, args.dose_cap, held_out, Knowledge(bundle, held_out), args.eta)

@@ -49,15 +49,11 @@ def _order(args: argparse.Namespace) -> int:
         raise UsageError("--by none without --dose-cap changes nothing", remedy="give one of them")
     bundle, _ = load_bundle(args.bundle)
     if bundle.automaton is not None:
-        raise UsageError(
-            f"{bundle.name} has an automaton: its clicks choose the order",
-            remedy="pans run --dose-cap keeps it within a dose",
-        )
+        what = f"{bundle.name} has an automaton: its clicks choose the order"
+        raise UsageError(what, remedy="pans run --dose-cap keeps it within a dose")
     if args.by != "none" and not trained_bleaching(bundle).is_none:
-        raise UsageError(
-            f"{bundle.name} was trained through bleaching: its back end expects what the patterns before have left",
-            remedy="--by none --dose-cap N keeps the first patterns",
-        )
+        what = f"{bundle.name} was trained through bleaching: its back end expects what the patterns before have left"
+        raise UsageError(what, remedy="--by none --dose-cap N keeps the first patterns")
     with as_usage_error():
         bleaching = bleaching_given(args)
         task = args.task or remembered_task(bundle.provenance, bundle.task, bundle_path(args.bundle))

@@ -174,9 +174,8 @@ def _check_same(study: Any, base: Options, data_sha256: str) -> None:
     found = study.user_attrs
     differing = [f"{key} {found[key]} (now {value})" for key, value in wanted.items() if found.get(key, value) != value]
     if differing:
-        raise UsageError(
-            f"the study {study.study_name} is another: {', '.join(differing)}", remedy="give it a name by --study"
-        )
+        what = f"the study {study.study_name} is another: {', '.join(differing)}"
+        raise UsageError(what, remedy="give it a name by --study")
     for key, value in wanted.items():
         if key not in found:
             study.set_user_attr(key, value)

@@ -143,10 +143,8 @@ def _check_files(args: argparse.Namespace, checkpoint: Path) -> None:
     """Refuse, before anything is loaded, what cannot be written in the end; a checkpoint is hours of work too."""
     inputs = [args.task, *([args.profile] if args.profile else [])]
     if checkpoint.exists() and not (args.resume or args.force):
-        raise UsageError(
-            f"{checkpoint}: is here, of a training that was interrupted",
-            remedy="continue it by --resume, or replace it with --force",
-        )
+        what = f"{checkpoint}: is here, of a training that was interrupted"
+        raise UsageError(what, remedy="continue it by --resume, or replace it with --force")
     check_outputs([args.out], inputs=inputs, force=args.force)
     check_outputs([checkpoint], inputs=[*inputs, args.out], force=True)
     if args.history is not None:

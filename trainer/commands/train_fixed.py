@@ -102,10 +102,8 @@ def fixed_options(args: argparse.Namespace, task: Task, profile: Profile) -> Opt
     encoder, is_picture = args.encoder or physical_encoder(task), task.target == "image"
     head = args.head or ("picture" if is_picture else "mlp")
     if (head in PICTURE_HEADS) != is_picture:
-        raise UsageError(
-            f"--head {head}: the task {task.name} asks for {'a picture' if is_picture else 'a class'}",
-            remedy="leave --head out",
-        )
+        what = f"--head {head}: the task {task.name} asks for {'a picture' if is_picture else 'a class'}"
+        raise UsageError(what, remedy="leave --head out")
     if encoder == "active" and task.optics != "none":
         raise UsageError(f"--encoder active: {task.name} lies behind a fibre", remedy="use --encoder coherent")
     if encoder == "active" and args.unconstrained:

@@ -259,9 +259,8 @@ def _lit(light: F64, law: ClickLaw | CountLaw, illumination: float, profile: Pro
 def demand_sequence(profile: Profile) -> None:
     """Raise ValueError where `profile` shows all patterns at once: there no dose comes before another."""
     if profile.mode != "sequential":
-        raise ValueError(
-            f"{profile.name} shows all patterns at once ({profile.mode}), allowed with a dose: profiles that show pattern after pattern"
-        )
+        what = f"{profile.name} shows all patterns at once ({profile.mode}), allowed with a dose: profiles that show pattern after pattern"
+        raise ValueError(what)
 
 
 def exposure_of(bundle: Bundle, profile: Profile) -> float:

@@ -169,9 +169,8 @@ def within_cap(bundle: Bundle, cap: float, held_out: HeldOut, known: Knowledge, 
     ValueError where the first exposure alone brings more, for passive bundles and for pictures.
     """
     if bundle.analyser is not None or bundle.picture_shape is not None:
-        raise ValueError(
-            f"{bundle.name} sends no light or returns pictures, allowed with a dose cap: patterns and classes"
-        )
+        what = f"{bundle.name} sends no light or returns pictures, allowed with a dose cap: patterns and classes"
+        raise ValueError(what)
     own = cap / eta if eta > 0 else math.inf
     if bundle.automaton is None:
         count = patterns_within(bundle, own)

@@ -162,7 +162,5 @@ def compare_decider(bundle: Bundle, seed: int) -> None:
     labels, scores = decider.decide_batch(words, 1), decider.scores_batch(words, 1)
     # labels by the posteriors, not by the scores: logarithms in float32 may be equal where posteriors are not
     if not (np.array_equal(labels, wanted.argmax(axis=1)) and np.array_equal(scores, log_scores(wanted))):
-        raise PansError(
-            f"the back end of {bundle.name} decides otherwise than its leaves",
-            remedy="report this with the bundle: the export is wrong",
-        )
+        what = f"the back end of {bundle.name} decides otherwise than its leaves"
+        raise PansError(what, remedy="report this with the bundle: the export is wrong")

@@ -26,9 +26,8 @@ FLOOR = 1e-6  # of a posterior in the table
 def bar_patterns(pixels_per_bar: int, lit_px: int) -> NDArray[np.uint8]:
     """Return one pattern per bar, 1 on the `lit_px` pixels in its middle: uint8 (10, 10 * pixels_per_bar)."""
     if not 1 <= lit_px <= pixels_per_bar or (pixels_per_bar - lit_px) % 2:
-        raise ValueError(
-            f"{lit_px} lit pixels of {pixels_per_bar}: allowed are 1 to {pixels_per_bar}, with equal guard bands"
-        )
+        what = f"{lit_px} lit pixels of {pixels_per_bar}: allowed are 1 to {pixels_per_bar}, with equal guard bands"
+        raise ValueError(what)
     guard = (pixels_per_bar - lit_px) // 2
     lit = np.zeros((N_BARS, N_BARS, pixels_per_bar), np.uint8)
     lit[np.arange(N_BARS), np.arange(N_BARS), guard : guard + lit_px] = 1

@@ -53,13 +53,11 @@ def with_copies(objects: Objects, kept: int, copies: int, seed: int, imaged: Ima
 def _check(images: NDArray[np.uint8], copies: int) -> None:
     height, width = images.shape[1:]
     if min(height, width) < SIDE_MIN_PX:
-        raise ValueError(
-            f"images of {height} x {width} pixels cannot be distorted into copies, allowed: {SIDE_MIN_PX} per side and more"
-        )
+        what = f"images of {height} x {width} pixels cannot be distorted into copies, allowed: {SIDE_MIN_PX} per side and more"
+        raise ValueError(what)
     if images.nbytes * (copies + 1) > IMAGES_MAX_BYTES:
-        raise ValueError(
-            f"{copies} copies of {images.nbytes >> 20} MiB of images, allowed: {IMAGES_MAX_BYTES >> 20} MiB in all"
-        )
+        what = f"{copies} copies of {images.nbytes >> 20} MiB of images, allowed: {IMAGES_MAX_BYTES >> 20} MiB in all"
+        raise ValueError(what)
 
 
 def distorted(images: NDArray[np.uint8], seed: list[int], strength: float = 1.0) -> NDArray[np.uint8]:

@@ -94,10 +94,8 @@ def data_folder(data_dir: str | Path | None) -> Path:
     """Return the folder of the public sets: `data_dir`, or what PANS_DATA names; UsageError without either."""
     chosen = data_dir or os.environ.get("PANS_DATA")
     if not chosen:
-        raise UsageError(
-            "no data folder: neither --data-dir nor PANS_DATA is set",
-            remedy="`pans data fetch --data-dir FOLDER` fetches the public sets",
-        )
+        what = "no data folder: neither --data-dir nor PANS_DATA is set"
+        raise UsageError(what, remedy="`pans data fetch --data-dir FOLDER` fetches the public sets")
     return Path(chosen)
 
 
@@ -125,9 +123,8 @@ def file_sha256(path: Path) -> str:
 def check_pinned(path: Path, pinned: PinnedFile) -> None:
     """Raise UsageError if the file is not there, DamagedFileError if it is not byte for byte the pinned one."""
     if not path.is_file():
-        raise UsageError(
-            f"{path} is not there", remedy=f"`pans data fetch --data-dir {path.parent.parent}`, or copy it there"
-        )
+        what = f"{path} is not there"
+        raise UsageError(what, remedy=f"`pans data fetch --data-dir {path.parent.parent}`, or copy it there")
     size = path.stat().st_size
     if size != pinned.n_bytes:
         raise DamagedFileError(f"{path}: {size} bytes, the pinned file has {pinned.n_bytes}", remedy=_FETCH_AGAIN)

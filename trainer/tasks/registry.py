@@ -151,9 +151,8 @@ def _checked_task(task: Task, name: str) -> Task:
     for part, objects in (("train", task.train), ("test", task.test)):
         images, labels = np.asarray(objects.images), np.asarray(objects.labels)
         if images.dtype != np.uint8 or images.ndim != 3 or images.shape[1:] != task.image_shape:
-            raise UsageError(
-                f"task {name!r}, {part}: images are {images.dtype} {images.shape}, must be uint8 (n, h, w)"
-            )
+            what = f"task {name!r}, {part}: images are {images.dtype} {images.shape}, must be uint8 (n, h, w)"
+            raise UsageError(what)
         if labels.shape != images.shape[:1] or not len(labels):
             raise UsageError(f"task {name!r}, {part}: {labels.shape} labels for {len(images)} images")
         if not ((labels >= 0) & (labels < len(task.classes))).all():
@@ -207,10 +206,8 @@ def _load_npz(path: Path) -> Task:
         train, test = _split(path, _objects(path, arrays["images"], arrays["labels"]))
         split = _SPLIT_BY_POSITION
     else:
-        raise UsageError(
-            f"{path}: holds {', '.join(sorted(arrays)) or 'nothing'}",
-            remedy=f"name the arrays `images` and `labels`, or {', '.join(parts)}",
-        )
+        what = f"{path}: holds {', '.join(sorted(arrays)) or 'nothing'}"
+        raise UsageError(what, remedy=f"name the arrays `images` and `labels`, or {', '.join(parts)}")
     n_classes = int(max(train.labels.max(), test.labels.max())) + 1
     classes = tuple(str(name) for name in arrays.get("classes", np.arange(n_classes)).ravel())
     given = arrays["images" if "images" in arrays else "train_images"].dtype
@@ -311,7 +308,5 @@ def remembered_task(provenance: Mapping[str, Any], name: str, bundle: Path) -> s
             return str(place)
     looked = ", ".join(dict.fromkeys(os.path.normpath(place) for place in places)) or "nothing: the bundle names none"
     digest = str(provenance.get("data_sha256", ""))[:12]
-    raise UsageError(
-        f"the data set {task!r}{f' (SHA-256 {digest}…)' if digest else ''} of {bundle} was not found; looked for {looked}",
-        remedy="name it: --task FOLDER, FILE.npz or a name of `pans data list`",
-    )
+    what = f"the data set {task!r}{f' (SHA-256 {digest}…)' if digest else ''} of {bundle} was not found; looked for {looked}"
+    raise UsageError(what, remedy="name it: --task FOLDER, FILE.npz or a name of `pans data list`")

@@ -137,8 +137,6 @@ def read_targets(path: Path, taught: Taught, n_classes: int) -> F32:
     fine = targets.shape == shape and targets.dtype == np.float32 and bool(np.isfinite(targets).all())
     if not fine or (targets < 0).any() or (abs(targets.sum(axis=1) - 1.0) > SUM_TOLERANCE).any():
         wanted = f"float32 {shape}, each row probabilities that sum to 1"
-        raise DamagedFileError(
-            f"{path}: targets are {targets.dtype} {targets.shape}, allowed: {wanted}",
-            remedy="remove it to make them anew",
-        )
+        what = f"{path}: targets are {targets.dtype} {targets.shape}, allowed: {wanted}"
+        raise DamagedFileError(what, remedy="remove it to make them anew")
     return np.asarray(targets, np.float32)
