@@ -236,7 +236,7 @@ def finished(
     nodes = _numbered(machine), _by_node(machine, posteriors)
     automaton = reachable_automaton(np.arange(len(of_states)), np.concatenate(dwells), steps, *nodes, counts)
     different, pattern = np.unique(of_states[automaton.pattern], axis=0, return_inverse=True)
-    automaton = replace(automaton, pattern=channels * pattern.reshape(-1))
+    automaton = replace(automaton, pattern=(channels * pattern.reshape(-1)).astype(np.uint16))
     return Shown(levels, different.reshape(-1, n_pixels), top / (levels - 1)), automaton
 
 

@@ -345,10 +345,10 @@ class _Run:
             if stage == "shown" and 1 <= self.epoch <= epochs - 2:
                 self._choose_patterns()
             blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
-            means = self.tuning.epoch(blocks)
+            found = [*self.tuning.epoch(blocks), *self._prices()]
             self.epoch += 1
             before = self.exposures + (tune_epochs_of(self.options) if stage == "shown" else 0)
-            self.report(Progress(stage, before + self.epoch, self.steps, *means, *self._prices()))
+            self.report(Progress(stage, before + self.epoch, self.steps, *found))
             keep()
 
     def _choose_top(self) -> None:

@@ -155,7 +155,8 @@ def fit(
                 if step % 20 == 0 or step == steps:
                     report(f"loss {float(loss.detach()):.3f}", step / steps)
             net.eval()
-            watch(*(sums / len(labels)).tolist(), decider(net))
+            loss_mean, accuracy = (sums / len(labels)).tolist()
+            watch(loss_mean, accuracy, decider(net))
 
 
 def _by_rate(net: nn.Module, rates: dict[str, float]) -> dict[float, list[nn.Parameter]]:
