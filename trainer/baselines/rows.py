@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from pans.trainer.evaluate.accuracy import row_of
+from pans.trainer.evaluate.walks import FIRST_OBJECTS
 from pans.trainer.options import LEAST_PHOTONS, BaselineOptions
 from pans.trainer.tasks.registry import Task
 
 from .common import Decide, Light, Measurement, Report, Trials, detect, measure, run_trials
 
-FIRST = 200  # test objects, those of the paper's tables
 EQUAL_TRIALS, EQUAL_DECISIONS = 10, 5000  # readouts per object of a comparison, fewer where all would be more than that
 
 At = Callable[[float], tuple[Decide, dict[str, Any]]]  # photons per object -> the decision, and facts about it
@@ -40,7 +40,7 @@ def baseline_rows(
     for level, n_readouts, done, extra in walk(task, options, levels, report):
         yield {
             **row_of(done.measured()),
-            "first_200": row_of(done.measured(FIRST)),
+            "first_200": row_of(done.measured(FIRST_OBJECTS)),
             "photons_asked": level.amount if level.of == "photons" else None,
             "illumination_asked": level.amount if level.of == "illumination" else None,
             "detector": options.detector,

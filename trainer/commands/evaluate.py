@@ -432,14 +432,14 @@ def optics_curve_words(name: str, objects: int, about: Imaging, curves: Mapping[
 
 
 def _within_dose(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
-    from pans.trainer.evaluate.dose import Capped, Knowledge, depends_on_walk, figures_of, trial_error, within_cap
+    from pans.trainer.evaluate.dose import Capped, depends_on_walk, figures_of, knowledge_of, trial_error, within_cap
 
     if args.exact and depends_on_walk(bundle, conditions):
         what = "--exact: what is left of a bleached sample depends on the walk, and walks are sampled"
         raise UsageError(what, remedy="use --trials")
     found = Capped(bundle, 0.0, bundle.n_features, None)
     if args.dose_cap is not None:
-        found = within_cap(bundle, args.dose_cap, held_out, Knowledge(bundle, held_out), args.eta)
+        found = within_cap(bundle, args.dose_cap, held_out, knowledge_of(bundle, held_out), args.eta)
     measured = asdict(figures_of(found, held_out, conditions, args.trials))
     measured["accuracy_se_trials"] = trial_error(measured)
     which = f"{_how(measured)}, {conditions.bleaching.words()}"

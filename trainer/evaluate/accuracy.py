@@ -111,7 +111,7 @@ class Measured(Conveyed):
     by_class: ByClass | None = None
 
 
-def figures_of(
+def means_of(
     right: F64, spread: float, clicks: float, photons: F64, illumination: float, *, trials: int = 0, **more: Any
 ) -> Measured:
     """Return the means of objects that are decided `right` with these chances, (n,), and give `photons` (n,); `more` as in `Measured`."""
@@ -151,7 +151,7 @@ class Trials:
         if self.surprise is not None and self.labels is not None:
             known = conveyed(self.surprise[:first], self.labels[:first], photons, light)
         clicks = float(self.clicks[:first].mean())
-        return figures_of(right.mean(axis=0), spread, clicks, photons, light, trials=len(right), **known)
+        return means_of(right.mean(axis=0), spread, clicks, photons, light, trials=len(right), **known)
 
 
 def row_of(measured: Any) -> dict[str, Any]:
@@ -300,7 +300,7 @@ def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *,
     right = np.clip(right, 0.0, 1.0)
     over_trials = math.sqrt(float((right * (1 - right)).sum())) / len(labels)
     photons, illumination = shots * light.photoelectrons.sum(axis=1), light.illumination * shots
-    return figures_of(
+    return means_of(
         right,
         over_trials,
         shots * float(light.probability.sum()) / len(right),

@@ -8,9 +8,9 @@ Exact expectations, but for automata before samples that bleach: what is left de
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -150,20 +150,12 @@ class Capped:
         return {"dose_cap": self.cap, "exposures_most": self.exposures_most, "states": self.states}
 
 
-@dataclass(frozen=True, eq=False)
-class Knowledge:
-    """What training objects show under a bundle's fixed patterns, computed when it is first needed."""
-
-    bundle: Bundle
-    held_out: HeldOut
-
-    @cached_property
-    def readings(self) -> F64:
-        """P(reading) of training objects, (n, d_f, outcomes)."""
-        return training_readings(self.bundle, self.held_out.profile, self.held_out.task.train)
+def knowledge_of(bundle: Bundle, held_out: HeldOut) -> Callable[[], F64]:
+    """Return what gives `training_readings` of `bundle`, computed when they are first needed."""
+    return cache(lambda: training_readings(bundle, held_out.profile, held_out.task.train))
 
 
-def within_cap(bundle: Bundle, cap: float, held_out: HeldOut, known: Knowledge, eta: float = 1.0) -> Capped:
+def within_cap(bundle: Bundle, cap: float, held_out: HeldOut, known: Callable[[], F64], eta: float = 1.0) -> Capped:
     """Return `bundle` so that no object receives more illumination than `cap`, as the bundle states its patterns, times `eta`.
 
     ValueError where the first exposure alone brings more, for passive bundles and for pictures.
@@ -174,7 +166,7 @@ def within_cap(bundle: Bundle, cap: float, held_out: HeldOut, known: Knowledge, 
     own = cap / eta if eta > 0 else math.inf
     if bundle.automaton is None:
         count = patterns_within(bundle, own)
-        found = bundle if count == bundle.n_features else of_first(bundle, count, known.readings)
+        found = bundle if count == bundle.n_features else of_first(bundle, count, known())
         return Capped(found, cap, count, None)
     most = held_out.profile.projector.automaton_states or STATES_MAX
     automaton = capped(bundle.automaton, bundle.state_light(), min(own, CAP_MAX), most)
@@ -213,7 +205,7 @@ def dose_curve(
 ) -> list[dict[str, Any]]:
     """Return the points of accuracy against dose, from small caps to none; each with light, both spreads and, before samples
     that bleach, the accuracy that it would have without (`accuracy_unbleached`)."""
-    known, caps, points = Knowledge(bundle, held_out), caps_of(bundle), []
+    known, caps, points = knowledge_of(bundle, held_out), caps_of(bundle), []
     for cap in caps:
         found = within_cap(bundle, cap * (conditions.eta or 1.0), held_out, known, conditions.eta)
         measured = asdict(figures_of(found, held_out, conditions))

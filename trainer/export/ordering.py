@@ -21,14 +21,12 @@ from pans.runtime.instrument.click_law import CountLaw, click_probability, count
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import demand_sequence, outcome_law_of
-from pans.trainer.evaluate.dose import demand_fixed_patterns, plain_layers, rebuilt
+from pans.trainer.evaluate.dose import TRAINING_OBJECTS, WORDS_MAX, demand_fixed_patterns, plain_layers, rebuilt
 from pans.trainer.evaluate.information import entropy_bits, mutual_information_bits
 from pans.trainer.evaluate.readings import vector_chances
 from pans.trainer.evaluate.walks import patterns_met
 from pans.trainer.tasks.registry import Objects
 
-EXACT_WORDS_MAX = 1 << 12  # per object
-OBJECTS = 20_000  # the first training objects
 SAMPLED_OBJECTS = 1500  # and as many words, where they are sampled
 WAYS = ("information", "dose")  # most information per pattern, or per light that it sends
 LEAST = 1e-12  # of every reading, so that a word that was drawn is never impossible
@@ -91,8 +89,8 @@ def information_order(
     `by` "dose": most information per light that the pattern sends. `training` are the objects it is measured on, the first of them.
     ValueError for a bundle without fixed patterns, and for a profile that shows all of them at once.
     """
-    exact = (bundle.largest + 1) ** bundle.n_features <= EXACT_WORDS_MAX
-    objects = training.first(OBJECTS if exact else SAMPLED_OBJECTS)
+    exact = (bundle.largest + 1) ** bundle.n_features <= WORDS_MAX
+    objects = training.first(TRAINING_OBJECTS if exact else SAMPLED_OBJECTS)
     readings = _Readings(bundle, profile, objects, bleaching)
     known = _Words(objects.labels, bundle.n_classes) if exact else _Samples(objects.labels, bundle.n_classes, seed)
     cost = readings.light.sum(axis=1) if by == "dose" else np.ones(bundle.n_features)

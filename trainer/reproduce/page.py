@@ -23,6 +23,7 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import say
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import check_outputs, make_folder, replace_file
+from pans.trainer.evaluate.walks import FIRST_OBJECTS as FIRST_OBJECTS
 from pans.trainer.options import Options, same_options
 
 Row = dict[str, Any]  # flat; "table" names the table of the page that it belongs to
@@ -32,7 +33,6 @@ Draw = Callable[[Path], None]
 VERDICTS = ("above", "level", "below")
 UNITS = {"photons": "photon", "illumination": "illumination"}  # of light, of which there are bits
 ERRORS = 2.0  # combined standard errors that a difference must exceed
-FIRST_OBJECTS = 200  # test images, by which the paper judges FashionMNIST and MNIST
 
 
 def read_toml(name: str) -> Row:

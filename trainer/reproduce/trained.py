@@ -14,7 +14,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.evidence import log_softmax
-from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Light, decision_shares, light_of, sampled_shares
+from pans.trainer.evaluate.accuracy import Light, decision_shares, light_of, sampled_shares
 from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.tasks.registry import Objects, load_task
 
@@ -189,12 +189,15 @@ def confusion_page(asked: Asked) -> Made:
 
 def _matrix(row: TrainedRow, data_dir: str | None) -> Row:
     task = load_task(row.name, data_dir)
-    lit = light_of(row.bundle, load_profile(PROFILE), task.test.images)
-    if enumerable(row.bundle, len(task.test)):
-        shares = decision_shares(row.bundle, lit)
-    else:
-        shares = sampled_shares(row.bundle, lit, trials=TRIALS_OF_ALL, seed=1)
+    shares = shares_of(row.bundle, light_of(row.bundle, load_profile(PROFILE), task.test.images), TRIALS_OF_ALL)
     return {"classes": list(task.classes), "all": confusion(shares, task.test).round(5).tolist()}
+
+
+def shares_of(bundle: Bundle, lit: Light, trials: int) -> F64:
+    """Return P(decided class | object), (n, classes): exact where all outcomes can be enumerated, else of so many trials."""
+    if enumerable(bundle, len(lit.probability)):
+        return decision_shares(bundle, lit)
+    return sampled_shares(bundle, lit, trials=trials, seed=1)
 
 
 def named_confusions(matrix: F64, classes: list[str]) -> Row:
@@ -270,10 +273,7 @@ def _trials(bundle: Bundle, lit: Light, chosen: I64) -> Rows:
     """Return per chosen object: clicks and outputs of every trial, the decisions, and their expected shares."""
     decider = make_decider(bundle)
     part = Light(lit.photoelectrons[chosen], lit.probability[chosen], lit.law, lit.illumination)
-    if 1 << bundle.n_features <= EXACT_OUTCOMES_MAX:
-        expected = decision_shares(bundle, part)
-    else:
-        expected = sampled_shares(bundle, part, trials=SAMPLED_TRIALS, seed=1)
+    expected = shares_of(bundle, part, SAMPLED_TRIALS)
     rng = np.random.default_rng([0, bundle.n_features])
     found = []
     for i, index in enumerate(chosen):

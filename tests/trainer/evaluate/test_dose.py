@@ -18,10 +18,10 @@ from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.rebuild import chain_onnx
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.dose import (
-    Knowledge,
     caps_of,
     dose_curve,
     figures_of,
+    knowledge_of,
     of_first,
     patterns_within,
     training_readings,
@@ -144,7 +144,7 @@ def test_a_cap_stops_before_the_pattern_that_would_pass_it() -> None:
     assert [patterns_within(bundle, cap) for cap in (light[0], light[1] * 0.999, light[1], 1e9)] == [1, 1, 2, 3]
     with pytest.raises(ValueError, match="the first pattern alone brings"):
         patterns_within(bundle, light[0] * 0.99)
-    known = Knowledge(bundle, HELD_OUT)
+    known = knowledge_of(bundle, HELD_OUT)
     found = figures_of(within_cap(bundle, light[1], HELD_OUT, known), HELD_OUT, Conditions())
     assert found.illumination == pytest.approx(light[1])
     assert within_cap(bundle, 1e9, HELD_OUT, known).bundle is bundle
@@ -155,7 +155,7 @@ def test_a_curve_ends_at_the_whole_bundle(which: str, tmp_path: Path) -> None:
     bundle = fixed() if which == "fixed" else automaton_bundle(six_states(), photons=1.5)
     points = dose_curve(bundle, HELD_OUT, Conditions(bleaching=LAW))
     assert [point["dose_cap"] for point in points] == caps_of(bundle)
-    whole = figures_of(within_cap(bundle, 1e9, HELD_OUT, Knowledge(bundle, HELD_OUT)), HELD_OUT, Conditions())
+    whole = figures_of(within_cap(bundle, 1e9, HELD_OUT, knowledge_of(bundle, HELD_OUT)), HELD_OUT, Conditions())
     assert points[-1]["accuracy_unbleached"] == pytest.approx(whole.accuracy_mean, abs=1e-12)
     assert points[-1]["illumination"] == pytest.approx(whole.illumination, rel=0.2)
     assert points[-1]["photons_mean"] < 0.95 * whole.photons_mean
