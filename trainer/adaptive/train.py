@@ -40,17 +40,7 @@ from .budget import (
     tune_epochs_of,
     with_defaults,
 )
-from .finish import (
-    Posteriors,
-    bit_grid,
-    calibrated,
-    finished,
-    meet_budget,
-    node_counts,
-    send_evenly,
-    set_top,
-    to_grid,
-)
+from .finish import Posteriors, bit_grid, calibrated, finished, meet_budget, node_counts, send_evenly, set_top, to_grid
 from .grow import Growth
 from .machine import (
     COUNT_FLOOR,
