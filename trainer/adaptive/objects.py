@@ -51,7 +51,7 @@ class TrainingObjects:
         n_fit = len(task.train) - n_back
         if n_fit < 1:
             raise ValueError(f"{n_back} of {len(task.train)} training objects held back, allowed: all but one")
-        self._fit = task.train.first(n_fit)
+        self.fitted = task.train.first(n_fit)  # as they are, in the order of the file
         self._back = task.train.take(slice(n_fit, None))
         self.n_classes, self.n_fit, self.n_pixels = len(task.classes), n_fit, task.image_shape[0] * task.image_shape[1]
         self.image_shape = task.image_shape
@@ -66,14 +66,9 @@ class TrainingObjects:
         self.floor = self._black if self._optics is None else 0.0  # which drawn optics show like all other light
         self._targets: NDArray[np.float32] | None = None
 
-    @property
-    def fitted(self) -> Objects:
-        """The objects to fit, as they are, in the order of the file."""
-        return self._fit
-
     def soften(self, answers: NDArray[np.float32], weight: float) -> None:
         """Give every object to fit class probabilities for its label: `weight` of `answers` (objects, classes), of the label the rest."""
-        labels = np.eye(self.n_classes, dtype=np.float32)[self._fit.labels]
+        labels = np.eye(self.n_classes, dtype=np.float32)[self.fitted.labels]
         self._targets = weight * answers + np.float32(1.0 - weight) * labels
 
     def wide(self, objects: Objects) -> Tensor:
@@ -87,7 +82,7 @@ class TrainingObjects:
         """Return the objects to fit in an order of their own, moved, and distorted unless `plain`; the last block may be smaller."""
         random = np.random.default_rng([ORDER_STREAM, self._seed, number])
         order = random.permutation(self.n_fit)
-        objects = self._moved(self._fit if plain else self._copied(number), number)
+        objects = self._moved(self.fitted if plain else self._copied(number), number)
         targets = None if self._targets is None else self._targets[order]
         return list(self._blocks(objects.take(order), size, dtype, targets, draw=number))
 
@@ -96,7 +91,7 @@ class TrainingObjects:
         return list(self._blocks(self._moved(self._back, HELD_BACK_DRAW), size, dtype, draw=HELD_BACK_DRAW))
 
     def _copied(self, number: int) -> Objects:
-        objects, way = self._fit, self._options
+        objects, way = self.fitted, self._options
         version = number % ((way.copies or 0) + 1)
         if not version:
             return objects

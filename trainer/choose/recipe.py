@@ -35,15 +35,15 @@ FIXED_EPOCHS = (20, 400)
 KEPT_PART = 12  # one in twelve training images chooses and calibrates, and has no copies
 FEW_PER_CLASS = 30
 UNEQUAL = 5.0  # times as many images in one class as in another
-TRIES: tuple[dict[str, Any], ...] = (  # one after the other: the best of each goes into the next
-    {"turn_deg": (8.0, 25.0, 180.0)},
-    {"shift": (0.04, 0.1)},
-    {"size": (0.1, 0.2)},
-    {"mirror_x": (True,)},
-    {"mirror_y": (True,)},
-    {"stretch": (0.15,)},
-    {"bend": (0.02,)},
-)
+TRIES: dict[str, tuple[Any, ...]] = {  # one after the other: the best of each goes into the next
+    "turn_deg": (8.0, 25.0, 180.0),
+    "shift": (0.04, 0.1),
+    "size": (0.1, 0.2),
+    "mirror_x": (True,),
+    "mirror_y": (True,),
+    "stretch": (0.15,),
+    "bend": (0.02,),
+}
 FRAME_PHOTONS = 20.0  # so many that shapes count, so few that a left-out image need not be matched pixel by pixel
 WORLD = 5000  # images of the world, changed copies included
 LEFT_OUT_PART = 5
@@ -102,7 +102,7 @@ def as_trained_on(task: Task, provenance: Mapping[str, Any]) -> Task:
     found, options = provenance.get("variation"), provenance.get("options")
     if not (isinstance(found, Mapping) and isinstance(options, Mapping)) or provenance["data_sha256"] != task.sha256:
         return task
-    sizes = {name: found[name] for tried in TRIES for name in tried if found.get(name) in tried[name]}
+    sizes = {name: found[name] for name, tried in TRIES.items() if found.get(name) in tried}
     variation = Variation(**sizes)
     recipe = choose_training(task, variation, "automaton")  # of whose size here nothing depends on the encoder
     return enlarged(task, variation, recipe.objects, recipe.kept, int(options["seed"]))
@@ -153,8 +153,8 @@ def choose_variation(task: Task, seed: int = 0) -> Choice:
     judge = _Judge(task, seed)
     best = Variation()
     losses = before = judge.losses(best)
-    for tried in TRIES:
-        (name, sizes), won = next(iter(tried.items())), None
+    for name, sizes in TRIES.items():
+        won = None
         for size in sizes:
             changed = replace(best, **{name: size})
             found = judge.losses(changed)

@@ -6,15 +6,13 @@ bundle with all light scaled, behind a detector without dark counts or read nois
 
 from __future__ import annotations
 
-import importlib.resources
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.model import Bundle, load_bundle
+from pans.runtime.bundle.model import SHIPPED, Bundle, load_bundle
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines import strings
@@ -54,13 +52,9 @@ WAYS = ("frames", "ten patterns", "automaton")
 F64 = NDArray[np.float64]
 
 
-def shipped_bundle() -> Bundle:
-    """Return the bundle that comes with the package: ten patterns, FashionMNIST."""
-    return _shipped("fashion10")
-
-
-def _shipped(name: str) -> Bundle:
-    return load_bundle(Path(str(importlib.resources.files("pans.runtime") / "shipped" / f"{name}.pans")))[0]
+def shipped_bundle(name: str = "fashion10") -> Bundle:
+    """Return a bundle that comes with the package, by default the one of ten patterns for FashionMNIST."""
+    return load_bundle(SHIPPED / f"{name}.pans")[0]
 
 
 def shipped_light(task: Task) -> tuple[F64, F64]:
@@ -98,7 +92,7 @@ def information_page(asked: Asked) -> Made:
 
 def _information_of_walks(task: Task) -> Row:
     """The shipped automaton behind the ideal detector."""
-    found = measure_walks(_shipped("fashion-adaptive"), task.test, load_profile(PROFILE))
+    found = measure_walks(shipped_bundle("fashion-adaptive"), task.test, load_profile(PROFILE))
     row: Row = {"table": "information", "way": WAYS[2], "photons": found.photons_mean, "objects": found.objects}
     row |= {"illumination": found.illumination, "clicks": found.clicks_mean}
     return row | {"bits": found.bits, "bits_se": found.bits_se, "value": 100 * (found.accuracy_mean or 0.0)}
