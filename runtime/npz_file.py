@@ -5,6 +5,7 @@ ValueError says what cannot be, UsageError that there is no such file. What the 
 
 from __future__ import annotations
 
+import io
 import math
 import zipfile
 import zlib
@@ -40,6 +41,13 @@ def read_arrays(path: str | Path, wanted: Sequence[str] | None, max_bytes: int) 
                 return {name: loaded[name] for name in present}
         except _UNREADABLE as error:
             raise ValueError(str(error) or type(error).__name__) from error
+
+
+def npz_bytes(**arrays: Any) -> bytes:
+    """Return arrays as the bytes of a compressed .npz file."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
 
 
 def _check_header(name: str, member: IO[bytes], size: int) -> None:

@@ -5,7 +5,6 @@ A decision that abstained has no picture.
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
 from pans.runtime.images import likeness, shipped_scene
-from pans.runtime.npz_file import read_arrays
+from pans.runtime.npz_file import npz_bytes, read_arrays
 from pans.runtime.outputs import write_file
 
 from .replaying import ClickLog
@@ -46,9 +45,7 @@ class PictureLog(ClickLog):
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write `object` and `pictures` to a .npz, whole or not at all; UsageError if it exists, unless `force`."""
         objects, pictures = self.pictures()
-        stream = io.BytesIO()
-        np.savez_compressed(stream, allow_pickle=False, object=objects, pictures=pictures)
-        write_file(path, stream.getvalue(), force=force)
+        write_file(path, npz_bytes(object=objects, pictures=pictures), force=force)
 
     def compare(self, truth: Path) -> dict[str, Any]:
         """Return SSIM and mean squared error against the scene in `truth` (.npz with `images`), whose objects pass in turn."""

@@ -6,13 +6,13 @@ A scene is a .npz file with images, labels and classes (docs/reference/simulator
 from __future__ import annotations
 
 import argparse
-import io
 from pathlib import Path
 
 import numpy as np
 
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, new_file, say
 from pans.runtime.errors import PansError, UsageError
+from pans.runtime.npz_file import npz_bytes
 from pans.runtime.outputs import check_outputs, write_file
 from pans.trainer.tasks.generators import GENERATORS
 from pans.trainer.tasks.public_sets import PUBLIC_SETS, check_pinned, data_folder, fetch
@@ -48,12 +48,11 @@ def _data(args: argparse.Namespace) -> int:
     check_outputs([args.out], inputs=args.names, force=args.force)
     classes, objects = _objects(args.names[0], args)
     part = objects.first(args.objects)
-    data = io.BytesIO()
-    np.savez_compressed(data, images=part.images, labels=part.labels.astype(np.int16), classes=np.array(classes))
-    write_file(args.out, data.getvalue(), force=args.force)
+    data = npz_bytes(images=part.images, labels=part.labels.astype(np.int16), classes=np.array(classes))
+    write_file(args.out, data, force=args.force)
     height, width = part.images.shape[1:]
     payload = {"scene": str(args.out), "task": args.names[0], "part": args.part, "objects": len(part)}
-    payload |= {"height_px": height, "width_px": width, "classes": list(classes), "bytes": len(data.getvalue())}
+    payload |= {"height_px": height, "width_px": width, "classes": list(classes), "bytes": len(data)}
     emit(args, payload, f"{args.out}  {len(part)} objects of {height} x {width} pixels, classes {', '.join(classes)}")
     return EXIT_FINE
 

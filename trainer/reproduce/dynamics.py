@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.npz_file import npz_bytes
 from pans.runtime.outputs import replace_file
 from pans.trainer.options import Options, differing_options
 from pans.trainer.tasks.registry import load_task
@@ -54,16 +53,12 @@ def training(asked: Asked, features: int, alpha: float, schedule: str = SHORT) -
         task = load_task(TASK, asked.data_dir)
         course = follow(task, load_profile(PROFILE), options, patterns_after=STAGES if shown else ())
         if shown:
-            _keep_patterns(path.with_suffix(".npz"), course.patterns)
+            after = sorted(course.patterns)
+            kept = npz_bytes(after=np.array(after), patterns=np.array([course.patterns[epoch] for epoch in after]))
+            replace_file(path.with_suffix(".npz"), kept)
         return {"epochs": course.columns, "final": measure(TASK, task, course.trained)}
 
     return asked.kept(name, differing_options(options), make)
-
-
-def _keep_patterns(path: Path, patterns: dict[int, NDArray[np.float32]]) -> None:
-    archive, after = io.BytesIO(), sorted(patterns)
-    np.savez_compressed(archive, after=np.array(after), patterns=np.array([patterns[epoch] for epoch in after]))
-    replace_file(path, archive.getvalue())
 
 
 def alpha_page(asked: Asked) -> Made:

@@ -8,7 +8,6 @@ measure. `barcode` is judged on all 1024 strings by their exact weights. The ima
 from __future__ import annotations
 
 import functools
-import io
 import json
 from dataclasses import asdict, replace
 from functools import partial
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from pans.runtime.bundle.optics import incident_field
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.npz_file import npz_bytes
 from pans.runtime.outputs import replace_file
 from pans.trainer.baselines import strings
 from pans.trainer.baselines.bayes import bayes
@@ -188,9 +188,7 @@ def make_cell(asked: Asked, row: PassiveRow, dark: float) -> Row:
     if task.target == "image":
         objects = first_of_each_class(task.test)
         p = click_probability(light_of(task, objects, trained), trained.law)
-        archive = io.BytesIO()
-        np.savez_compressed(archive, **asdict(take_samples(trained.head, p, objects)))
-        replace_file(path.with_suffix(".npz"), archive.getvalue())
+        replace_file(path.with_suffix(".npz"), npz_bytes(**asdict(take_samples(trained.head, p, objects))))
     if task.imaged is None:  # what a bundle looks at must be what the task shows
         command = f"pans reproduce {name} --rows {row.features} --dark {dark:g} --data-seed {asked.data_seed}"
         facts = {"task_argument": recipe_facts(name).get("task", name), "command": command}

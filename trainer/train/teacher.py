@@ -6,10 +6,8 @@ Dean 2015, arXiv:1503.02531). Objects held back are never shown to the network, 
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.npz_file import npz_bytes, read_arrays
 from pans.runtime.outputs import replace_file
 from pans.trainer.device import here, product_dtype
 from pans.trainer.tasks.changes import SIDE_MIN_PX, distorted
@@ -116,20 +115,16 @@ def _answers(network: nn.Module, images: NDArray[np.uint8]) -> F32:
 
 def write_targets(path: Path, targets: F32, taught: Taught) -> None:
     """Write `targets` to `path` (.npz), whole or not at all."""
-    file = io.BytesIO()
-    np.savez(file, task=taught.task, fitted=taught.fitted, epochs=taught.epochs, targets=targets)
-    replace_file(path, file.getbuffer())
+    replace_file(path, npz_bytes(**asdict(taught), targets=targets))
 
 
 def read_targets(path: Path, taught: Taught, n_classes: int) -> F32:
     """Return the targets in `path`, float32 (objects, classes); UsageError if they are of other objects, DamagedFileError if unfit."""
-    if path.stat().st_size > FILE_MAX_BYTES:
-        raise DamagedFileError(f"{path} has {path.stat().st_size} bytes, allowed at most {FILE_MAX_BYTES}")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            task, fitted, epochs, targets = (file[name] for name in FILE_FIELDS)
+        arrays = read_arrays(path, FILE_FIELDS, FILE_MAX_BYTES)
+        task, fitted, epochs, targets = (arrays[name] for name in FILE_FIELDS)
         found = Taught(str(task), int(fitted), int(epochs))
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise DamagedFileError(f"{path}: no soft targets: {error}", remedy="remove it to make them anew") from error
     if found != taught:
         raise UsageError(f"{path} holds {found}, wanted: {taught}", remedy="name another file, and they are made anew")
