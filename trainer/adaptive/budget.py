@@ -53,7 +53,8 @@ def first_prices(options: AutomatonOptions) -> Prices:
     """Return the prices at which training spends about the budgets of `options`; each of two begins with half of it."""
     prices, budgets = [], budgets_of(options)
     for kind, budget in budgets.items():
-        prices.append(Price(kind, price_of(budget * DETECTED_PER[kind]) * _share(kind, len(budgets)), budget))
+        price = PRICE_AT_10 * (10.0 / (budget * DETECTED_PER[kind])) ** PRICE_POWER
+        prices.append(Price(kind, price * _share(kind, len(budgets)), budget))
     return Prices(prices)
 
 
@@ -70,11 +71,6 @@ def states_at_most(exposures: int, states: int, outcomes: int = 2) -> int:
 def patterns_at_most(options: AutomatonOptions, profile: Profile) -> int:
     """Return how many patterns may be shown: what was asked for, within the projector's memory."""
     return min(options.patterns or profile.projector.pattern_memory, profile.projector.pattern_memory)
-
-
-def price_of(photons: float) -> float:
-    """Return the price per photoelectron (nats) with which training spends about that many on the public sets."""
-    return PRICE_AT_10 * (10.0 / photons) ** PRICE_POWER
 
 
 def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int]:
@@ -176,7 +172,12 @@ def check_automaton_options(options: AutomatonOptions, task: Task, profile: Prof
     _check_dose(options, task, profile)
     if options.optics is not None:
         check_optics(options.optics)
-    _check_task(task)
+    if task.target == "image":
+        what = f"--encoder automaton: {task.name} asks for a picture, the leaves of an automaton hold classes"
+        raise UsageError(what, remedy="use --encoder coherent")
+    if task.light != "transmission" or task.optics != "none":
+        what = f"--encoder automaton: in {task.name} the light is the scene's own, no pattern of ours can follow the clicks"
+        raise UsageError(what, remedy="use a passive encoder: coherent or incoherent")
     _check_fits(options, profile)
 
 
@@ -221,15 +222,6 @@ def _check_dose(options: AutomatonOptions, task: Task, profile: Profile) -> None
 def fades_of(options: AutomatonOptions, pixels: int) -> float:
     """Return the illumination of a whole object of so many pixels after which 1/e of its light is left; see Sight."""
     return math.inf if options.bleach is None else bleaching_of(options.bleach).dose * pixels
-
-
-def _check_task(task: Task) -> None:
-    if task.target == "image":
-        what = f"--encoder automaton: {task.name} asks for a picture, the leaves of an automaton hold classes"
-        raise UsageError(what, remedy="use --encoder coherent")
-    if task.light != "transmission" or task.optics != "none":
-        what = f"--encoder automaton: in {task.name} the light is the scene's own, no pattern of ours can follow the clicks"
-        raise UsageError(what, remedy="use a passive encoder: coherent or incoherent")
 
 
 def _check_fits(options: AutomatonOptions, profile: Profile) -> None:

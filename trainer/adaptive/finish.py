@@ -233,7 +233,10 @@ def finished(
     n_pixels = rows[0].shape[1]  # what a state shows on all its channels is one
     of_states = np.concatenate(rows).reshape(-1, channels * n_pixels)
     steps = 1 if grid is None or grid.by_level else grid.steps
-    nodes = _numbered(machine), _by_node(machine, posteriors)
+    sizes = [*(level.n_states for level in machine.levels), 0]
+    of_nodes = [level[:n] for level, n in zip(posteriors.levels, sizes)]  # states first
+    of_nodes += [level[n:] for level, n in zip(posteriors.levels, sizes)]
+    nodes = _numbered(machine), np.concatenate(of_nodes).astype(np.float32)
     automaton = reachable_automaton(np.arange(len(of_states)), np.concatenate(dwells), steps, *nodes, counts)
     different, pattern = np.unique(of_states[automaton.pattern], axis=0, return_inverse=True)
     automaton = replace(automaton, pattern=(channels * pattern.reshape(-1)).astype(np.uint16))
@@ -251,10 +254,3 @@ def _numbered(machine: Machine) -> NDArray[np.int64]:
         to = level.successors.T.cpu().numpy()
         rows.append(np.where(to < n_next, first_state[number + 1] + to, first_leaf[number] + to - n_next))
     return np.concatenate(rows).astype(np.int64)
-
-
-def _by_node(machine: Machine, posteriors: Posteriors) -> NDArray[np.float32]:
-    sizes = [*(level.n_states for level in machine.levels), 0]
-    states = [level[:n] for level, n in zip(posteriors.levels, sizes)]
-    leaves = [level[n:] for level, n in zip(posteriors.levels, sizes)]
-    return np.concatenate([*states, *leaves]).astype(np.float32)

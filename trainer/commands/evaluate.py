@@ -220,12 +220,12 @@ def _draw(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, condition
         objects = held_out.objects
         if bundle.automaton is not None:
             walks = walks_on(bundle, held_out, conditions=conditions)
-            return [str(path) for path in write_walk_pictures(args.pictures, bundle, walks, force=args.force)]
-        imaging = conditions.imaging_on(held_out.profile)
-        light = light_of(bundle, held_out.profile, objects.images, eta=args.eta, dark=args.dark, imaging=imaging)
-        written = write_pictures(
-            args.pictures, bundle, light, objects, shots=args.shots, seed=args.seed, force=args.force
-        )
+            written = write_walk_pictures(args.pictures, bundle, walks, force=args.force)
+        else:
+            imaging = conditions.imaging_on(held_out.profile)
+            light = light_of(bundle, held_out.profile, objects.images, eta=args.eta, dark=args.dark, imaging=imaging)
+            how = {"shots": args.shots, "seed": args.seed, "force": args.force}
+            written = write_pictures(args.pictures, bundle, light, objects, **how)
     return [str(path) for path in written]
 
 
