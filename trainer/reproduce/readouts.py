@@ -12,7 +12,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.model import SHIPPED, Bundle, load_bundle
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines import strings
