@@ -184,8 +184,9 @@ def meet_budget(
     for _ in range(DIMMINGS):
         if grid is not None:
             to_grid(machine, grid)
-        wanted = UNDER_BUDGET / prices.excess(figures(machine, sight(), drawn))
-        if 0.995 <= wanted <= 1.0:
+        spent = prices.excess(figures(machine, sight(), drawn))
+        # where all patterns are dark no brightness helps
+        if not spent or 0.995 <= (wanted := UNDER_BUDGET / spent) <= 1.0:
             return
         for light, before in zip(bits, exact):
             light.log_light.copy_(before)

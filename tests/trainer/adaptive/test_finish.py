@@ -1,9 +1,17 @@
-"""Posteriors of the nodes: smoothing, calibration on held-back objects, and the calibration error."""
+"""Posteriors of the nodes: smoothing, calibration on held-back objects, and the calibration error; the budget in the end."""
+
+import math
 
 import numpy as np
 import pytest
+import torch
 
-from pans.trainer.adaptive.finish import calibrated, calibration_error, log_loss, smoothed
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive.finish import calibrated, calibration_error, log_loss, meet_budget, smoothed
+from pans.trainer.adaptive.machine import Bits, Level, Machine, Sight
+from pans.trainer.adaptive.objects import Block
+from pans.trainer.adaptive.outcomes import law_of
+from pans.trainer.adaptive.tune import Price, Prices, figures
 
 
 def test_smoothing_is_that_of_pseudo_objects():
@@ -42,3 +50,18 @@ def test_states_are_calibrated_too_but_do_not_choose_the_smoothing():
     assert found.smoothing == alone.smoothing
     np.testing.assert_allclose(found.levels[1], alone.levels[0])
     assert log_loss(found.levels[0], of_states) <= log_loss(smoothed(states, found.smoothing), of_states)
+
+
+def one_pixel(lean: float) -> Machine:
+    """One exposure of one state, which lights its one pixel where `lean` is above 0."""
+    light = Bits(torch.tensor([[lean]]), torch.tensor([[math.log(5.0)]]))
+    return Machine([Level(light, torch.tensor([[0], [1]]))], [torch.ones(2, 2)])
+
+
+def test_the_budget_is_met_and_patterns_without_any_light_stay_dark():
+    sight = Sight(law_of(load_profile("ideal"), 100.0, 2, 1, None), gain=1.0)
+    block = Block(torch.tensor([[0.5], [1.0]]), torch.eye(2))
+    for lean, photons in ((1.0, 2.97), (-1.0, 0.0)):  # 99 % of the budget
+        machine = one_pixel(lean)
+        meet_budget(machine, Prices([Price("photons", 0.1, 3.0)]), None, lambda: sight, [block])
+        assert figures(machine, sight, [block]).photons == pytest.approx(photons, rel=0.01)
