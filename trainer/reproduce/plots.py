@@ -41,7 +41,7 @@ def curves(path: Path, rows: Rows, spec: Row) -> None:
             _plane(figure, axis, of_table(rows, panel["plane"]))
         for line in panel.get("lines", ()):
             _lines(
-                axis, rows, numbers, {**spec.get("line", {}), **panel.get("line", {}), **line}, spec.get("colours", {})
+                axis, rows, numbers, {**spec.get("line", {}), **panel.get("line", {}), **line}, spec.get("families", {})
             )
         axis.set(**spec.get("set", {}) | panel.get("set", {}))
         axis.grid(alpha=0.3)
@@ -78,10 +78,10 @@ def _kind(way: str) -> str:
     return "direct imaging" if way.startswith("direct") else "fixed patterns and masks"
 
 
-def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row, colours: dict[str, str]) -> None:
+def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row, families: dict[str, list[str]]) -> None:
     """Draw one line per label: `y` over `x` of the rows of a table, with error bars and notes where they are asked for.
 
-    A label that contains a word of `colours` has its colour.
+    A label that contains a word of `families` has that one's colour, and its name in the legend.
     """
     x, y = line["x"], line["y"]
     groups: dict[str, Rows] = {}
@@ -93,7 +93,7 @@ def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row, colours: d
         number = numbers.setdefault(label, len(numbers))
         mine.sort(key=lambda row: float(row[x]))
         errors = [row.get(line["bars"]) or 0.0 for row in mine] if "bars" in line else None
-        colour = next((colours[word] for word in colours if word in label), None)
+        colour, family = next((families[word] for word in families if word in label), ("", label))
         line_style = {
             "fmt": f"{'os^DvP*X<>'[number % 10 if colour else number // 10 % 4]}-",
             "color": colour or f"C{number % 10}",
@@ -102,7 +102,7 @@ def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row, colours: d
             "capsize": 2,
         }
         style = line_style | line.get("style", {})
-        axis.errorbar([row[x] for row in mine], [row[y] for row in mine], errors, label=label, **style)
+        axis.errorbar([row[x] for row in mine], [row[y] for row in mine], errors, label=family, **style)
         for row in mine if "note" in line else ():
             words = line["note"].format(**row)
             axis.annotate(words, (row[x], row[y]), textcoords="offset points", xytext=(4, -10), fontsize=7)
