@@ -46,7 +46,7 @@ def read_arrays(path: str | Path, wanted: Sequence[str] | None, max_bytes: int) 
 def npz_bytes(**arrays: Any) -> bytes:
     """Return arrays as the bytes of a compressed .npz file."""
     stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)
+    np.savez_compressed(stream, allow_pickle=False, **arrays)
     return stream.getvalue()
 
 
