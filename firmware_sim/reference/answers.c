@@ -58,10 +58,25 @@ void send_ack(struct pans_device *d)
     send(d, 16u + d->ack.text_bytes, ACK, d->session);
 }
 
+static void send_exposed(struct pans_device *d)
+{
+    const struct evidence *e = &d->evidence;
+    uint8_t *at = d->scratch + HEADER_BYTES;
+    put32(at, e->exposures);
+    put32(at + 4, (uint32_t)e->start);
+    put32(at + 8, (uint32_t)e->length);
+    put64(at + 12, e->start_at);
+    put64(at + 20, e->length_at);
+    send(d, 28, EXPOSED, d->session);
+    d->evidence = (struct evidence){0};
+}
+
 void send_status(struct pans_device *d)
 {
     if (d->session == 0)
         return;
+    if (d->evidence.exposures != 0)
+        send_exposed(d);
     d->status_tick = d->tick + d->limits.tick_hz;
     uint64_t left = d->run.active ? d->run.lease_tick - d->tick : 0;
     uint64_t hz = d->limits.tick_hz;
@@ -72,7 +87,7 @@ void send_status(struct pans_device *d)
     put32(at + 4, (uint32_t)(left / hz * 1000 + left % hz * 1000 / hz));
     put32(at + 8, d->stream.drops);
     put64(at + 12, d->tick);
-    put64(at + 20, d->run.active ? d->run.begun : d->run.ended);
+    put64(at + 20, d->run.active ? run_begun(d) : d->run.place.number);
     send(d, 28, STATUS, d->session);
 }
 
@@ -165,6 +180,7 @@ static void add_facts(const struct pans_device *d, struct map *map)
     add_value(map, "tick", d->tick);
     add_value(map, "buffer_messages", l->buffer_messages);
     add_value(map, "gate_channels", l->gate_outputs);
+    add_value(map, "exposed_schema", EXPOSED_SCHEMA);
     if (l->dwell_steps != 0) {
         add_value(map, "automaton_schema", AUTOMATON_SCHEMA);
         add_value(map, "automaton_states", l->automaton_states);

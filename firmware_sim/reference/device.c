@@ -17,10 +17,19 @@ static void *carve(struct carver *c, uint64_t count, uint64_t size)
     return c->base == NULL ? NULL : c->base + at;
 }
 
-static struct pans_device *lay_out(struct carver *c, const struct pans_limits *l, uint8_t *parts[13])
+/* One exposure that waits for the main loop, with room for its bits. */
+static uint32_t ended_bytes(const struct pans_limits *l)
+{
+    uint32_t word = l->parallel ? word_bytes(l->channels) : 1u;
+    return (uint32_t)sizeof(struct ended) + (word + 7u) / 8u * 8u;
+}
+
+#define PARTS 15
+
+static struct pans_device *lay_out(struct carver *c, const struct pans_limits *l, uint8_t *parts[PARTS])
 {
     struct pans_device *d = carve(c, 1, sizeof *d);
-    const uint64_t sizes[13] = {
+    const uint64_t sizes[PARTS] = {
         l->payload_bytes + (uint64_t)HEADER_BYTES + CRC_BYTES,
         l->pattern_memory * sizeof *d->patterns,
         l->slot_memory * (uint64_t)sizeof *d->plan.start,
@@ -34,8 +43,10 @@ static struct pans_device *lay_out(struct carver *c, const struct pans_limits *l
         ANSWER_BYTES + PONG_BYTES,
         l->port_bytes,
         l->port_bytes,
+        (l->pending_exposures + (uint64_t)1) * ended_bytes(l),
+        l->gate_outputs * sizeof *d->gates.open,
     };
-    for (int i = 0; i < 13; i++)
+    for (int i = 0; i < PARTS; i++)
         parts[i] = carve(c, sizes[i], 1);
     return d;
 }
@@ -45,14 +56,15 @@ static bool can_be_meant(const struct pans_limits *l)
     bool counted = l->tick_hz >= 1000 && l->tick_hz <= 10000000000u && l->channels != 0 && l->levels >= 2 && l->levels <= 65536;
     bool held = l->slot_memory != 0 && l->buffer_messages != 0 && l->buffer_bytes >= l->block_bytes + l->block_bytes / 254 + 32;
     bool sized = l->block_bytes >= BLOCK_HEADER + 3 && l->block_bytes <= MAX_PAYLOAD && l->payload_bytes >= 64 && l->port_bytes != 0;
+    bool waits = l->pending_exposures >= 2;
     bool automata = l->dwell_steps == 0 || (!l->parallel && l->show_memory >= 64);
-    return counted && held && sized && automata && l->payload_bytes <= MAX_PAYLOAD && l->firmware != NULL && l->serial != NULL;
+    return counted && held && sized && waits && automata && l->payload_bytes <= MAX_PAYLOAD && l->firmware != NULL && l->serial != NULL;
 }
 
 size_t pans_memory_bytes(const struct pans_limits *limits)
 {
     struct carver carver = {NULL, 0};
-    uint8_t *parts[13];
+    uint8_t *parts[PARTS];
     if (!can_be_meant(limits))
         return 0;
     lay_out(&carver, limits, parts);
@@ -64,7 +76,7 @@ struct pans_device *pans_start(const struct pans_limits *limits, const struct pa
 {
     size_t needed = pans_memory_bytes(limits);
     struct carver carver = {memory, 0};
-    uint8_t *parts[13];
+    uint8_t *parts[PARTS];
     if (memory == NULL || needed == 0 || needed > bytes)
         return NULL;
     struct pans_device *d = lay_out(&carver, limits, parts);
@@ -88,6 +100,10 @@ struct pans_device *pans_start(const struct pans_limits *limits, const struct pa
     ring_init(&d->pong_ring, parts[10] + ANSWER_BYTES, PONG_BYTES);
     d->received = parts[11];
     d->staged = parts[12];
+    d->edges.ended = parts[13];
+    d->edges.size = limits->pending_exposures;
+    d->edges.stride = ended_bytes(limits);
+    d->gates.open = (uint16_t *)(void *)parts[14];
     return d;
 }
 
@@ -98,31 +114,36 @@ static uint64_t least(uint64_t a, uint64_t b)
     return a < b ? a : b;
 }
 
-/* The next event but for exposures. */
-static uint64_t next_event(const struct pans_device *d)
+/* The next event but for edges. A run is over at its end, or once the last exposure has ended and is known. */
+static uint64_t next_event(struct pans_device *d)
 {
-    uint64_t due = least(d->status_tick, d->gates.next_tick);
+    uint64_t due = d->status_tick;
     if (d->run.active)
-        due = least(due, least(d->run.lease_tick, d->state == PANS_ARMED ? d->run.start_tick : d->run.end_tick));
+        due = least(due, d->run.lease_tick);
+    if (d->run.active && d->state == PANS_ARMED)
+        due = least(due, d->run.start_tick);
+    else if (d->run.active && d->run.end_tick < due && run_is_over(d))
+        due = d->run.end_tick;
     return due;
 }
 
-uint64_t pans_next_tick(const struct pans_device *d)
+uint64_t pans_next_tick(const struct pans_device *device)
 {
-    return least(next_event(d), run_next_tick(d));
+    struct pans_device *d = (struct pans_device *)(uintptr_t)device; /* looking takes hold of it */
+    hold(d, true);
+    uint64_t edge = pans_edge_tick(d);
+    hold(d, false);
+    return least(next_event(d), edge);
 }
 
 /* One event that is due at the present tick; of several the first in this order, the others come with the next call. */
 static void happen(struct pans_device *d)
 {
-    if (d->gates.next_tick <= d->tick) {
-        gates_do_due(d);
-    } else if (d->run.active && d->state == PANS_ARMED && d->run.start_tick <= d->tick) {
+    if (d->run.active && d->state == PANS_ARMED && d->run.start_tick <= d->tick) {
         d->state = PANS_RUNNING;
         d->reason = NO_REASON;
-        run_do_due(d, d->tick); /* STATUS counts the exposure that begins with the run */
         send_status(d);
-    } else if (d->run.active && d->state == PANS_RUNNING && d->run.end_tick <= d->tick) {
+    } else if (d->run.active && d->state == PANS_RUNNING && d->run.end_tick <= d->tick && run_is_over(d)) {
         run_end(d, PANS_IDLE, COMPLETED);
     } else if (d->run.active && d->run.lease_tick <= d->tick) {
         d->counters.lease_expiries++;
@@ -135,8 +156,12 @@ static void happen(struct pans_device *d)
 static void advance(struct pans_device *d, uint64_t tick)
 {
     for (;;) {
+        run_collect(d);
         uint64_t due = next_event(d);
-        run_do_due(d, least(due, tick));
+        if (d->hw.hold == NULL && pans_edge_tick(d) <= least(due, tick)) {
+            pans_edge(d);
+            continue;
+        }
         if (due > tick)
             break;
         d->tick = due > d->tick ? due : d->tick;
@@ -155,7 +180,8 @@ static void forget_session(struct pans_device *d)
     d->plan.filled = 0;
     forget_states(d);
     d->ack = (struct ack){0};
-    d->run.ended = 0;
+    d->run.place = (struct place){0};
+    d->evidence = (struct evidence){0};
     d->n_pongs = 0;
     d->status_tick = PANS_NEVER;
     ring_forget(&d->answers, d->sending == OF_ANSWERS);
@@ -331,6 +357,8 @@ size_t pans_output(struct pans_device *d, uint64_t tick, uint8_t *out, size_t ro
 
 bool pans_turn(struct pans_device *d)
 {
+    while (d->hw.hold == NULL && pans_edge_tick(d) - d->limits.lead_ticks <= d->hw.now(d->hw.self)) /* PANS_NEVER is never */
+        pans_edge(d);
     size_t room = d->limits.port_bytes, count = d->hw.read(d->hw.self, d->received, room);
     pans_step(d, d->hw.now(d->hw.self), d->received, count);
     if (d->staged_from == d->staged_to) {

@@ -14,7 +14,7 @@
 
 enum message {
     HELLO = 0x01, PING = 0x02, COMMAND = 0x03, GRANT = 0x04,
-    WELCOME = 0x81, PONG = 0x82, ACK = 0x83, STATUS = 0x84, CLICKS = 0x90, FRAMES = 0x91, MARK = 0x92,
+    WELCOME = 0x81, PONG = 0x82, ACK = 0x83, STATUS = 0x84, EXPOSED = 0x85, CLICKS = 0x90, FRAMES = 0x91, MARK = 0x92,
 };
 
 uint32_t pans_crc32(uint32_t start, const uint8_t *data, size_t count);

@@ -10,12 +10,13 @@ static void find_next(struct gates *g)
     }
 }
 
-static bool is_open(const struct gates *g, uint16_t output)
+/* Of pulses that overlap on one output the first opens it, the last closes it. */
+static void switch_to(struct pans_device *d, const struct pulse *pulse, bool open, uint64_t tick)
 {
-    for (uint16_t i = 0; i < g->count; i++)
-        if (g->at[i].open && g->at[i].output == output)
-            return true;
-    return false;
+    uint16_t *holders = d->gates.open + pulse->output, before = *holders;
+    *holders = (uint16_t)(open ? before + 1 : before - 1);
+    if (before == 0 || *holders == 0)
+        d->hw.gate(d->hw.self, pulse->output, open, tick);
 }
 
 enum pans_status take_gate(struct pans_device *d, const uint8_t *body, uint32_t count)
@@ -33,33 +34,31 @@ enum pans_status take_gate(struct pans_device *d, const uint8_t *body, uint32_t 
         return refuse_number(d, PANS_RANGE, "gate output", output, d->limits.gate_outputs - 1u);
     if (ticks == 0 || tick >= LAST_TICK)
         return refuse(d, PANS_RANGE, "a gate of 0 ticks, or beyond the last tick");
-    if (d->gates.count == d->limits.gate_pulses)
-        return refuse_number(d, PANS_RANGE, "number of pending gates", d->gates.count + 1u, d->limits.gate_pulses);
-    d->gates.at[d->gates.count++] = (struct pulse){tick, tick + ticks, output, false};
+    hold(d, true);
+    bool full = d->gates.count == d->limits.gate_pulses;
+    if (!full)
+        d->gates.at[d->gates.count++] = (struct pulse){tick, tick + ticks, output, false};
     find_next(&d->gates);
-    return PANS_DONE;
+    hold(d, false);
+    return full ? refuse_number(d, PANS_RANGE, "number of pending gates", d->limits.gate_pulses + 1u, d->limits.gate_pulses) : PANS_DONE;
 }
 
-/* Open and close what is due at the present tick. */
-void gates_do_due(struct pans_device *d)
+void gates_switch(struct pans_device *d)
 {
     struct gates *g = &d->gates;
+    uint64_t tick = g->next_tick;
     for (uint16_t i = 0; i < g->count;) {
         struct pulse *pulse = g->at + i;
-        if (!pulse->open && pulse->tick <= d->tick) {
-            bool was_open = is_open(g, pulse->output);
+        if (!pulse->open && pulse->tick <= tick) {
             pulse->open = true;
-            if (!was_open)
-                d->hw.gate(d->hw.self, pulse->output, true);
+            switch_to(d, pulse, true, tick);
         }
-        if (!pulse->open || pulse->end > d->tick) {
+        if (!pulse->open || pulse->end > tick) {
             i++;
             continue;
         }
-        uint16_t output = pulse->output;
+        switch_to(d, pulse, false, tick);
         *pulse = g->at[--g->count];
-        if (!is_open(g, output))
-            d->hw.gate(d->hw.self, output, false);
     }
     find_next(g);
 }
@@ -67,10 +66,10 @@ void gates_do_due(struct pans_device *d)
 void gates_close(struct pans_device *d)
 {
     struct gates *g = &d->gates;
-    while (g->count != 0) {
-        struct pulse last = g->at[--g->count];
-        if (last.open && !is_open(g, last.output))
-            d->hw.gate(d->hw.self, last.output, false);
-    }
+    hold(d, true);
+    while (g->count != 0)
+        if (g->at[--g->count].open)
+            switch_to(d, g->at + g->count, false, d->tick);
     find_next(g);
+    hold(d, false);
 }

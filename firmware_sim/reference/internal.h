@@ -7,6 +7,7 @@
 #include "pans_device.h"
 
 #define AUTOMATON_SCHEMA 0xD00A27FFu
+#define EXPOSED_SCHEMA 0x9D499DC7u
 #define NO_OBJECT 0xFFFFFFFFu
 #define BLOCK_HEADER 36u
 #define MAX_CYCLE_TICKS ((uint64_t)1 << 48)
@@ -48,6 +49,7 @@ struct automaton {
     bool begun, complete;
     uint16_t n_states, dwell_steps, filled, longest;
     uint32_t n_leaves, revision;
+    uint64_t step_ticks; /* of light in one dwell step, times 2^32, rounded up: dwell by dwell exact, without a division */
     struct state_row *row;
     uint16_t *depth; /* exposures of the longest walk up to and with a state; 0: not reached */
 };
@@ -63,15 +65,48 @@ struct shows {
     uint16_t count;
 };
 
-struct run {
-    bool active, exposing, host_driven;
-    uint64_t start_tick, cycles, end_tick;
-    uint64_t cycle, cycle_tick, next_tick; /* next_tick: of the present exposure's end, or the next one's begin */
-    uint64_t begun, ended;                 /* exposures since ARM */
-    uint32_t slot, node;
+/* Which exposure of a run: counted on, never divided. */
+struct place {
+    uint64_t number; /* since ARM */
+    uint64_t cycle_tick;
+    uint32_t slot, cycle_here, object; /* cycles of this object's visit that are over */
+};
+
+/* An exposure that has ended, on its way to the main loop; its bits stand behind it. */
+struct ended {
+    uint64_t began;
+    uint32_t length; /* ticks */
+    uint32_t missed; /* exposures right before it that found no room */
     uint16_t stamp;
-    uint64_t began_at; /* the present exposure, as late as the hardware was */
-    uint64_t lease_tick;
+};
+
+/* What pans_edge works with. While `on` the main loop changes it under `hold` only; the entries in use are the main loop's. */
+struct edges {
+    bool on, exposing;
+    uint64_t tick; /* at which the exposure under way ends, or the next one begins; PANS_NEVER after the last */
+    uint64_t end_tick;
+    struct place place; /* of the exposure under way, or of the next one */
+    struct pans_exposure exposure;
+    uint64_t began;
+    uint32_t node;
+    uint16_t stamp, word_bytes;
+    uint8_t *ended; /* `size` places and one to spare, `stride` bytes each */
+    uint32_t stride;
+    uint16_t size, first, used;
+    uint32_t missed;
+};
+
+struct run {
+    bool active, host_driven, marked; /* the present object has its MARK */
+    uint64_t start_tick, cycles, end_tick, lease_tick;
+    struct place place; /* of the first exposure that the stream does not have */
+};
+
+/* How far exposures were from the plan: the worst since the latest EXPOSED. */
+struct evidence {
+    uint32_t exposures;
+    int32_t start, length; /* ticks */
+    uint64_t start_at, length_at;
 };
 
 struct block {
@@ -96,6 +131,7 @@ struct pulse {
 struct gates {
     struct pulse *at;
     uint16_t count;
+    uint16_t *open; /* pulses that hold each output open */
     uint64_t next_tick;
 };
 
@@ -138,6 +174,8 @@ struct pans_device {
     struct automaton automaton;
     struct shows shows;
     struct run run;
+    struct edges edges;
+    struct evidence evidence;
     struct stream stream;
     struct gates gates;
     uint8_t scratch[ANSWER_BYTES / 2]; /* one answer before it is framed */
@@ -148,7 +186,7 @@ struct pans_device {
 /* answers.c */
 void send_welcome(struct pans_device *d, uint32_t session);
 void send_ack(struct pans_device *d);
-void send_status(struct pans_device *d);
+void send_status(struct pans_device *d); /* and EXPOSED before it */
 void take_ping(struct pans_device *d, const uint8_t *payload);
 void frame_pong(struct pans_device *d);
 
@@ -167,30 +205,35 @@ uint64_t gap_after(const struct plan *plan, uint32_t slot);
 void forget_states(struct pans_device *d);
 enum pans_status load_states(struct pans_device *d, const uint8_t *body, uint32_t count);
 enum pans_status take_show(struct pans_device *d, const uint8_t *body, uint32_t count);
-struct pans_light light_now(struct pans_device *d, uint16_t *stamp);
-void walk_on(struct pans_device *d, bool click);
+const struct show *find_show(const struct shows *shows, uint64_t exposure);
 struct pans_light light_of_state(const void *device, uint16_t number, uint32_t next[2]);
+
+/* edge.c */
+void hold(struct pans_device *d, bool on);
+void place_next(const struct plan *plan, struct place *place);
+void edges_start(struct pans_device *d); /* under hold: from the run's first exposure on */
+void edges_named(struct pans_device *d); /* under hold: the host has named a state */
 
 /* run.c */
 enum pans_status arm(struct pans_device *d, const uint8_t *body, uint32_t count);
 enum pans_status prepare(struct pans_device *d);
-uint64_t run_next_tick(const struct pans_device *d);
-void run_do_due(struct pans_device *d, uint64_t tick); /* begins and ends of exposures due up to `tick` */
+void run_collect(struct pans_device *d); /* exposures that have begun or ended go to the stream */
+bool run_is_over(struct pans_device *d); /* every exposure has ended and been collected */
+uint64_t run_begun(struct pans_device *d);
 void run_end(struct pans_device *d, enum pans_state state, enum reason reason);
 void enter(struct pans_device *d, enum pans_state state, enum reason reason);
 void renew_lease(struct pans_device *d, uint32_t lease_ms);
 
 /* stream.c */
 void stream_restart(struct pans_device *d);
-uint8_t *stream_word(struct pans_device *d); /* where the bits of the next exposure of many channels belong */
-void stream_add(struct pans_device *d, bool click, uint64_t exposure, uint32_t object);
+void stream_add(struct pans_device *d, const struct ended *ended); /* the exposure at run.place */
 void stream_close_block(struct pans_device *d);
 void stream_mark(struct pans_device *d, uint32_t object, uint64_t exposure, uint64_t tick);
 bool stream_may_send(const struct pans_device *d);
 
 /* gate.c */
 enum pans_status take_gate(struct pans_device *d, const uint8_t *body, uint32_t count);
-void gates_do_due(struct pans_device *d);
+void gates_switch(struct pans_device *d); /* from pans_edge: what is due at gates.next_tick */
 void gates_close(struct pans_device *d);
 
 #endif

@@ -2,6 +2,9 @@
  *
  * The core is bytes in, bytes out, with ticks as arguments. It reads no clock, opens no port, needs no operating system and allocates
  * nothing: all memory is one block that the caller hands over at start. What touches the world is in the hardware functions below.
+ *
+ * What must happen at a tick is apart from what may wait. `pans_edge` begins or ends an exposure or switches a gate: no framing, no division,
+ * no memory but its own; a timer interrupt may call it. All else (bytes, commands, blocks, leases) is the main loop's.
  */
 #ifndef PANS_DEVICE_H
 #define PANS_DEVICE_H
@@ -46,6 +49,8 @@ struct pans_limits {
     uint32_t block_bytes;                   /* longest payload of a block, 36 to 65536 */
     uint32_t payload_bytes;                 /* longest payload that is received: 65536, or less by a board that says so */
     uint32_t port_bytes;                    /* read or written at once by pans_turn */
+    uint16_t pending_exposures;             /* that may end before the main loop takes them up: at least 2 */
+    uint32_t lead_ticks;                    /* by how much pans_turn is ahead of an edge; 0: at its tick, or later */
     uint16_t gate_outputs, gate_pulses;     /* outputs; pulses that may be pending */
     uint64_t epoch;                         /* another one whenever the tick counter has restarted */
     const char *firmware, *serial;
@@ -64,6 +69,7 @@ struct pans_pixels {
 struct pans_light {
     uint16_t pattern; /* PANS_DARK: none */
     uint16_t dwell, dwell_steps; /* the light is on for dwell / dwell_steps of the exposure, from its start on */
+    uint32_t ticks;              /* the same in ticks */
 };
 
 struct pans_exposure {
@@ -87,19 +93,23 @@ struct pans_task {
     const void *device;
 };
 
-/* The ten functions of the hardware. `self` is whatever the board needs; none of them may wait for the host. */
+/* The functions of the hardware. `self` is whatever the board needs; none of them may wait for the host. */
 struct pans_hardware {
     void *self;
+    /* From the main loop. */
     uint64_t (*now)(void *self);                                         /* clock: ticks, never going back */
     size_t (*read)(void *self, uint8_t *bytes, size_t room);             /* port: what has arrived, 0 without */
     size_t (*write)(void *self, const uint8_t *bytes, size_t count);     /* port: how many it took */
     void (*store)(void *self, const struct pans_pixels *pixels);         /* projector: in order; NULL: forget all */
     enum pans_status (*prepare)(void *self, const struct pans_task *task, const char **why); /* all: DONE, or why not */
-    uint64_t (*expose)(void *self, const struct pans_exposure *exposure); /* projector, detector: the tick at which it began */
-    void (*clicks)(void *self, uint8_t *word, uint16_t bytes);           /* detector: bits of the exposure that has ended */
-    void (*dark)(void *self);                                            /* projector: no light, at once; the run is over */
-    void (*gate)(void *self, uint16_t output, bool open);                /* gate */
+    void (*dark)(void *self); /* projector, detector: no light and no exposure, at once; the run is over */
     bool (*mark)(void *self, uint32_t object, int16_t *truth, float *photons); /* what a simulator knows; else false */
+    void (*hold)(void *self, bool on); /* keep pans_edge from being called while `on`; NULL: pans_step and pans_turn call it themselves */
+    /* From pans_edge, which `hold` keeps away; `show` also from the main loop, held. */
+    void (*show)(void *self, const struct pans_exposure *next);           /* projector: what comes next, as soon as it is known; may be NULL */
+    uint64_t (*expose)(void *self, const struct pans_exposure *exposure); /* wait for its tick, let there be light, open: when it began */
+    uint64_t (*clicks)(void *self, uint8_t *word, uint16_t bytes); /* wait for its end, close, read the bits: the tick at which it ended */
+    void (*gate)(void *self, uint16_t output, bool open, uint64_t tick);  /* wait for the tick, switch */
 };
 
 struct pans_counters {
@@ -117,7 +127,14 @@ size_t pans_memory_bytes(const struct pans_limits *limits);
 struct pans_device *pans_start(const struct pans_limits *limits, const struct pans_hardware *hardware, void *memory, size_t bytes,
                                uint64_t tick);
 
-/* Do what is due up to `tick`, then digest bytes that have come by then. Ticks never go back. */
+/* The tick of the next edge: an exposure begins or ends, a gate opens or closes. PANS_NEVER: none. */
+uint64_t pans_edge_tick(const struct pans_device *device);
+
+/* Do that. To be called ahead of its tick, for which the hardware functions wait: by more than the interrupt and the longest `hold` take. */
+void pans_edge(struct pans_device *device);
+
+/* Do what is due up to `tick`, then digest bytes that have come by then. Ticks never go back, nor ahead of the clock: leases are judged by
+ * them. */
 void pans_step(struct pans_device *device, uint64_t tick, const uint8_t *data, size_t count);
 
 /* Copy what may be sent at `tick`, at most `room` bytes; 0 when there is nothing. What is copied counts as sent. */

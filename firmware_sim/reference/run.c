@@ -71,78 +71,120 @@ enum pans_status arm(struct pans_device *d, const uint8_t *body, uint32_t count)
         .start_tick = start,
         .cycles = cycles,
         .end_tick = cycles == 0 ? PANS_NEVER : start + cycles * d->plan.cycle_ticks,
-        .cycle_tick = start,
-        .next_tick = start + d->plan.start[0],
+        .place = {.cycle_tick = start},
     };
     d->shows.count = 0;
+    d->evidence = (struct evidence){0};
     stream_restart(d);
+    hold(d, true);
+    edges_start(d);
+    hold(d, false);
     renew_lease(d, lease_ms);
     enter(d, PANS_ARMED, NO_REASON);
     return PANS_DONE;
 }
 
-uint64_t run_next_tick(const struct pans_device *d)
+uint64_t run_begun(struct pans_device *d)
 {
-    return d->state == PANS_RUNNING ? d->run.next_tick : PANS_NEVER;
+    hold(d, true);
+    uint64_t begun = d->edges.place.number + d->edges.exposing;
+    hold(d, false);
+    return begun;
 }
 
-static void begin(struct pans_device *d)
+bool run_is_over(struct pans_device *d)
 {
-    struct run *run = &d->run;
-    uint64_t visit = run->cycle / d->plan.cycles_per_object;
-    struct pans_exposure exposure = {
-        .tick = run->next_tick,
-        .number = run->begun,
-        .object = (uint32_t)(visit % NO_OBJECT),
-        .ticks = d->plan.exposure_ticks,
-        .state = PANS_DARK,
-    };
-    if (run->slot == 0) {
-        run->node = 0;
-        if (run->cycle == visit * d->plan.cycles_per_object)
-            stream_mark(d, exposure.object, run->begun, run->next_tick);
+    hold(d, true);
+    bool over = d->edges.tick == PANS_NEVER && d->edges.used == 0;
+    hold(d, false);
+    return over;
+}
+
+static int32_t clamped(uint64_t after, uint64_t before)
+{
+    bool late = after >= before;
+    uint64_t far = late ? after - before : before - after;
+    int32_t error = far > INT32_MAX ? INT32_MAX : (int32_t)far;
+    return late ? error : -error;
+}
+
+static void judge(struct pans_device *d, const struct ended *ended)
+{
+    struct evidence *e = &d->evidence;
+    const struct place *at = &d->run.place;
+    int32_t start = clamped(ended->began, at->cycle_tick + d->plan.start[at->slot]);
+    int32_t length = clamped(ended->length, d->plan.exposure_ticks);
+    if (e->exposures == 0 || (start < 0 ? -start : start) > (e->start < 0 ? -e->start : e->start)) {
+        e->start = start;
+        e->start_at = at->number;
     }
-    exposure.light = light_now(d, &run->stamp);
-    if (d->plan.adaptive && !run->host_driven)
-        exposure.state = run->stamp;
-    run->began_at = d->hw.expose(d->hw.self, &exposure);
-    run->exposing = true;
-    run->begun++;
-    run->next_tick += d->plan.exposure_ticks;
+    if (e->exposures == 0 || (length < 0 ? -length : length) > (e->length < 0 ? -e->length : e->length)) {
+        e->length = length;
+        e->length_at = at->number;
+    }
+    e->exposures++;
 }
 
-static void finish(struct pans_device *d)
+static void mark(struct pans_device *d)
 {
     struct run *run = &d->run;
-    const struct plan *p = &d->plan;
-    uint8_t bit = 0, *word = p->mode == 1 ? stream_word(d) : &bit;
-    uint16_t bytes = p->mode == 1 ? word_bytes(p->n_patterns) : 1;
-    memset(word, 0, bytes);
-    d->hw.clicks(d->hw.self, word, bytes);
-    stream_add(d, bit & 1, run->begun - 1, (uint32_t)(run->cycle / p->cycles_per_object % NO_OBJECT));
-    walk_on(d, bit & 1);
-    run->exposing = false;
-    run->ended++;
-    bool last = run->slot + 1 == p->n_slots;
-    if (last || d->stream.block.count == p->block_exposures || gap_after(p, run->slot) != p->period_ticks)
+    const struct place *at = &run->place;
+    if (run->marked || at->slot != 0 || at->cycle_here != 0)
+        return;
+    stream_mark(d, at->object, at->number, at->cycle_tick + d->plan.start[0]);
+    run->marked = true;
+}
+
+/* The exposure at run.place is done with. */
+static void next_place(struct run *run, const struct plan *plan)
+{
+    place_next(plan, &run->place);
+    run->marked = run->marked && (run->place.slot != 0 || run->place.cycle_here != 0);
+}
+
+/* Exposures that ended without room to tell of them: they count as dropped. */
+static void lose(struct pans_device *d, uint32_t missed)
+{
+    if (missed != 0)
         stream_close_block(d);
-    run->slot++;
-    if (last) {
-        run->slot = 0;
-        run->cycle++;
-        run->cycle_tick += p->cycle_ticks;
+    d->stream.drops += missed;
+    for (; missed != 0; missed--) {
+        mark(d);
+        next_place(&d->run, &d->plan);
     }
-    bool over = run->cycles != 0 && run->cycle == run->cycles;
-    run->next_tick = over ? PANS_NEVER : run->cycle_tick + p->start[run->slot];
 }
 
-void run_do_due(struct pans_device *d, uint64_t tick)
+static void collect_one(struct pans_device *d, const struct ended *ended)
 {
-    while (d->state == PANS_RUNNING && d->run.next_tick <= tick) {
-        if (d->run.exposing)
-            finish(d);
-        else
-            begin(d);
+    const struct plan *p = &d->plan;
+    struct place *at = &d->run.place;
+    lose(d, ended->missed);
+    mark(d);
+    judge(d, ended);
+    stream_add(d, ended);
+    if (at->slot + 1 == p->n_slots || d->stream.block.count == p->block_exposures || gap_after(p, at->slot) != p->period_ticks)
+        stream_close_block(d);
+    next_place(&d->run, p);
+}
+
+void run_collect(struct pans_device *d)
+{
+    struct edges *e = &d->edges;
+    while (d->run.active) {
+        hold(d, true);
+        uint16_t used = e->used, first = e->first;
+        uint64_t begun = e->place.number + e->exposing;
+        hold(d, false);
+        if (used == 0) {
+            if (begun > d->run.place.number)
+                mark(d); /* as soon as its first exposure has begun */
+            return;
+        }
+        collect_one(d, (const struct ended *)(const void *)(e->ended + first * e->stride));
+        hold(d, true);
+        e->first = (uint16_t)(first + 1) == e->size ? 0 : (uint16_t)(first + 1);
+        e->used--;
+        hold(d, false);
     }
 }
 
@@ -151,10 +193,15 @@ void run_end(struct pans_device *d, enum pans_state state, enum reason reason)
 {
     if (!d->run.active)
         return;
-    stream_close_block(d);
-    d->run.active = d->run.exposing = false;
-    d->shows.count = 0;
+    hold(d, true);
+    d->edges.on = d->edges.exposing = false;
+    hold(d, false);
     d->hw.dark(d->hw.self);
+    run_collect(d);
+    lose(d, d->edges.missed);
+    stream_close_block(d);
+    d->run.active = false;
+    d->shows.count = 0;
     if (reason != COMPLETED)
         gates_close(d);
     enter(d, state, reason);

@@ -41,24 +41,22 @@ static uint8_t *bits_of(struct pans_device *d)
     return d->stream.block.body + HEADER_BYTES + BLOCK_HEADER + 2u * d->plan.block_exposures;
 }
 
-uint8_t *stream_word(struct pans_device *d)
+void stream_add(struct pans_device *d, const struct ended *ended)
 {
     struct block *b = &d->stream.block;
-    return b->body + HEADER_BYTES + BLOCK_HEADER + (uint32_t)b->count * word_bytes(d->plan.n_patterns);
-}
-
-void stream_add(struct pans_device *d, bool click, uint64_t exposure, uint32_t object)
-{
-    struct block *b = &d->stream.block;
+    const uint8_t *word = (const uint8_t *)(ended + 1);
+    uint8_t *at = b->body + HEADER_BYTES + BLOCK_HEADER;
     if (b->count == 0) {
-        b->tick = d->run.began_at;
-        b->exposure = exposure;
-        b->object = object;
+        b->tick = ended->began;
+        b->exposure = d->run.place.number;
+        b->object = d->run.place.object;
     }
     if (d->plan.mode == 0) {
-        put16(b->body + HEADER_BYTES + BLOCK_HEADER + 2u * b->count, d->run.stamp);
+        put16(at + 2u * b->count, ended->stamp);
         uint8_t *bits = bits_of(d) + b->count / 8;
-        *bits = (uint8_t)((b->count % 8 == 0 ? 0 : *bits) | click << b->count % 8);
+        *bits = (uint8_t)((b->count % 8 == 0 ? 0 : *bits) | (word[0] & 1) << b->count % 8);
+    } else {
+        memcpy(at + (uint32_t)b->count * d->edges.word_bytes, word, d->edges.word_bytes);
     }
     b->count++;
 }

@@ -125,6 +125,7 @@ enum pans_status load_states(struct pans_device *d, const uint8_t *body, uint32_
         a->n_states = here.n_states;
         a->dwell_steps = here.dwell_steps;
         a->n_leaves = here.n_leaves;
+        a->step_ticks = (((uint64_t)d->plan.exposure_ticks << 32) + here.dwell_steps - 1) / here.dwell_steps;
         memset(a->depth, 0, here.n_states * sizeof a->depth[0]);
         a->depth[0] = 1;
     }
@@ -135,7 +136,7 @@ enum pans_status load_states(struct pans_device *d, const uint8_t *body, uint32_
 
 /* -- what the host names -- */
 
-static struct show *find(struct shows *shows, uint64_t exposure)
+const struct show *find_show(const struct shows *shows, uint64_t exposure)
 {
     for (uint16_t i = 0; i < shows->count; i++)
         if (shows->at[i].exposure == exposure)
@@ -143,7 +144,7 @@ static struct show *find(struct shows *shows, uint64_t exposure)
     return NULL;
 }
 
-static enum pans_status check_show(struct pans_device *d, const struct show *show)
+static enum pans_status check_show(struct pans_device *d, const struct show *show, uint64_t begun)
 {
     const struct plan *p = &d->plan;
     if (show->light.pattern >= p->n_patterns)
@@ -158,10 +159,20 @@ static enum pans_status check_show(struct pans_device *d, const struct show *sho
     if (d->run.cycles != 0 && show->exposure >= d->run.cycles * p->n_slots)
         return refuse_number(d, PANS_RANGE, "exposure", show->exposure, d->run.cycles * p->n_slots - 1);
     if (p->pattern[show->exposure % p->n_slots] != PANS_ADAPTIVE)
-        return refuse_number(d, PANS_RANGE, "exposure, which is dark: its number", show->exposure, d->run.begun);
-    if (show->exposure < d->run.begun)
-        return refuse_number(d, PANS_LATE, "exposure, which has begun: its number", show->exposure, d->run.begun);
+        return refuse_number(d, PANS_RANGE, "exposure, which is dark: its number", show->exposure, begun);
+    if (show->exposure < begun)
+        return refuse_number(d, PANS_LATE, "exposure, which has begun: its number", show->exposure, begun);
     return PANS_DONE;
+}
+
+/* Names of exposures that have begun make room. */
+static void forget_shown(struct shows *shows, uint64_t begun)
+{
+    for (uint16_t i = 0; i < shows->count;)
+        if (shows->at[i].exposure < begun)
+            shows->at[i] = shows->at[--shows->count];
+        else
+            i++;
 }
 
 enum pans_status take_show(struct pans_device *d, const uint8_t *body, uint32_t count)
@@ -170,21 +181,30 @@ enum pans_status take_show(struct pans_device *d, const uint8_t *body, uint32_t 
         return refuse(d, PANS_WRONG_STATE, "SHOW needs a run whose states the host names");
     if (count != 16)
         return refuse_number(d, PANS_MALFORMED, "SHOW: number of bytes", count, 16);
-    struct show show = {get64(body), get16(body + 8), {get16(body + 10), get16(body + 12), get16(body + 14)}};
-    enum pans_status status = check_show(d, &show);
+    struct show show = {get64(body), get16(body + 8), {get16(body + 10), get16(body + 12), get16(body + 14), 0}};
+    enum pans_status status = check_show(d, &show, run_begun(d));
     if (status != PANS_DONE)
         return status;
-    struct show *place = find(&d->shows, show.exposure);
-    if (place == NULL) {
-        if (d->shows.count == d->limits.show_memory)
-            return refuse_number(d, PANS_RANGE, "number of exposures that are named", d->shows.count + 1u, d->limits.show_memory);
-        place = d->shows.at + d->shows.count++;
+    show.light.ticks = (uint32_t)((uint64_t)d->plan.exposure_ticks * show.light.dwell / show.light.dwell_steps);
+    struct shows *shows = &d->shows;
+    hold(d, true);
+    forget_shown(shows, d->edges.place.number + d->edges.exposing);
+    const struct show *known = find_show(shows, show.exposure);
+    if (show.exposure < d->edges.place.number + d->edges.exposing) {
+        status = PANS_LATE; /* it has begun since */
+    } else if (known == NULL && shows->count == d->limits.show_memory) {
+        status = PANS_RANGE;
+    } else {
+        shows->at[known == NULL ? shows->count++ : (uint16_t)(known - shows->at)] = show;
+        edges_named(d);
     }
-    *place = show;
-    return PANS_DONE;
+    hold(d, false);
+    if (status == PANS_LATE)
+        return refuse_number(d, status, "exposure, which has begun: its number", show.exposure, show.exposure + 1);
+    if (status == PANS_RANGE)
+        return refuse_number(d, status, "number of exposures that are named", shows->count + 1u, d->limits.show_memory);
+    return status;
 }
-
-/* -- from click to click -- */
 
 struct pans_light light_of_state(const void *device, uint16_t number, uint32_t next[2])
 {
@@ -192,37 +212,5 @@ struct pans_light light_of_state(const void *device, uint16_t number, uint32_t n
     const struct state_row *row = d->automaton.row + number;
     next[0] = row->next[0];
     next[1] = row->next[1];
-    return (struct pans_light){row->pattern, row->dwell, d->automaton.dwell_steps};
-}
-
-/* What the exposure that begins now shows, and its stamp. */
-struct pans_light light_now(struct pans_device *d, uint16_t *stamp)
-{
-    const struct pans_light dark = {PANS_DARK, 1, 1};
-    struct run *run = &d->run;
-    uint16_t pattern = d->plan.pattern[run->slot];
-    *stamp = pattern;
-    if (!d->plan.adaptive || pattern != PANS_ADAPTIVE)
-        return (struct pans_light){pattern, 1, 1};
-    *stamp = PANS_DARK;
-    if (!run->host_driven) {
-        if (run->node >= d->automaton.n_states)
-            return dark;
-        uint32_t next[2];
-        *stamp = (uint16_t)run->node;
-        return light_of_state(d, *stamp, next);
-    }
-    struct show *named = find(&d->shows, run->begun);
-    if (named == NULL)
-        return dark;
-    struct pans_light light = named->light;
-    *stamp = named->state;
-    *named = d->shows.at[--d->shows.count]; /* their order means nothing */
-    return light;
-}
-
-void walk_on(struct pans_device *d, bool click)
-{
-    if (d->plan.adaptive && !d->run.host_driven && d->run.stamp != PANS_DARK)
-        d->run.node = d->automaton.row[d->run.node].next[click];
+    return (struct pans_light){row->pattern, row->dwell, d->automaton.dwell_steps, (uint32_t)(d->automaton.step_ticks * row->dwell >> 32)};
 }

@@ -23,7 +23,8 @@ static struct {
     uint64_t dice, tick, exposures, frames_in, frames_out, bytes_in, armed, blocks, devices;
     uint32_t last_id;
     uint64_t exposing;
-    bool is_open[4];
+    bool is_open[4], held;
+    struct pans_device *device; /* that the interrupt is of; NULL: none */
     uint8_t body[LARGEST_FRAME], frame[LARGEST_FRAME + LARGEST_FRAME / 254 + 2], heard[LARGEST_FRAME];
     struct decoder decoder;
     struct ring ring;
@@ -55,6 +56,29 @@ static uint64_t number(unsigned bits)
 
 /* -- hardware that does nothing but count -- */
 
+/* The timer's interrupt, in half of the lives: between any two functions that the main loop calls, but never while it is held. */
+static void interrupt(void)
+{
+    if (here.device == NULL || here.held || roll(3) == 0)
+        return;
+    here.held = true;
+    while (pans_edge_tick(here.device) <= here.tick)
+        pans_edge(here.device);
+    here.held = false;
+}
+
+static void hw_hold(void *self, bool on)
+{
+    (void)self;
+    if (here.held == on)
+        wrong(on ? "held twice" : "released twice");
+    if (on)
+        interrupt();
+    here.held = on;
+    if (!on)
+        interrupt();
+}
+
 static uint64_t hw_now(void *self)
 {
     (void)self;
@@ -64,6 +88,7 @@ static uint64_t hw_now(void *self)
 static size_t hw_read(void *self, uint8_t *bytes, size_t room)
 {
     (void)self;
+    interrupt();
     size_t count = (size_t)roll(room + 1);
     for (size_t i = 0; i < count; i++)
         bytes[i] = (uint8_t)roll(256);
@@ -73,12 +98,14 @@ static size_t hw_read(void *self, uint8_t *bytes, size_t room)
 static size_t hw_write(void *self, const uint8_t *bytes, size_t count)
 {
     (void)self, (void)bytes;
+    interrupt();
     return (size_t)roll(count + 1); /* bytes of pans_turn are not looked at: they would have to be put in order with those of pans_output */
 }
 
 static void hw_store(void *self, const struct pans_pixels *pixels)
 {
     volatile uint8_t *sink = self;
+    interrupt();
     size_t bytes = pixels == NULL ? 0 : pixels->bits ? (pixels->count + 7u) / 8 : 2u * pixels->count;
     for (size_t i = 0; i < bytes; i++) /* touch all: they must be there */
         *sink = pixels->data[i];
@@ -88,6 +115,7 @@ static enum pans_status hw_prepare(void *self, const struct pans_task *task, con
 {
     uint32_t next[2];
     (void)self;
+    interrupt();
     for (uint32_t i = 0; i < task->n_states; i++)
         if (task->state(task->device, (uint16_t)i, next).pattern >= task->n_patterns || next[0] <= i)
             wrong("a state that should have been refused");
@@ -105,12 +133,22 @@ static uint64_t hw_expose(void *self, const struct pans_exposure *exposure)
     return exposure->tick;
 }
 
-static void hw_clicks(void *self, uint8_t *word, uint16_t bytes)
+static uint64_t hw_clicks(void *self, uint8_t *word, uint16_t bytes)
 {
     (void)self;
     here.exposing--;
     for (uint16_t i = 0; i < bytes; i++)
         word[i] = (uint8_t)roll(256);
+    return here.tick;
+}
+
+static void hw_show(void *self, const struct pans_exposure *next)
+{
+    (void)self;
+    if (here.exposing != 0 || next->light.ticks > next->ticks || next->light.dwell > next->light.dwell_steps)
+        wrong("light that cannot be meant");
+    if (next->light.ticks != (uint64_t)next->ticks * next->light.dwell / next->light.dwell_steps)
+        wrong("a dwell of other ticks");
 }
 
 static void hw_dark(void *self)
@@ -119,9 +157,11 @@ static void hw_dark(void *self)
     here.exposing = 0;
 }
 
-static void hw_gate(void *self, uint16_t output, bool open)
+static void hw_gate(void *self, uint16_t output, bool open, uint64_t tick)
 {
     (void)self;
+    if (tick > here.tick)
+        wrong("a gate before its time");
     if (here.is_open[output] == open)
         wrong("a gate that is so already");
     here.is_open[output] = open;
@@ -130,6 +170,7 @@ static void hw_gate(void *self, uint16_t output, bool open)
 static bool hw_mark(void *self, uint32_t object, int16_t *truth, float *photons)
 {
     (void)self, (void)object;
+    interrupt();
     *truth = 1;
     *photons = 0.5f;
     return roll(2) != 0;
@@ -280,6 +321,10 @@ static void judge(uint32_t count)
             wrong("a STATUS that cannot be meant");
         here.armed += payload[0] == PANS_ARMED;
         break;
+    case EXPOSED:
+        if (get32(payload) == 0 || (int32_t)get32(payload + 4) < 0 || get64(payload + 12) > here.exposures || get64(payload + 20) > here.exposures)
+            wrong("an EXPOSED that cannot be meant");
+        break;
     case PONG:
         if (get64(payload + 12) > get64(payload + 20) || get64(payload + 20) > here.tick)
             wrong("a PONG that cannot be meant");
@@ -337,7 +382,7 @@ static struct pans_limits any_limits(void)
         .dwell_steps = (uint16_t)(parallel ? 0 : roll(3) * 4), .show_memory = 64, .exposure_min_ticks = 1, .exposure_max_ticks = 100,
         .readout_ticks = (uint32_t)roll(8), .pattern_ticks = (uint32_t)roll(20), .turn_ticks = (uint32_t)roll(12),
         .buffer_messages = 1 + (uint32_t)roll(20), .block_bytes = 39 + (uint32_t)roll(300), .payload_bytes = roll(2) ? 65536 : 64 + (uint32_t)roll(900),
-        .port_bytes = 1 + (uint32_t)roll(300), .gate_outputs = 4, .gate_pulses = (uint16_t)(1 + roll(6)), .epoch = 1, .firmware = "fuzz", .serial = "0",
+        .port_bytes = 1 + (uint32_t)roll(300), .pending_exposures = (uint16_t)(2 + roll(6)), .gate_outputs = 4, .gate_pulses = (uint16_t)(1 + roll(6)), .epoch = 1, .firmware = "fuzz", .serial = "0",
     };
     limits.facts = any_facts();
     limits.n_facts = roll(MOST_FACTS + 1);
@@ -351,13 +396,17 @@ static void one_life(void)
     struct pans_limits limits = any_limits();
     size_t bytes = pans_memory_bytes(&limits);
     uint8_t sink, *memory = malloc(bytes);
-    const struct pans_hardware hardware = {&sink,     hw_now,    hw_read, hw_write, hw_store, hw_prepare,
-                                           hw_expose, hw_clicks, hw_dark, hw_gate,  hw_mark};
+    const struct pans_hardware hardware = {
+        .self = &sink, .now = hw_now, .read = hw_read, .write = hw_write, .store = hw_store, .prepare = hw_prepare, .dark = hw_dark, .mark = hw_mark,
+        .hold = roll(2) ? hw_hold : NULL, .show = hw_show, .expose = hw_expose, .clicks = hw_clicks, .gate = hw_gate,
+    };
+    here.device = NULL;
     struct pans_device *device = pans_start(&limits, &hardware, memory, bytes, here.tick);
     if (device == NULL || pans_start(&limits, &hardware, memory, bytes - 8, here.tick) != NULL)
         wrong("memory that does not suffice, or that is not looked at");
     here.devices++;
     device = pans_start(&limits, &hardware, memory, bytes, here.tick);
+    here.device = hardware.hold == NULL ? NULL : device;
     here.last_id = 0;
     here.exposing = 0;
     memset(here.is_open, 0, sizeof here.is_open);

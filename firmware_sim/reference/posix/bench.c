@@ -71,6 +71,7 @@ void read_settings(struct settings *s)
     s->limits.simulated = true;
     s->limits.block_bytes = s->limits.payload_bytes = 65536;
     s->limits.port_bytes = 65536;
+    s->limits.pending_exposures = 2;
     s->limits.firmware = s->firmware;
     s->limits.serial = s->serial;
     s->facts[0] = (struct pans_fact){"profile", s->profile, 0};
@@ -115,10 +116,12 @@ static uint64_t hw_expose(void *self, const struct pans_exposure *exposure)
     return exposure->tick; /* a simulator is never late itself */
 }
 
-static void hw_clicks(void *self, uint8_t *word, uint16_t bytes)
+static uint64_t hw_clicks(void *self, uint8_t *word, uint16_t bytes)
 {
+    struct light *light = &((struct bench *)self)->light;
     (void)bytes;
-    light_clicks(&((struct bench *)self)->light, word);
+    light_clicks(light, word);
+    return light->now.tick + light->now.ticks;
 }
 
 static void hw_dark(void *self)
@@ -126,9 +129,9 @@ static void hw_dark(void *self)
     (void)self;
 }
 
-static void hw_gate(void *self, uint16_t output, bool open)
+static void hw_gate(void *self, uint16_t output, bool open, uint64_t tick)
 {
-    (void)self, (void)output, (void)open;
+    (void)self, (void)output, (void)open, (void)tick;
 }
 
 static bool hw_mark(void *self, uint32_t object, int16_t *truth, float *photons)
@@ -138,8 +141,9 @@ static bool hw_mark(void *self, uint32_t object, int16_t *truth, float *photons)
 
 struct pans_device *switch_on(struct settings *settings, struct bench *bench, uint64_t tick)
 {
-    const struct pans_hardware hardware = {bench,     hw_now,    hw_read, hw_write, hw_store, hw_prepare,
-                                           hw_expose, hw_clicks, hw_dark, hw_gate,  hw_mark};
+    const struct pans_hardware hardware = {.self = bench,         .now = hw_now,       .read = hw_read,     .write = hw_write,
+                                           .store = hw_store,     .prepare = hw_prepare, .dark = hw_dark,   .mark = hw_mark,
+                                           .expose = hw_expose,   .clicks = hw_clicks, .gate = hw_gate};
     light_init(&bench->light, settings->limits.channels);
     size_t bytes = pans_memory_bytes(&settings->limits);
     bench->memory = bytes == 0 ? NULL : malloc(bytes);

@@ -99,12 +99,14 @@ static uint64_t hw_expose(void *self, const struct pans_exposure *exposure)
     return began;
 }
 
-static void hw_clicks(void *self, uint8_t *word, uint16_t bytes)
+static uint64_t hw_clicks(void *self, uint8_t *word, uint16_t bytes)
 {
     (void)self, (void)bytes;
+    uint64_t ended = hw_now(self);
     SIO_GPIO_OUT_CLR = 1u << DETECTOR_GATE | 1u << TRIGGER;
     board.light_off = PANS_NEVER;
     word[0] = PWM_CTR != board.count_before;
+    return ended;
 }
 
 static void hw_dark(void *self)
@@ -114,9 +116,9 @@ static void hw_dark(void *self)
     board.light_off = PANS_NEVER;
 }
 
-static void hw_gate(void *self, uint16_t output, bool open)
+static void hw_gate(void *self, uint16_t output, bool open, uint64_t tick)
 {
-    (void)self;
+    (void)self, (void)tick;
     uint32_t pin = 1u << (FIRST_OUTPUT + output);
     if (open)
         SIO_GPIO_OUT_SET = pin;
@@ -166,6 +168,7 @@ static const struct pans_limits LIMITS = {
     .block_bytes = 4096,
     .payload_bytes = 65536, /* the protocol's longest */
     .port_bytes = 512,
+    .pending_exposures = 16,
     .gate_outputs = OUTPUTS,
     .gate_pulses = 32,
     .epoch = 1, /* count it up in flash at every start, so that the host sees a restart */
@@ -183,8 +186,10 @@ size_t memory_left(void)
 
 int main(void)
 {
-    static const struct pans_hardware hardware = {&board,    hw_now,    hw_read, hw_write, hw_store, hw_prepare,
-                                                  hw_expose, hw_clicks, hw_dark, hw_gate,  hw_mark};
+    static const struct pans_hardware hardware = {
+        .self = &board, .now = hw_now, .read = hw_read, .write = hw_write, .store = hw_store, .prepare = hw_prepare, .dark = hw_dark, .mark = hw_mark,
+        .expose = hw_expose, .clicks = hw_clicks, .gate = hw_gate,
+    };
     set_up_pins();
     tusb_init();
     board.light_off = PANS_NEVER;
