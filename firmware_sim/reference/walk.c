@@ -144,7 +144,7 @@ const struct show *find_show(const struct shows *shows, uint64_t exposure)
     return NULL;
 }
 
-static enum pans_status check_show(struct pans_device *d, const struct show *show, uint64_t begun)
+static enum pans_status check_show(struct pans_device *d, const struct show *show)
 {
     const struct plan *p = &d->plan;
     if (show->light.pattern >= p->n_patterns)
@@ -159,9 +159,7 @@ static enum pans_status check_show(struct pans_device *d, const struct show *sho
     if (d->run.cycles != 0 && show->exposure >= d->run.cycles * p->n_slots)
         return refuse_number(d, PANS_RANGE, "exposure", show->exposure, d->run.cycles * p->n_slots - 1);
     if (p->pattern[show->exposure % p->n_slots] != PANS_ADAPTIVE)
-        return refuse_number(d, PANS_RANGE, "exposure, which is dark: its number", show->exposure, begun);
-    if (show->exposure < begun)
-        return refuse_number(d, PANS_LATE, "exposure, which has begun: its number", show->exposure, begun);
+        return refuse_number(d, PANS_RANGE, "exposure, which is dark: its number", show->exposure, run_begun(d));
     return PANS_DONE;
 }
 
@@ -182,16 +180,17 @@ enum pans_status take_show(struct pans_device *d, const uint8_t *body, uint32_t 
     if (count != 16)
         return refuse_number(d, PANS_MALFORMED, "SHOW: number of bytes", count, 16);
     struct show show = {get64(body), get16(body + 8), {get16(body + 10), get16(body + 12), get16(body + 14), 0}};
-    enum pans_status status = check_show(d, &show, run_begun(d));
+    enum pans_status status = check_show(d, &show);
     if (status != PANS_DONE)
         return status;
     show.light.ticks = (uint32_t)((uint64_t)d->plan.exposure_ticks * show.light.dwell / show.light.dwell_steps);
     struct shows *shows = &d->shows;
     hold(d, true);
-    forget_shown(shows, d->edges.place.number + d->edges.exposing);
+    uint64_t begun = d->edges.place.number + d->edges.exposing;
+    forget_shown(shows, begun);
     const struct show *known = find_show(shows, show.exposure);
-    if (show.exposure < d->edges.place.number + d->edges.exposing) {
-        status = PANS_LATE; /* it has begun since */
+    if (show.exposure < begun) {
+        status = PANS_LATE;
     } else if (known == NULL && shows->count == d->limits.show_memory) {
         status = PANS_RANGE;
     } else {
@@ -200,7 +199,7 @@ enum pans_status take_show(struct pans_device *d, const uint8_t *body, uint32_t 
     }
     hold(d, false);
     if (status == PANS_LATE)
-        return refuse_number(d, status, "exposure, which has begun: its number", show.exposure, show.exposure + 1);
+        return refuse_number(d, status, "exposure, which has begun: its number", show.exposure, begun);
     if (status == PANS_RANGE)
         return refuse_number(d, status, "number of exposures that are named", shows->count + 1u, d->limits.show_memory);
     return status;

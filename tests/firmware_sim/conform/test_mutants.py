@@ -116,30 +116,30 @@ MUTANTS = {
         "stream.c", "s->drops += exposures;", "s->drops = (uint16_t)(s->drops + exposures);", {"5.12"}
     ),
     "a tick of drift per cycle": Mutant(
-        "run.c", "run->cycle_tick += p->cycle_ticks;", "run->cycle_tick += p->cycle_ticks + 1;", {"5.11"}
+        "edge.c", "place->cycle_tick += plan->cycle_ticks;", "place->cycle_tick += plan->cycle_ticks + 1;", {"5.11"}
     ),
     "blocks go on after a pause": Mutant(
-        "run.c", " || gap_after(p, run->slot) != p->period_ticks)", ")", {"5.2"}
+        "run.c", " || gap_after(p, at->slot) != p->period_ticks)", ")", {"5.2"}
     ),
     "the pattern of the first slot in each stamp": Mutant(
-        "stream.c", "2u * b->count, d->run.stamp);", "2u * b->count, d->plan.pattern[0]);", {"5.3"}
+        "stream.c", "2u * b->count, ended->stamp);", "2u * b->count, d->plan.pattern[0]);", {"5.3"}
     ),
     "a tick of the exposure's end": Mutant(
-        "stream.c", "b->tick = d->run.began_at;", "b->tick = d->run.began_at + d->plan.exposure_ticks;", {"5.4"}
+        "stream.c", "b->tick = ended->began;", "b->tick = ended->began + d->plan.exposure_ticks;", {"5.4"}
     ),
     "an object per cycle": Mutant(
-        "run.c", "(uint32_t)(run->cycle / p->cycles_per_object % NO_OBJECT)", "(uint32_t)run->cycle", {"5.5"}
+        "edge.c", "if (++place->cycle_here < plan->cycles_per_object)", "if (++place->cycle_here < 1)", {"5.5"}
     ),
     "the window is ignored": Mutant(
         "stream.c", "return s->held != 0 && ahead != 0 && ahead < 0x80000000u;", "(void)ahead; return s->held != 0;", {"5.6"}
     ),
     "no drops in blocks": Mutant("stream.c", "put32(at + 4, d->stream.drops);", "put32(at + 4, 0);", {"5.7"}),
     "STOP counts the exposure under way": Mutant(
-        "run.c", "    stream_close_block(d);\n    d->run.active", "    if (d->run.exposing)\n        finish(d);\n"
-        "    stream_close_block(d);\n    d->run.active", {"5.8"},
+        "run.c", "    hold(d, true);\n    d->edges.on", "    if (d->edges.exposing)\n        pans_edge(d);\n"
+        "    hold(d, true);\n    d->edges.on", {"5.8"},
     ),
-    "bits of an earlier block": Mutant("stream.c", "(b->count % 8 == 0 ? 0 : *bits) | click", "*bits | click", {"5.9"}),
-    "each STATUS counts on": Mutant("answers.c", "d->run.begun : d->run.ended", "d->run.begun : d->run.ended++", {"5.10"}),
+    "bits of an earlier block": Mutant("stream.c", "(b->count % 8 == 0 ? 0 : *bits) |", "*bits |", {"5.9"}),
+    "each STATUS counts on": Mutant("answers.c", "run_begun(d) : d->run.place.number", "run_begun(d) : d->run.place.number++", {"5.10"}),
     # -- probes
     "nanoseconds of 32 bits": Mutant(
         "answers.c", "put64(body + HEADER_BYTES + 4, d->pong[0].host_ns);",
@@ -167,10 +167,10 @@ MUTANTS = {
     "ARM with half an automaton": Mutant(
         "run.c", "if (d->automaton.begun && !d->automaton.complete)", "if (d->automaton.n_states == 0xFFFF)", {"11.5"}
     ),
-    "a walk that goes on into the next cycle": Mutant("run.c", "        run->node = 0;\n", "", {"11.6"}),
-    "states of 8 bits": Mutant("walk.c", "*stamp = named->state;", "*stamp = (uint8_t)named->state;", {"11.7"}),
+    "a walk that goes on into the next cycle": Mutant("edge.c", "        e->node = 0;\n", "        ;\n", {"11.6"}),
+    "states of 8 bits": Mutant("edge.c", "e->stamp = named->state;", "e->stamp = (uint8_t)named->state;", {"11.7"}),
     "SHOW of an exposure that has begun": Mutant(
-        "walk.c", "if (show->exposure < d->run.begun)", "if (show->exposure + UINT32_MAX < d->run.begun)", {"11.8"}
+        "walk.c", "if (show.exposure < begun)", "if (show.exposure + UINT32_MAX < begun)", {"11.8"}
     ),
 }  # fmt: skip
 
