@@ -131,7 +131,7 @@ uint64_t pans_next_tick(const struct pans_device *device)
 {
     struct pans_device *d = (struct pans_device *)(uintptr_t)device; /* looking takes hold of it */
     hold(d, true);
-    uint64_t edge = pans_edge_tick(d);
+    uint64_t edge = d->edges.used != 0 ? d->tick : pans_edge_tick(d); /* what has ended waits to be taken up */
     hold(d, false);
     return least(next_event(d), edge);
 }
