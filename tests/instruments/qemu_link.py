@@ -1,7 +1,7 @@
 """The reference firmware as an Arm image in QEMU: how it is built, a link to it in virtual time, and the log of a run without a host.
 
 The board is firmware_sim/reference/mps2. With mailbox.c it runs in lock-step: its time stands still while the host works, so that nothing
-depends on how busy the machine is. `open_qemu` opens `qemu:IMAGE.elf`; `register` makes that a device URL.
+depends on how busy the machine is. `open_qemu` opens `qemu:IMAGE.elf`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import os
 import shutil
 import struct
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lock_step import LockStepLink, open_links
 
 from pans.firmware_sim import device
 from pans.runtime.errors import LinkError
@@ -30,7 +30,7 @@ STRICT = ("-std=gnu11", "-O2", "-mthumb", "-Wall", "-Wextra", "-Wconversion", "-
 LINKING = ("-nostartfiles", "-ffunction-sections", "-specs=nano.specs", "-specs=nosys.specs", "-Wl,--gc-sections")
 SHIFT = 4  # QEMU counts 2^SHIFT ns an instruction: a processor of 62.5 million a second
 TICK_HZ = 25_000_000
-BATCH, MAIL_RING, MAIL_AT = "shared", 1 << 20, 0xC00000
+MAIL_RING, MAIL_AT = 1 << 20, 0xC00000
 GO, DONE, IN_PUT, IN_GOT, OUT_PUT, OUT_GOT, UNTIL, NOW, IN = 0, 4, 8, 12, 16, 20, 24, 32, 40
 OUT = IN + MAIL_RING
 START_S = 20.0
@@ -85,13 +85,13 @@ def canned_log(image: Path, log: Path) -> str:
     return log.read_text()
 
 
-class QemuLink:
-    """A link whose time is that of the emulated instrument; it ends with `end`, since a run opens and closes it at will."""
+class QemuLink(LockStepLink):
+    """A link to an image of the line `mailbox`."""
 
-    simulated, virtual = True, True
+    simulated = True
 
     def __init__(self, image: Path) -> None:
-        self.name, self._closed, self._now = f"qemu:{image}", False, 0
+        super().__init__(f"qemu:{image}")
         self._folder = tempfile.TemporaryDirectory(prefix="pans-qemu-")
         shared = Path(self._folder.name) / "memory"
         with shared.open("w+b") as file:
@@ -101,61 +101,20 @@ class QemuLink:
         words = _emulator(image, Path(self._folder.name) / "log", "-object", backend)
         words[2] = "mps2-an386,memory-backend=shared"
         self._emulator = subprocess.Popen(words)
-        self._run(0)
+        self.run(0)
 
-    def read(self, timeout_s: float) -> bytes:
-        """See `Link`."""
-        self._check_open()
-        return self._run(self._now + max(0, round(timeout_s * 1e9)))
-
-    def write(self, data: bytes) -> None:
-        """See `Link`."""
-        self._check_open()
+    def send(self, data: bytes) -> None:
+        """Put bytes into the ring of what the device receives."""
         put, got = self._get(IN_PUT), self._get(IN_GOT)
         if len(data) > MAIL_RING - ((put - got) & 0xFFFFFFFF):
             raise LinkError("the emulator takes no more bytes")
         at = put % MAIL_RING
-        first = bytes(data[: MAIL_RING - at])
-        for start, part in ((at, first), (0, bytes(data[len(first) :]))):
+        first = data[: MAIL_RING - at]
+        for start, part in ((at, first), (0, data[len(first) :])):
             self._memory[MAIL_AT + IN + start : MAIL_AT + IN + start + len(part)] = part
         self._set(IN_PUT, put + len(data))
 
-    def now_ns(self) -> int:
-        """See `Link`."""
-        return self._now
-
-    def pause(self, seconds: float) -> None:
-        """Let the instrument's time pass; what it says meanwhile is lost."""
-        until = self._now + round(seconds * 1e9)
-        while self._now < until:
-            self._run(until)
-
-    def reopen(self) -> QemuLink:
-        """Open the port of the same instrument again."""
-        self._closed = False
-        return self
-
-    def close(self) -> None:
-        """See `Link`."""
-        self._closed = True
-
-    def end(self) -> None:
-        """Switch the emulator off."""
-        self._emulator.kill()
-        self._emulator.wait()
-        self._folder.cleanup()
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise LinkError(f"{self.name} is closed")
-
-    def _get(self, at: int) -> int:
-        return int(struct.unpack_from("<I", self._memory, MAIL_AT + at)[0])
-
-    def _set(self, at: int, value: int) -> None:
-        struct.pack_into("<I", self._memory, MAIL_AT + at, value & 0xFFFFFFFF)
-
-    def _run(self, until_ns: int) -> bytes:
+    def run(self, until_ns: int) -> bytes:
         """Let time pass up to `until_ns`, or until the instrument has said something, which is returned."""
         ticks = until_ns * (TICK_HZ // 1_000_000) // 1000
         struct.pack_into("<Q", self._memory, MAIL_AT + UNTIL, ticks)
@@ -166,7 +125,7 @@ class QemuLink:
             if self._emulator.poll() is not None or time.monotonic() > give_up:
                 raise LinkError("the emulator has ended or hangs")
             os.sched_yield()
-        self._now = struct.unpack_from("<Q", self._memory, MAIL_AT + NOW)[0] * (10**9 // TICK_HZ)
+        self.at_ns = struct.unpack_from("<Q", self._memory, MAIL_AT + NOW)[0] * (10**9 // TICK_HZ)
         got, put = self._get(OUT_GOT), self._get(OUT_PUT)
         count, at = (put - got) & 0xFFFFFFFF, got % MAIL_RING
         base = MAIL_AT + OUT
@@ -175,20 +134,20 @@ class QemuLink:
         self._set(OUT_GOT, put)
         return data
 
+    def end(self) -> None:
+        """Switch the emulator off."""
+        self._emulator.kill()
+        self._emulator.wait()
+        self._folder.cleanup()
 
-links: list[QemuLink] = []  # that `open_qemu` has opened: the test ends them
+    def _get(self, at: int) -> int:
+        return int(struct.unpack_from("<I", self._memory, MAIL_AT + at)[0])
+
+    def _set(self, at: int, value: int) -> None:
+        struct.pack_into("<I", self._memory, MAIL_AT + at, value & 0xFFFFFFFF)
 
 
 def open_qemu(url: str) -> Any:
     """Open `qemu:IMAGE.elf` (an entry point of `pans.devices`)."""
-    links.append(QemuLink(Path(url.partition(":")[2])))
-    return links[-1]
-
-
-def register(folder: Path) -> None:
-    """Make `qemu:` a device URL of this process, as an installed package would."""
-    facts = folder / "pans_qemu-1.dist-info"
-    facts.mkdir(parents=True)
-    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: pans-qemu\nVersion: 1\n")
-    (facts / "entry_points.txt").write_text(f"[pans.devices]\nqemu = {__name__}:open_qemu\n")
-    sys.path.append(str(folder))
+    open_links.append(QemuLink(Path(url.partition(":")[2])))
+    return open_links[-1]

@@ -1,82 +1,164 @@
-/* A worked example: the instrument on an RP2040 (Raspberry Pi Pico), bare registers and TinyUSB.
+/* The instrument on an RP2040 (Raspberry Pi Pico) or RP2350 (Pico 2).
  *
- *   USB CDC    TinyUSB's device stack carries the bytes; the pico-sdk brings it, and its descriptors.
- *   GPIO 2     trigger of the projector: rises when a pattern is to be shown, falls when the light is to go out
- *   GPIO 3     gate of the detector: high while it is open
- *   GPIO 5     pulses of the detector, counted by PWM slice 2 (channel B counts rising edges)
- *   GPIO 6..9  the four actuation outputs
- *   GPIO 16..19 SPI to the projector, which holds the patterns: `send_to_projector` is the one function to fill in
+ *   GPIO 2      light: high while the pattern is to be lit (the projector's trigger, or the lamp's)
+ *   GPIO 3      the detector's gate: high during an exposure
+ *   GPIO 5      pulses of the detector, rising edges counted by PWM slice 2
+ *   GPIO 6..9   the four actuation outputs
+ *   GPIO 16..19 SPI to the projector: projector.c
+ *   USB         CDC, serial number from the chip
  *
- * The timer counts microseconds in 64 bits, so that tick_hz is 1 000 000. Register addresses: RP2040 datasheet, sections 2.3.1.7 (SIO),
- * 4.5.3 (PWM), 4.6.5 (timer).
+ * A PIO state machine makes light and gate (pulse.pio), from the tick at which the processor starts it: both end by themselves. An alarm of the
+ * timer calls pans_edge LEAD_US ahead. The watchdog is fed while the main loop turns and edges are served; when it bites, the chip restarts with
+ * all pins low. The timer counts microseconds in 64 bits. Docs: docs/how-to/bench.md.
  */
-#include "../pans_device.h"
+#include "board.h"
+#include "hardware/clocks.h"
+#include "hardware/irq.h"
+#include "hardware/pio.h"
+#include "hardware/pwm.h"
+#include "hardware/timer.h"
+#include "hardware/watchdog.h"
+#include "pico/stdlib.h"
+#include "pico/unique_id.h"
+#include "pulse.pio.h"
 
-#define REGISTER(address) (*(volatile uint32_t *)(uintptr_t)(address))
-#define SIO_GPIO_OUT_SET REGISTER(0xD0000014)
-#define SIO_GPIO_OUT_CLR REGISTER(0xD0000018)
-#define SIO_GPIO_OE_SET REGISTER(0xD0000024)
-#define TIMER_RAW_HIGH REGISTER(0x40054024)
-#define TIMER_RAW_LOW REGISTER(0x40054028)
-#define PWM_SLICE_2 0x40050028u
-#define PWM_CSR REGISTER(PWM_SLICE_2 + 0x00)
-#define PWM_DIV REGISTER(PWM_SLICE_2 + 0x04)
-#define PWM_CTR REGISTER(PWM_SLICE_2 + 0x08)
-#define PWM_TOP REGISTER(PWM_SLICE_2 + 0x10)
-#define IO_BANK_FUNCTION(pin) REGISTER(0x40014004u + 8u * (pin))
-
-enum { TRIGGER = 2, DETECTOR_GATE = 3, PULSES = 5, FIRST_OUTPUT = 6, OUTPUTS = 4, FUNCTION_PWM = 4, FUNCTION_SIO = 5 };
+enum { LIGHT = 2, DETECTOR_GATE = 3, PULSES = 5, FIRST_OUTPUT = 6, OUTPUTS = 4, ALARM = 0 };
 
 #define TICK_HZ 1000000u
-#define LIGHT_RISE_US 2u /* what the trigger takes until there is light: measure yours */
-
-/* TinyUSB (tusb.h) */
-extern bool tusb_init(void);
-extern void tud_task(void);
-extern uint32_t tud_cdc_n_read(uint8_t port, void *bytes, uint32_t room);
-extern uint32_t tud_cdc_n_write(uint8_t port, const void *bytes, uint32_t count);
-extern uint32_t tud_cdc_n_write_flush(uint8_t port);
-
-/* The projector's own interface: pixels into its memory, and which pattern the next trigger shows. */
-extern void send_to_projector(const struct pans_pixels *pixels);
-extern void choose_on_projector(uint16_t pattern);
+#define LEAD_US 15u      /* more than the interrupt, the longest `hold` and what expose does ahead of its tick */
+#define WATCHDOG_MS 100u /* a loop that hangs: no light after so long */
+#define OVERDUE_US 2000u /* an edge that nobody serves for so long is a hang too */
 
 static struct {
-    uint64_t light_off; /* the tick at which the light of the present exposure goes out */
-    uint32_t count_before;
+    struct pans_device *device;
+    uint32_t cycles; /* of the state machine in a microsecond */
+    uint64_t end;
+    uint16_t counted;
+    uint32_t exposures;
 } board;
+
+static const PIO pio = pio0;
+static const uint machine = 0;
+static uint program;
+
+/* -- clock and alarm -- */
 
 static uint64_t hw_now(void *self)
 {
     (void)self;
-    for (;;) { /* without the latched pair of registers, which the second core might read at the same time */
-        uint32_t high = TIMER_RAW_HIGH, low = TIMER_RAW_LOW;
-        if (high == TIMER_RAW_HIGH)
-            return (uint64_t)high << 32 | low;
-    }
+    return time_us_64();
 }
+
+static void wait_until(uint64_t tick)
+{
+    while (time_us_64() < tick)
+        continue;
+}
+
+static void schedule(void)
+{
+    uint64_t edge = pans_edge_tick(board.device);
+    if (edge == PANS_NEVER)
+        return;
+    timer_hw->alarm[ALARM] = (uint32_t)(edge - LEAD_US);
+    if (edge <= time_us_64() + LEAD_US)
+        hw_set_bits(&timer_hw->intf, 1u << ALARM); /* the alarm would be missed */
+}
+
+static void edge_interrupt(void)
+{
+    uint64_t edge;
+    hw_clear_bits(&timer_hw->intf, 1u << ALARM);
+    timer_hw->intr = 1u << ALARM;
+    while ((edge = pans_edge_tick(board.device)) != PANS_NEVER && edge <= time_us_64() + LEAD_US)
+        pans_edge(board.device);
+    schedule(); /* also of an alarm that was further ahead than 32 bits */
+}
+
+static void hw_hold(void *self, bool on)
+{
+    (void)self;
+    if (!on)
+        schedule();
+    irq_set_enabled(hardware_alarm_get_irq_num(ALARM), !on);
+}
+
+/* -- exposures -- */
+
+static void hw_show(void *self, const struct pans_exposure *next)
+{
+    (void)self;
+    if (next->light.pattern != PANS_DARK)
+        projector_choose(next->light.pattern);
+}
+
+static uint64_t hw_expose(void *self, const struct pans_exposure *exposure)
+{
+    (void)self;
+    const struct pans_light *light = &exposure->light;
+    bool lit = light->pattern != PANS_DARK;
+    uint32_t whole = exposure->ticks * board.cycles;
+    uint32_t on = lit && light->dwell < light->dwell_steps ? (uint32_t)((uint64_t)whole * light->dwell / light->dwell_steps) : whole - 2;
+    on = on < 2 ? 2 : on > whole - 2 ? whole - 2 : on; /* the least that the state machine can do: 16 ns */
+    pio_sm_put(pio, machine, on - 2);
+    pio_sm_put(pio, machine, whole - on - 2);
+    wait_until(exposure->tick);
+    board.counted = (uint16_t)pwm_get_counter(PULSES / 2);
+    pio_sm_put(pio, machine, lit ? 3 : 2);
+    uint64_t began = time_us_64();
+    board.end = began + exposure->ticks;
+    board.exposures++;
+    return began;
+}
+
+static uint64_t hw_clicks(void *self, uint8_t *word, uint16_t bytes)
+{
+    (void)self, (void)bytes;
+    while (pio_sm_is_rx_fifo_empty(pio, machine) && time_us_64() <= board.end + LEAD_US)
+        continue;
+    uint64_t ended = time_us_64();
+    word[0] = (uint16_t)pwm_get_counter(PULSES / 2) != board.counted;
+    if (!pio_sm_is_rx_fifo_empty(pio, machine))
+        (void)pio_sm_get(pio, machine);
+    return ended;
+}
+
+static void hw_dark(void *self)
+{
+    (void)self;
+    pio_sm_set_enabled(pio, machine, false);
+    pio_sm_clear_fifos(pio, machine);
+    pio_sm_restart(pio, machine);
+    pio_sm_exec(pio, machine, pio_encode_set(pio_pins, 0));
+    pio_sm_exec(pio, machine, pio_encode_jmp(program));
+    pio_sm_set_enabled(pio, machine, true);
+}
+
+static void hw_gate(void *self, uint16_t output, bool open, uint64_t tick)
+{
+    (void)self;
+    wait_until(tick);
+    gpio_put(FIRST_OUTPUT + output, open);
+}
+
+/* -- what may wait -- */
 
 static size_t hw_read(void *self, uint8_t *bytes, size_t room)
 {
     (void)self;
-    tud_task();
-    return tud_cdc_n_read(0, bytes, (uint32_t)room);
+    return port_read(bytes, room);
 }
 
 static size_t hw_write(void *self, const uint8_t *bytes, size_t count)
 {
     (void)self;
-    uint32_t took = count == 0 ? 0 : tud_cdc_n_write(0, bytes, (uint32_t)count);
-    if (took != 0)
-        tud_cdc_n_write_flush(0); /* a short frame is one that the host waits for */
-    return took;
+    return port_write(bytes, count);
 }
 
 static void hw_store(void *self, const struct pans_pixels *pixels)
 {
     (void)self;
-    if (pixels != NULL)
-        send_to_projector(pixels);
+    projector_store(pixels);
 }
 
 static enum pans_status hw_prepare(void *self, const struct pans_task *task, const char **why)
@@ -85,121 +167,123 @@ static enum pans_status hw_prepare(void *self, const struct pans_task *task, con
     return PANS_DONE; /* the projector shows each pattern by its number */
 }
 
-static uint64_t hw_expose(void *self, const struct pans_exposure *exposure)
-{
-    bool lit = exposure->light.pattern != PANS_DARK;
-    if (lit)
-        choose_on_projector(exposure->light.pattern);
-    while (hw_now(self) < exposure->tick) /* the main loop calls a little ahead of time: see main */
-        continue;
-    uint64_t began = hw_now(self);
-    board.count_before = PWM_CTR;
-    SIO_GPIO_OUT_SET = 1u << DETECTOR_GATE | (lit ? 1u << TRIGGER : 0);
-    board.light_off = lit ? began + (uint64_t)exposure->ticks * exposure->light.dwell / exposure->light.dwell_steps : PANS_NEVER;
-    return began;
-}
-
-static uint64_t hw_clicks(void *self, uint8_t *word, uint16_t bytes)
-{
-    (void)self, (void)bytes;
-    uint64_t ended = hw_now(self);
-    SIO_GPIO_OUT_CLR = 1u << DETECTOR_GATE | 1u << TRIGGER;
-    board.light_off = PANS_NEVER;
-    word[0] = PWM_CTR != board.count_before;
-    return ended;
-}
-
-static void hw_dark(void *self)
-{
-    (void)self;
-    SIO_GPIO_OUT_CLR = 1u << DETECTOR_GATE | 1u << TRIGGER;
-    board.light_off = PANS_NEVER;
-}
-
-static void hw_gate(void *self, uint16_t output, bool open, uint64_t tick)
-{
-    (void)self, (void)tick;
-    uint32_t pin = 1u << (FIRST_OUTPUT + output);
-    if (open)
-        SIO_GPIO_OUT_SET = pin;
-    else
-        SIO_GPIO_OUT_CLR = pin;
-}
-
 static bool hw_mark(void *self, uint32_t object, int16_t *truth, float *photons)
 {
     (void)self, (void)object, (void)truth, (void)photons;
     return false; /* hardware does not know what it looks at */
 }
 
-static void set_up_pins(void)
+/* -- start -- */
+
+static void start_pulses(void)
 {
-    static const uint8_t outputs[] = {TRIGGER, DETECTOR_GATE, FIRST_OUTPUT, FIRST_OUTPUT + 1, FIRST_OUTPUT + 2, FIRST_OUTPUT + 3};
-    for (size_t i = 0; i < sizeof outputs; i++) {
-        SIO_GPIO_OUT_CLR = 1u << outputs[i];
-        SIO_GPIO_OE_SET = 1u << outputs[i];
-        IO_BANK_FUNCTION(outputs[i]) = FUNCTION_SIO;
-    }
-    IO_BANK_FUNCTION(PULSES) = FUNCTION_PWM;
-    PWM_DIV = 1u << 4;           /* every edge counts */
-    PWM_TOP = 0xFFFF;
-    PWM_CSR = 2u << 4 | 1u;      /* count rising edges of channel B; go */
+    program = (uint)pio_add_program(pio, &pulse_program);
+    pio_sm_config config = pulse_program_get_default_config(program);
+    sm_config_set_out_pins(&config, LIGHT, 2);
+    sm_config_set_set_pins(&config, LIGHT, 2);
+    pio_gpio_init(pio, LIGHT);
+    pio_gpio_init(pio, DETECTOR_GATE);
+    pio_sm_init(pio, machine, program, &config);
+    pio_sm_set_consecutive_pindirs(pio, machine, LIGHT, 2, true);
+    hw_dark(NULL);
+    board.cycles = clock_get_hz(clk_sys) / TICK_HZ;
 }
 
-/* What this board is. 160 patterns, 512 slots and an automaton of 1024 states fit the 264 KiB beside USB. */
-static const struct pans_limits LIMITS = {
+static void start_counter(void)
+{
+    pwm_config config = pwm_get_default_config();
+    pwm_config_set_clkdiv_mode(&config, PWM_DIV_B_RISING);
+    gpio_set_function(PULSES, GPIO_FUNC_PWM);
+    pwm_init(PULSES / 2, &config, true);
+}
+
+static void start_outputs(void)
+{
+    for (uint pin = FIRST_OUTPUT; pin < FIRST_OUTPUT + OUTPUTS; pin++) {
+        gpio_init(pin);
+        gpio_set_dir(pin, GPIO_OUT);
+    }
+}
+
+static void start_alarm(void)
+{
+    uint irq = hardware_alarm_get_irq_num(ALARM);
+    hardware_alarm_claim(ALARM);
+    irq_set_exclusive_handler(irq, edge_interrupt);
+    irq_set_priority(irq, PICO_HIGHEST_IRQ_PRIORITY); /* above that of USB */
+    hw_set_bits(&timer_hw->inte, 1u << ALARM);
+    irq_set_enabled(irq, true);
+}
+
+static bool edges_are_served(void)
+{
+    hw_hold(NULL, true);
+    uint64_t edge = pans_edge_tick(board.device);
+    hw_hold(NULL, false);
+    return edge == PANS_NEVER || edge + OVERDUE_US > time_us_64();
+}
+
+static struct pans_limits limits = {
     .tick_hz = TICK_HZ,
     .channels = 1,
     .levels = 2,
-    .pattern_memory = 160,
+    .pattern_memory = 4096,
     .pattern_pixels = 1024,
-    .pixel_memory = 160u * 1024u,
+    .pixel_memory = 4096u * 1024u, /* the projector's */
     .slot_memory = 512,
-    .automaton_states = 1024,
-    .dwell_steps = 100,
+    .automaton_states = 4096,
+    .dwell_steps = 1000,
     .show_memory = 64,
-    .exposure_min_ticks = 100,
+    .exposure_min_ticks = 40,
     .exposure_max_ticks = 1000000,
-    .readout_ticks = 50,
-    .pattern_ticks = 100,
-    .turn_ticks = 50,
+    .readout_ticks = 3,
+    .pattern_ticks = 44, /* of a DLP7000: 23.1 kHz */
+    .turn_ticks = 50,    /* the same, and what the core takes to choose */
     .buffer_messages = 128,
-    .buffer_bytes = 32768,
+    .buffer_bytes = 24576,
     .block_bytes = 4096,
-    .payload_bytes = 65536, /* the protocol's longest */
+    .payload_bytes = 12416, /* more than this host ever sends */
     .port_bytes = 512,
-    .pending_exposures = 16,
+    .pending_exposures = 64,
     .gate_outputs = OUTPUTS,
     .gate_pulses = 32,
-    .epoch = 1, /* count it up in flash at every start, so that the host sees a restart */
-    .firmware = "pans-reference 1 (RP2040)",
-    .serial = "0001",
+    .firmware = "pans-reference 2 (" PICO_BOARD ")",
 };
 
-static uint64_t memory[(168u << 10) / 8];
-
-size_t memory_left(void)
-{
-    size_t needed = pans_memory_bytes(&LIMITS);
-    return needed > sizeof memory ? 0 : sizeof memory - needed;
-}
+static uint64_t memory[(160u << 10) / 8];
 
 int main(void)
 {
     static const struct pans_hardware hardware = {
-        .self = &board, .now = hw_now, .read = hw_read, .write = hw_write, .store = hw_store, .prepare = hw_prepare, .dark = hw_dark, .mark = hw_mark,
-        .expose = hw_expose, .clicks = hw_clicks, .gate = hw_gate,
+        .now = hw_now, .read = hw_read, .write = hw_write, .store = hw_store, .prepare = hw_prepare, .dark = hw_dark, .mark = hw_mark,
+#ifndef POLLED /* of a test: firmware without an interrupt, whose exposures begin late */
+        .hold = hw_hold,
+#endif
+        .show = hw_show, .expose = hw_expose, .clicks = hw_clicks, .gate = hw_gate,
     };
-    set_up_pins();
-    tusb_init();
-    board.light_off = PANS_NEVER;
-    struct pans_device *device = pans_start(&LIMITS, &hardware, memory, sizeof memory, hw_now(NULL));
-    while (device != NULL) {
-        pans_turn(device);
-        if (hw_now(NULL) + LIGHT_RISE_US >= board.light_off) { /* a dwell time that is shorter than the exposure */
-            SIO_GPIO_OUT_CLR = 1u << TRIGGER;
-            board.light_off = PANS_NEVER;
-        }
+    static char serial[2 * PICO_UNIQUE_BOARD_ID_SIZE_BYTES + 1];
+    pico_get_unique_board_id_string(serial, sizeof serial);
+    limits.serial = serial;
+    limits.epoch = next_epoch();
+    start_outputs();
+    start_pulses();
+    start_counter();
+    projector_start();
+    port_start(serial);
+    board.device = pans_start(&limits, &hardware, memory, sizeof memory, time_us_64());
+    if (board.device == NULL)
+        panic("the limits do not fit the memory");
+#ifndef POLLED
+    start_alarm();
+#endif
+    watchdog_enable(WATCHDOG_MS, false);
+    for (;;) {
+        pans_turn(board.device);
+#ifdef HANG_AFTER /* of a test: the main loop hangs */
+        while (board.exposures >= HANG_AFTER)
+            continue;
+#endif
+        if (edges_are_served())
+            watchdog_update();
     }
-    return 1; /* the limits do not fit the memory */
 }

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import pytest
 import qemu_link
 from commands import json_of
+from lock_step import open_links, register
 from qemu_link import CPUS, build, canned_log, instructions
 
 from pans.runtime.instrument.profile import profile_text
@@ -78,15 +78,14 @@ def emulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callab
         assert shipped in text
         text = text.replace(shipped, here)
     (tmp_path / "mps2.toml").write_text(text)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    qemu_link.register(tmp_path / "site")
+    monkeypatch.syspath_prepend(register(tmp_path / "site", "qemu", "qemu_link:open_qemu"))
 
     def made(*defines: str) -> list[str]:
         return [f"qemu:{build(tmp_path, 'm0plus', 'mailbox', *defines)}", "--profile", str(tmp_path / "mps2.toml")]
 
     yield made
-    while qemu_link.links:
-        qemu_link.links.pop().end()
+    while open_links:
+        open_links.pop().end()
 
 
 def test_the_image_keeps_every_rule(emulated: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]) -> None:

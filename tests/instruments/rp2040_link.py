@@ -1,0 +1,102 @@
+"""The firmware of rp2040/ in an emulated Pico (rp2040js): how it is built, and a link to it in virtual time.
+
+It needs three things that are not installed with the package: PICO_SDK_PATH, the vendor's SDK (with its TinyUSB, or PICO_TINYUSB_PATH);
+PANS_RP2040JS, the folder of the npm package rp2040js 1.4; PANS_RP2040_BOOTROM, its source's demo/bootrom.ts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lock_step import LockStepLink, open_links
+from qemu_link import FOLDER
+
+from pans.runtime.errors import LinkError
+
+BENCH = Path(__file__).parent / "rp2040" / "bench.mjs"
+NEEDED = ("PICO_SDK_PATH", "PANS_RP2040JS", "PANS_RP2040_BOOTROM")
+WALK_SLOTS, PEAK_HZ, DARK_HZ = 33, 2000, 100  # of the shipped automaton, and of the profile dmd-spad
+
+
+def missing() -> str:
+    """Return what is missing, "" if nothing."""
+    programs = [name for name in ("arm-none-eabi-gcc", "cmake", "node") if shutil.which(name) is None]
+    return ", ".join([name for name in NEEDED if not os.environ.get(name)] + programs)
+
+
+def build(folder: Path, *defines: str, board: str = "pico") -> tuple[Path, str]:
+    """Build the firmware; return the folder of pans.bin and pans.elf, and what the compiler said."""
+    words = [f"-DPICO_BOARD={board}", "-DPICO_NO_PICOTOOL=1", f"-DPANS_DEFINES={';'.join(defines)}"]
+    source = ["cmake", "-S", str(FOLDER / "rp2040"), "-B", str(folder)]
+    subprocess.run([*source, *words], check=True, capture_output=True, timeout=120)
+    done = subprocess.run(["cmake", "--build", str(folder)], check=True, capture_output=True, text=True, timeout=600)
+    return folder, done.stdout + done.stderr
+
+
+def write_scene(path: Path) -> Path:
+    """Write the shipped images for the bench."""
+    scene = np.load(FOLDER.parent / "scenes" / "fashion200.npz")
+    images = scene["images"].reshape(len(scene["labels"]), -1)
+    head = struct.pack("<5I", *images.shape, WALK_SLOTS, 1000 * PEAK_HZ, 1000 * DARK_HZ)
+    path.write_bytes(head + images.astype(np.uint8).tobytes())
+    return path
+
+
+class Rp2040Link(LockStepLink):
+    """A link to USB CDC of the emulated chip."""
+
+    def __init__(self, image: Path) -> None:
+        super().__init__(f"rp2040:{image}")
+        library, rom = (os.environ[name] for name in NEEDED[1:])
+        words = ["node", str(BENCH), library, rom, str(image), str(write_scene(image.with_suffix(".scene")))]
+        self._node = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self.run(0)
+
+    def run(self, until_ns: int) -> bytes:
+        """See `LockStepLink`."""
+        self._ask(b"R" + struct.pack("<Q", until_ns))
+        self.at_ns, count = struct.unpack("<QI", self._take(12))
+        return self._take(count)
+
+    def send(self, data: bytes) -> None:
+        """See `LockStepLink`."""
+        self._ask(b"W" + struct.pack("<I", len(data)) + data)
+
+    def log(self) -> dict[str, Any]:
+        """Return what the bench has seen: `edges` of (light, gate or watchdog, 0 or 1, ns), `clicks`, `starts` of the chip."""
+        self._ask(b"L")
+        found: dict[str, Any] = json.loads(self._take(struct.unpack("<I", self._take(4))[0]))
+        return found
+
+    def end(self) -> None:
+        """See `LockStepLink`."""
+        self._node.kill()
+        self._node.communicate()
+
+    def _ask(self, words: bytes) -> None:
+        assert self._node.stdin is not None
+        try:
+            self._node.stdin.write(words)
+            self._node.stdin.flush()
+        except OSError as error:
+            raise LinkError(f"{self.name} went away") from error
+
+    def _take(self, count: int) -> bytes:
+        assert self._node.stdout is not None
+        data = self._node.stdout.read(count)
+        if len(data) < count:
+            raise LinkError(f"{self.name} went away")
+        return data
+
+
+def open_rp2040(url: str) -> Any:
+    """Open `rp2040:IMAGE.bin` (an entry point of `pans.devices`)."""
+    open_links.append(Rp2040Link(Path(url.partition(":")[2])))
+    return open_links[-1]
