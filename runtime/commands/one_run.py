@@ -42,13 +42,14 @@ if TYPE_CHECKING:
     from pans.runtime.core.decision import Output
     from pans.runtime.core.follower import Follower
     from pans.runtime.link.base import Link
-    from pans.runtime.live import LiveRun, RunResult
+    from pans.runtime.live import LiveRun, Observers, RunResult
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.monitor import Monitor
     from pans.runtime.record import Recorder
     from pans.runtime.registration.file import InUse
     from pans.runtime.report.summary import Summary
     from pans.runtime.watch.metrics import MetricsServer
+    from pans.runtime.watch.osc import OscSender
     from pans.runtime.watch.watchdog import Watchdog
 
 ROUNDING = 1e-9  # of a dose cap: a sum of light is known to so many digits
@@ -84,6 +85,8 @@ class _Around(NamedTuple):
     watchdog: Watchdog | None
     monitor: Monitor
     metrics: MetricsServer | None
+    osc: OscSender | None
+    besides: Observers | None
     ending: ExitStack
 
 
@@ -106,11 +109,13 @@ def run_once(
     *,
     ends_process: bool = False,
     report: Callable[[Outcome], None] = lambda done: None,
+    besides: Observers | None = None,
 ) -> Outcome:
     """Run and leave the files; `profile` takes the place of the one that `options` name.
 
     With `ends_process` a run that hangs when a signal asks for its end takes the process with it (watch/watchdog.py). `report` gets the
-    outcome once the files are whole and before the link is closed, which may wait for a device or a child process.
+    outcome once the files are whole and before the link is closed, which may wait for a device or a child process. `besides` observe the
+    run, too, as those who only look; their `stop` ends it from another thread.
     """
     check_together(options)
     profile = profile or load_profile(options.profile or "")
@@ -121,16 +126,17 @@ def run_once(
     )
     check_run_files(options)
     continuous, watchdog = not (options.seconds or options.decisions), None
-    with stop_signals(continuous=continuous) as stop, ExitStack() as watched:
+    asked = None if besides is None else besides.stop
+    with stop_signals(continuous=continuous, stop=asked) as stop, ExitStack() as watched:
         if ends_process:
             from pans.runtime.watch.watchdog import Watchdog
 
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
         try:
             # ports first: a busy one is refused before anything is compiled or opened
-            with _metrics_of(options) as metrics, ExitStack() as ending:
+            with _metrics_of(options) as metrics, _osc_of(options) as osc, ExitStack() as ending:
                 with _monitor_of(options) as monitor:
-                    around = _Around(stop, watchdog, monitor, metrics, ending)
+                    around = _Around(stop, watchdog, monitor, metrics, osc, besides, ending)
                     done = _prepare_and_run(options, profile, around)
                 report(done)
                 return done
@@ -318,7 +324,7 @@ class _Run:
         from pans.runtime.monitor.snapshot import begin_facts
         from pans.runtime.watch.watchers import Watchers
 
-        around, monitor = self.around, self.around.monitor
+        around, monitor, besides = self.around, self.around.monitor, self.around.besides
         recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
         facts = begin_facts(
             self.bundle,
@@ -341,6 +347,8 @@ class _Run:
                     say(f"pans: {words}")
                 seen.prepared(run)
                 monitor.prepared(run)
+                if besides is not None and besides.prepared is not None:
+                    besides.prepared(run)
                 if self.flow_run is not None:
                     self.flow_run.prepared(run)
 
@@ -348,6 +356,10 @@ class _Run:
                 self.dark.look(run, output)
                 seen.note_news(run)
                 monitor.watch(run, output)
+                if around.osc is not None:
+                    around.osc.watch(run, output)
+                if besides is not None and besides.watch is not None:
+                    besides.watch(run, output)
 
             observers = Observers(look, prepared, around.stop, acts=False)
             what = self.dark.profile, self.bundle, self.plan, self.core, self.options
@@ -463,6 +475,14 @@ def _metrics_of(options: RunOptions) -> AbstractContextManager[MetricsServer | N
     from pans.runtime.watch.metrics import MetricsServer
 
     return closing(MetricsServer(options.metrics))
+
+
+def _osc_of(options: RunOptions) -> AbstractContextManager[OscSender | None]:
+    if not options.osc:
+        return nullcontext()
+    from pans.runtime.watch.osc import OscSender
+
+    return closing(OscSender(options.osc))
 
 
 def _monitor_of(options: RunOptions) -> Monitor:

@@ -106,6 +106,11 @@ class RowDecisions(Sequence[Decision]):
         return [Decision(*row) for row in found] if isinstance(at, slice) else Decision(*found)
 
 
+def rows_of(decisions: Sequence[Decision]) -> npt.NDArray[np.void]:
+    """Return decisions as DECISION_DTYPE (n,); valid as long as they are."""
+    return decisions.rows if isinstance(decisions, RowDecisions) else np.array(decisions, DECISION_DTYPE)
+
+
 class Action(NamedTuple):
     """A pulse that decision `number` asks for: output `channel` from `tick` on; worthless after `tick`. Absolute device ticks."""
 

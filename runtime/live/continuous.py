@@ -69,9 +69,9 @@ def _outlives_its_terminal(number: int) -> bool:
 
 
 @contextmanager
-def stop_signals(*, continuous: bool) -> Iterator[Stop]:
-    """Kernel SIGTERM, SIGINT and SIGHUP into a `Stop`, and put the handlers back afterwards; in the main thread only, else none comes."""
-    stop = Stop(continuous=continuous)
+def stop_signals(*, continuous: bool, stop: Stop | None = None) -> Iterator[Stop]:
+    """Turn SIGTERM, SIGINT and SIGHUP into a `Stop`, and put the handlers back afterwards; in the main thread only, else none comes."""
+    stop = stop or Stop(continuous=continuous)
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return

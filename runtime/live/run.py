@@ -112,6 +112,7 @@ class LiveRun:
         self.armed_after_s, self.start_ns, self.last_data_ns = 0.0, 0, 0
         self.failed: list[Connection] = []  # those that broke before they could be armed
         self.taken_here = 0  # messages of the present connection that the core was given, or came before ARM
+        self.late: list[int] = []  # numbers of the late ones among the decisions that `report` gives next
         self.recorder = recorder
         self._watch: Watcher | None = None  # of the iteration under way
         self._idle = True  # nothing has come in it
@@ -279,6 +280,7 @@ class LiveRun:
             for output in outputs:
                 self._watch(self, output)
         outputs.clear()
+        self.late.clear()
 
     def _why_ended(self, now_ns: int, looked_ns: int, *, idle: bool) -> str:
         """Return why the run is over ("" while it is not); LinkError when the device is lost in a way that may be recovered from.
@@ -423,6 +425,7 @@ class LiveRun:
             self.recorder.add_timing_runs(runs)
         for at in np.flatnonzero(late).tolist():
             for number in range(int(numbers[at]), int(numbers[at] + counts[at])):
+                self.late.append(number)
                 self.journal.note("late", decision=number, latency_us=float(marks_ns[at, 3] - marks_ns[at, 0]) / 1000)
                 begin_ns, arrival_ns, _, decided_ns, _ = marks_ns[at].tolist()
                 self.lateness.incidents.late(LateWork(number, begin_ns, arrival_ns, decided_ns))

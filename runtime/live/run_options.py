@@ -18,6 +18,7 @@ from pans.runtime.ranges import Range
 
 AUTOMATA = "automata (docs/how-to/automata.md)"
 LIVE_PAGE = "live page (docs/how-to/live-view.md)"
+NEIGHBOURS = "neighbours (docs/how-to/neighbours.md)"
 FLOW = "objects in flow (docs/how-to/flow.md)"
 DARK = "calibration and dark counts (docs/how-to/calibrate.md, docs/how-to/dark-counts.md)"
 DAYS = "running for days"
@@ -84,6 +85,10 @@ class RunOptions:
         "", "show the run as a web page; a port alone: this machine only", metavar="HOST:PORT", group=LIVE_PAGE
     )
     serve_public: bool = option(False, "let other machines see the page; there is no password", group=LIVE_PAGE)
+
+    osc: str = option(
+        "", "send each decision there as an OSC message; a port alone: this machine", metavar="HOST:PORT", group=NEIGHBOURS
+    )
 
     flow: str | None = option(
         None, "settings of the flow: shipped ones or a TOML file", metavar="cells|tape|FILE", group=FLOW
