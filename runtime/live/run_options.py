@@ -87,7 +87,10 @@ class RunOptions:
     serve_public: bool = option(False, "let other machines see the page; there is no password", group=LIVE_PAGE)
 
     osc: str = option(
-        "", "send each decision there as an OSC message; a port alone: this machine", metavar="HOST:PORT", group=NEIGHBOURS
+        "",
+        "send each decision there as an OSC message; a port alone: this machine",
+        metavar="HOST:PORT",
+        group=NEIGHBOURS,
     )
 
     flow: str | None = option(

@@ -47,6 +47,7 @@ class OscSender:
 
     def __init__(self, address: str) -> None:
         host, port = parse_address(address, "--osc")
+        self._to: tuple[str | int, ...]
         try:
             family, kind, _, _, self._to = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:

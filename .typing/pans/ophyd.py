@@ -1,0 +1,1 @@
+../../runtime/api/ophyd.py

@@ -1,0 +1,173 @@
+"""`PansDetector`: a run as an ophyd-async device for the plans of bluesky. Needs the extra `ophyd`.
+
+`stage` opens the device and arms it, each `trigger` waits for one decision, `unstage` stops the device and closes the recording. The run is
+what `pans run` does, in a thread of its own; it does not wait for a plan.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pans.runtime.bundle.model import bundle_path, load_bundle
+from pans.runtime.commands.one_run import Outcome, run_once
+from pans.runtime.commands.run import profile_of
+from pans.runtime.core.decision import NO_LABEL, Output, rows_of
+from pans.runtime.errors import LinkError, PansError, UsageError
+from pans.runtime.link.connection import Connection
+from pans.runtime.live import LiveRun, Observers, RunOptions
+from pans.runtime.live.continuous import Stop
+
+try:
+    from bluesky.protocols import Triggerable
+    from ophyd_async.core import AsyncStatus, StandardReadable, StandardReadableFormat, soft_signal_r_and_setter
+except ImportError as error:
+    raise ImportError(f"pans.ophyd needs {error.name}: pip install 'pans-runtime[ophyd]'", name=error.name) from error
+
+CONFIGURATION = {"bundle": (str, None), "device": (str, None), "simulated": (bool, None), "tick_hz": (int, "Hz")}
+HINTED = {
+    "label": (int, None),  # -1: abstained
+    "probability": (float, None),  # posterior of the class
+    "clicks": (int, "clicks"),
+}
+READINGS = {
+    "class_name": (str, None),  # "": abstained
+    "photons": (float, "photoelectrons"),  # expected on this object; nan: the instrument does not know
+    "late": (bool, None),
+    "abstained": (bool, None),
+    "flags": (int, None),  # pans.runtime.core.decision.DecisionFlag
+    "number": (int, None),  # of the decision in the run's recording
+    "tick": (int, "ticks"),  # of the device, end of the last exposure
+}
+
+
+class PansDetector(StandardReadable, Triggerable):
+    """Decisions of `bundle` (a name or .pans) on the device behind a URL, one for each trigger.
+
+    An event's exposures all began after its trigger. `options` are fields of `RunOptions`, for example `out`, the folder of the recording.
+    After `unstage`, `outcome` is what `pans.run` returns. A trigger raises LinkError when the run has ended by itself, stage and unstage
+    raise what ended it (PansError).
+    """
+
+    outcome: Outcome | None = None
+
+    def __init__(
+        self, bundle: str | Path, device: str, *, profile: str | None = None, name: str = "", **options: Any
+    ) -> None:
+        chosen: dict[str, Any] = {"realtime": False, "display": False, "command": "pans.ophyd"} | options
+        path = bundle_path(bundle)
+        self._options = RunOptions(bundle=path, device=device, profile=profile or profile_of(device), **chosen)
+        self._classes = load_bundle(path)[0].classes
+        self._set: dict[str, Any] = {}
+        kinds = StandardReadableFormat
+        groups = (kinds.CONFIG_SIGNAL, CONFIGURATION), (kinds.HINTED_SIGNAL, HINTED), (kinds.CHILD, READINGS)
+        for way, fields in groups:
+            with self.add_children_as_readables(way):
+                for field, (kind, units) in fields.items():
+                    signal, self._set[field] = soft_signal_r_and_setter(kind, units=units)
+                    setattr(self, field, signal)
+        self._thread: threading.Thread | None = None
+        super().__init__(name=name)
+
+    @AsyncStatus.wrap
+    async def stage(self) -> None:
+        """Begin the run; done when the device is about to be armed."""
+        await super().stage()
+        self._loop, self._stop = asyncio.get_running_loop(), Stop(continuous=True)
+        self._ready, self._ended = self._loop.create_future(), self._loop.create_future()
+        self._asked: tuple[int, asyncio.Future[dict[str, Any]]] | None = None
+        self._connection: Connection | None = None
+        self._last_tick = 0  # of the latest decision
+        self._thread = threading.Thread(target=self._work, name="pans-run", daemon=True)
+        self._thread.start()
+        await asyncio.wait({self._ready, self._ended}, return_when=asyncio.FIRST_COMPLETED)
+        if self._ended.done():
+            self._thread = None
+            raise self._ended.result()
+        run = self._run = self._ready.result()
+        facts = {"bundle": str(self._options.bundle.stem), "device": self._options.device}
+        facts |= {"simulated": run.connection.link.simulated, "tick_hz": run.connection.known_clock().tick_hz}
+        for field, value in facts.items():
+            self._set[field](value)
+
+    @AsyncStatus.wrap
+    async def trigger(self) -> None:
+        """Wait for the first decision whose exposures begin from now on."""
+        if self._thread is None:
+            raise UsageError(f"{self.name} is not staged", remedy="use it in a plan that stages, or `bps.stage` first")
+        answer = self._loop.create_future()
+        self._asked = self._run.now_ns(), answer
+        await asyncio.wait({answer, self._ended}, return_when=asyncio.FIRST_COMPLETED)
+        if not answer.done():
+            raise self._ended.result()
+        for field, value in answer.result().items():
+            self._set[field](value)
+
+    @AsyncStatus.wrap
+    async def unstage(self) -> None:
+        """Stop the device and wait until the recording is closed."""
+        await super().unstage()
+        if self._thread is None:
+            return
+        self._stop.request("unstaged")
+        failed = await self._ended
+        self._thread = None
+        if self.outcome is None:
+            raise failed
+
+    # -- the run's thread ----------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        self.outcome, failed = None, PansError("the run has ended")
+        try:
+            seen = Observers(self._watch, lambda run: self._tell(self._ready, run), self._stop)
+            self.outcome = run_once(self._options, besides=seen)
+            failed = LinkError(f"the run has ended: {self.outcome.summary.ended}")
+        except PansError as error:
+            failed = error
+        except BaseException as error:
+            failed.__cause__ = error
+        self._tell(self._ended, failed)
+
+    def _tell(self, future: asyncio.Future[Any], result: Any) -> None:
+        self._loop.call_soon_threadsafe(lambda: None if future.done() else future.set_result(result))
+
+    def _watch(self, run: LiveRun, output: Output) -> None:
+        rows = rows_of(output.decisions)
+        if not len(rows):
+            return
+        if self._connection is not run.connection:  # maybe with another count of ticks
+            self._connection, self._last_tick = run.connection, 0
+        begins = np.append(
+            np.uint64(self._last_tick), rows["tick"][:-1]
+        )  # no window begins before the one before has ended
+        self._last_tick = int(rows["tick"][-1])
+        if self._asked is None:
+            return
+        asked_ns, answer = self._asked
+        clock = run.connection.known_clock()
+        unsure_ns = clock.to_host_ns(clock.to_tick(asked_ns))[1]
+        after = np.flatnonzero(begins >= clock.to_tick(asked_ns + unsure_ns))
+        if not len(after):
+            return
+        self._asked, row = None, rows[after[0]]
+        label, number = int(row["label"]), int(row["index"])
+        abstained = label == NO_LABEL
+        photons = np.nan if output.passages else run.core.marks.photons_of(row["object"][None].astype(np.int64))[0]
+        facts = {
+            "label": -1 if abstained else label,
+            "class_name": "" if abstained else self._classes[label],
+            "probability": float(row["probability"]),
+            "clicks": int(row["clicks"]),
+            "photons": float(photons) * self._options.shots,
+            "late": number in run.late,
+            "abstained": abstained,
+            "flags": int(row["flags"]),
+            "number": number,
+            "tick": int(row["tick"]),
+        }
+        self._tell(answer, facts)
