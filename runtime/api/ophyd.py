@@ -46,31 +46,30 @@ READINGS = {
 
 
 class PansDetector(StandardReadable, Triggerable):
-    """Decisions of `bundle` (a name or .pans) on the device behind a URL, one for each trigger.
+    """Decisions of `bundle` (a name or .pans) on the device behind a URL, one for each trigger; shapes are (), units as above.
 
-    An event's exposures all began after its trigger. `options` are fields of `RunOptions`, for example `out`, the folder of the recording.
+    An event's exposures all began after its trigger, for objects that stand still. `options` are fields of `RunOptions`, for example `out`, the folder of the recording.
     After `unstage`, `outcome` is what `pans.run` returns. A trigger raises LinkError when the run has ended by itself, stage and unstage
     raise what ended it (PansError).
     """
 
     outcome: Outcome | None = None
+    _thread: threading.Thread | None = None
 
     def __init__(
         self, bundle: str | Path, device: str, *, profile: str | None = None, name: str = "", **options: Any
     ) -> None:
-        chosen: dict[str, Any] = {"realtime": False, "display": False, "command": "pans.ophyd"} | options
+        chosen = {"realtime": False, "display": False, "command": "pans.ophyd"} | options
         path = bundle_path(bundle)
         self._options = RunOptions(bundle=path, device=device, profile=profile or profile_of(device), **chosen)
         self._classes = load_bundle(path)[0].classes
         self._set: dict[str, Any] = {}
-        kinds = StandardReadableFormat
-        groups = (kinds.CONFIG_SIGNAL, CONFIGURATION), (kinds.HINTED_SIGNAL, HINTED), (kinds.CHILD, READINGS)
-        for way, fields in groups:
-            with self.add_children_as_readables(way):
-                for field, (kind, units) in fields.items():
-                    signal, self._set[field] = soft_signal_r_and_setter(kind, units=units)
+        way = StandardReadableFormat
+        for kind, fields in ((way.CONFIG_SIGNAL, CONFIGURATION), (way.HINTED_SIGNAL, HINTED), (way.CHILD, READINGS)):
+            with self.add_children_as_readables(kind):
+                for field, (datatype, units) in fields.items():
+                    signal, self._set[field] = soft_signal_r_and_setter(datatype, units=units)
                     setattr(self, field, signal)
-        self._thread: threading.Thread | None = None
         super().__init__(name=name)
 
     @AsyncStatus.wrap
@@ -84,15 +83,10 @@ class PansDetector(StandardReadable, Triggerable):
         self._last_tick = 0  # of the latest decision
         self._thread = threading.Thread(target=self._work, name="pans-run", daemon=True)
         self._thread.start()
-        await asyncio.wait({self._ready, self._ended}, return_when=asyncio.FIRST_COMPLETED)
-        if self._ended.done():
-            self._thread = None
-            raise self._ended.result()
-        run = self._run = self._ready.result()
-        facts = {"bundle": str(self._options.bundle.stem), "device": self._options.device}
-        facts |= {"simulated": run.connection.link.simulated, "tick_hz": run.connection.known_clock().tick_hz}
-        for field, value in facts.items():
-            self._set[field](value)
+        self._run: LiveRun = await self._first(self._ready)
+        clock, options = self._run.connection.known_clock(), self._options
+        facts = {"bundle": options.bundle.stem, "device": options.device, "tick_hz": clock.tick_hz}
+        self._show(facts | {"simulated": self._run.connection.link.simulated})
 
     @AsyncStatus.wrap
     async def trigger(self) -> None:
@@ -101,23 +95,28 @@ class PansDetector(StandardReadable, Triggerable):
             raise UsageError(f"{self.name} is not staged", remedy="use it in a plan that stages, or `bps.stage` first")
         answer = self._loop.create_future()
         self._asked = self._run.now_ns(), answer
-        await asyncio.wait({answer, self._ended}, return_when=asyncio.FIRST_COMPLETED)
-        if not answer.done():
-            raise self._ended.result()
-        for field, value in answer.result().items():
-            self._set[field](value)
+        self._show(await self._first(answer))
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
         """Stop the device and wait until the recording is closed."""
         await super().unstage()
-        if self._thread is None:
-            return
-        self._stop.request("unstaged")
-        failed = await self._ended
-        self._thread = None
-        if self.outcome is None:
-            raise failed
+        if self._thread is not None:
+            self._stop.request("unstaged")
+            failed, self._thread = await self._ended, None
+            if self.outcome is None:
+                raise failed
+
+    async def _first(self, answer: asyncio.Future[Any]) -> Any:
+        """Return what `answer` is given; raise why the run has ended where that comes first."""
+        await asyncio.wait({answer, self._ended}, return_when=asyncio.FIRST_COMPLETED)
+        if answer.done():
+            return answer.result()
+        raise self._ended.result()
+
+    def _show(self, facts: dict[str, Any]) -> None:
+        for field, value in facts.items():
+            self._set[field](value)
 
     # -- the run's thread ----------------------------------------------------------------------------------------------
 
@@ -142,9 +141,8 @@ class PansDetector(StandardReadable, Triggerable):
             return
         if self._connection is not run.connection:  # maybe with another count of ticks
             self._connection, self._last_tick = run.connection, 0
-        begins = np.append(
-            np.uint64(self._last_tick), rows["tick"][:-1]
-        )  # no window begins before the one before has ended
+        # no window begins before the one before has ended
+        begins = np.append(np.uint64(self._last_tick), rows["tick"][:-1])
         self._last_tick = int(rows["tick"][-1])
         if self._asked is None:
             return
