@@ -48,20 +48,21 @@ READINGS = {
 class PansDetector(StandardReadable, Triggerable):
     """Decisions of `bundle` (a name or .pans) on the device behind a URL, one for each trigger; shapes are (), units as above.
 
-    An event's exposures all began after its trigger, for objects that stand still. `options` are fields of `RunOptions`, for example `out`, the folder of the recording.
-    After `unstage`, `outcome` is what `pans.run` returns. A trigger raises LinkError when the run has ended by itself, stage and unstage
-    raise what ended it (PansError).
+    An event's exposures all began after its trigger, for objects that stand still. `out` is a folder for the recording (None: none),
+    `options` are fields of `RunOptions`. After `unstage`, `outcome` is what `pans.run` returns. A trigger raises LinkError when the run has
+    ended by itself, stage and unstage raise what ended it (PansError).
     """
 
     outcome: Outcome | None = None
     _thread: threading.Thread | None = None
 
     def __init__(
-        self, bundle: str | Path, device: str, *, profile: str | None = None, name: str = "", **options: Any
+        self, bundle: str | Path, device: str, *, out: str | Path | None = None, name: str = "", **options: Any
     ) -> None:
+        path, folder = bundle_path(bundle), None if out is None else Path(out)
         chosen = {"realtime": False, "display": False, "command": "pans.ophyd"} | options
-        path = bundle_path(bundle)
-        self._options = RunOptions(bundle=path, device=device, profile=profile or profile_of(device), **chosen)
+        chosen["profile"] = options.get("profile") or profile_of(device)
+        self._options = RunOptions(bundle=path, device=device, out=folder, **chosen)
         self._classes = load_bundle(path)[0].classes
         self._set: dict[str, Any] = {}
         way = StandardReadableFormat
