@@ -60,7 +60,7 @@ class PansDetector(StandardReadable, Triggerable):
         self, bundle: str | Path, device: str, *, out: str | Path | None = None, name: str = "", **options: Any
     ) -> None:
         path, folder = bundle_path(bundle), None if out is None else Path(out)
-        chosen = {"realtime": False, "display": False, "command": "pans.ophyd"} | options
+        chosen: dict[str, Any] = {"realtime": False, "display": False, "command": "pans.ophyd"} | options
         chosen["profile"] = options.get("profile") or profile_of(device)
         self._options = RunOptions(bundle=path, device=device, out=folder, **chosen)
         self._classes = load_bundle(path)[0].classes

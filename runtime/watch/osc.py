@@ -1,7 +1,7 @@
 """Decisions out to Bonsai and its kind while a run goes on: one OSC message each, many in a datagram.
 
-In come the outputs of the loop, out go datagrams (OSC 1.0 over UDP). The socket never waits: its send buffer is the queue, and what does
-not fit is dropped and counted. A thread would cost the loop more, since it shares the interpreter.
+In come the outputs of the loop, out go datagrams (OSC 1.0 over UDP and IPv4). The socket never waits: its send buffer is the queue, and
+what does not fit is dropped and counted. The loop sends by itself; a thread would compete with it for the interpreter.
 """
 
 from __future__ import annotations
@@ -47,14 +47,11 @@ class OscSender:
 
     def __init__(self, address: str) -> None:
         host, port = parse_address(address, "--osc")
-        self._to: tuple[str | int, ...]
         try:
-            family, kind, _, _, self._to = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        except OSError as error:
-            raise UsageError(
-                f"--osc {address}: no such host: {error.strerror or error}", remedy="write HOST:PORT, or PORT"
-            ) from error
-        self._socket, self._address = socket.socket(family, kind), address
+            self._to = socket.gethostbyname(host), port
+        except (OSError, UnicodeError) as error:
+            raise UsageError(f"--osc {address}: no such host: {error}", remedy="write HOST:PORT, or PORT") from error
+        self._socket, self._address = socket.socket(type=socket.SOCK_DGRAM), address
         self._socket.setblocking(False)
         self.sent = self.dropped = 0  # decisions
 
