@@ -1,6 +1,6 @@
-"""The tables of options on the page of commands, made from the commands themselves when the site is built.
+"""The examples and tables of options on the page of commands, made from the commands themselves when the site is built.
 
-A line `<!-- options of pans NAME -->` becomes a table; a command that cannot be loaded here (its extra is not installed) names `pans help`.
+A line `<!-- options of pans NAME -->` becomes both; a command that cannot be loaded here (its extra is not installed) names `pans help`.
 """
 
 import argparse
@@ -27,12 +27,13 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def options_table(name: str) -> str:
-    """Return the options of `pans NAME` as a Markdown table."""
+    """Return the examples of `pans NAME` and its options, in Markdown."""
     from pans.runtime.cli.command import parser_of
 
     (point,) = entry_points(group="pans.commands", name=name)
     try:
-        parser = parser_of(name, point.load())
+        command = point.load()
+        parser = parser_of(name, command)
     except ModuleNotFoundError:
         return f"`pans help {name}` lists the options."
     rows = [
@@ -40,7 +41,8 @@ def options_table(name: str) -> str:
         for action in parser._actions
         if action.help != argparse.SUPPRESS and not set(COMMON) & set(action.option_strings)
     ]
-    return "\n".join(["| option | meaning |", "| --- | --- |", *rows])
+    examples = ["```console", *(f"$ {line}" for line in command.examples), "```", ""] if command.examples else []
+    return "\n".join([*examples, "| option | meaning |", "| --- | --- |", *rows])
 
 
 def _row(action: argparse.Action) -> str:
