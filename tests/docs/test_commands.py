@@ -25,7 +25,6 @@ from tree import ROOT
 from pans.runtime import cli
 
 COMMANDS = {point.name: point for point in entry_points(group="pans.commands")}
-LOG_OPTIONS = ("--log-file", "--log-format", "--log-rotate-mb")  # of every command, at the top of the page
 MOST_WORDS = 40  # of a sentence outside measurements and results, which are mostly figures
 
 
