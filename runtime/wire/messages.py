@@ -118,6 +118,16 @@ class Status(NamedTuple):
     next_exposure: int
 
 
+class Exposed(NamedTuple):
+    """What the latest `exposures` were off the plan at most, in ticks, and the numbers since ARM of those that were."""
+
+    exposures: int
+    start_error: int  # above 0: it began late
+    length_error: int  # above 0: it was too long
+    start_exposure: int
+    length_exposure: int
+
+
 class ClickBlock(NamedTuple):
     """Consecutive, equally spaced exposures of one detector: one bit and one shown pattern index each.
 
@@ -291,6 +301,16 @@ def decode_status(payload: bytes) -> Status:
     return Status(*fields("STATUS", payload))
 
 
+def encode_exposed(exposed: Exposed, session: int) -> bytes:
+    """Return when exposures happened; sent directly before a STATUS."""
+    return encode_frame(MessageType.EXPOSED, STRUCTS["EXPOSED"].pack(*exposed), session)
+
+
+def decode_exposed(payload: bytes) -> Exposed:
+    """Decode EXPOSED."""
+    return Exposed(*fields("EXPOSED", payload))
+
+
 def encode_clicks(block: ClickBlock, session: int) -> bytes:
     """Return a sequential block: CLICKS, or COUNTS where `block.largest` is above 1."""
     head, patterns = (*block[:5], len(block.patterns)), block.patterns.astype("<u2").tobytes()
@@ -368,5 +388,6 @@ DECODERS: Mapping[int, Callable[[bytes], Any]] = {  # of all that a device sends
     MessageType.PONG: decode_pong,
     MessageType.ACK: decode_ack,
     MessageType.STATUS: decode_status,
+    MessageType.EXPOSED: decode_exposed,
     **STREAM_DECODERS,
 }

@@ -54,9 +54,8 @@ class Field(NamedTuple):
         """What the layout can hold: integers of the code's bits, or every finite real number."""
         if self.code == "f":
             return -math.inf, math.inf
-        if self.code == "h":
-            return -(1 << 15), (1 << 15) - 1
-        return 0, (1 << _BITS[self.code]) - 1
+        half = 1 << _BITS[self.code.upper()] - 1
+        return (-half, half - 1) if self.code.islower() else (0, 2 * half - 1)
 
     @property
     def range(self) -> tuple[float, float]:
@@ -210,11 +209,21 @@ COUNT_MESSAGES: Mapping[str, tuple[Field, ...]] = {
     "COUNT_STATE": (_PATTERN, _DWELL),
     "COUNT_SUCCESSOR": (_next("next", "successor"),),
 }
-_WHOLE = {**MESSAGES, **AUTOMATON_MESSAGES, **COUNT_MESSAGES}
+# The same for when exposures happened (protocol.md, section 15).
+EXPOSED_MESSAGES: Mapping[str, tuple[Field, ...]] = {
+    "EXPOSED": (
+        Field("exposures", "I", "exposures", "exposures", low=1),
+        Field("start_error", "i", "start error", "ticks"),
+        Field("length_error", "i", "length error", "ticks"),
+        Field("start_exposure", "Q", "number of the one", "exposures", high=LARGEST_TICK),
+        Field("length_exposure", "Q", "of the other", "exposures", high=LARGEST_TICK),
+    )
+}
+_WHOLE = {**MESSAGES, **AUTOMATON_MESSAGES, **COUNT_MESSAGES, **EXPOSED_MESSAGES}
 # without what is reserved: those are 0 when sent and not looked at when they come
 ALL_MESSAGES = {name: tuple(field for field in fields if field.name != "reserved") for name, fields in _WHOLE.items()}
 # the host checks these; a device refuses commands itself
-FROM_DEVICE = ("PONG", "ACK", "STATUS", "CLICKS", "FRAMES", "MARK", "COUNTS")
+FROM_DEVICE = ("PONG", "ACK", "STATUS", "CLICKS", "FRAMES", "MARK", "COUNTS", "EXPOSED")
 
 
 class Fact(NamedTuple):
@@ -260,6 +269,7 @@ FACTS: Mapping[str, Fact] = {
     "count_schema": Fact(int, False, 0, U32_MAX),
     "photon_number_max": Fact(int, False, 1, MAX_PHOTON_NUMBER),
     "channels_at_once": Fact(int, False, 1, MAX_CHANNELS_AT_ONCE),
+    "exposed_schema": Fact(int, False, 0, U32_MAX),
 }
 
 
@@ -323,6 +333,7 @@ class MessageType(IntEnum):
     PONG = 0x82
     ACK = 0x83
     STATUS = 0x84
+    EXPOSED = 0x85  # of the extension for when exposures happened
     CLICKS = 0x90
     FRAMES = 0x91
     MARK = 0x92
@@ -391,8 +402,10 @@ def _struct(fields: tuple[Field, ...]) -> struct.Struct:
 SCHEMA_TEXT = _schema_text(f"pans-wire/{PROTOCOL_VERSION}", MESSAGES)
 AUTOMATON_SCHEMA_TEXT = _schema_text("pans-automaton/1", AUTOMATON_MESSAGES)
 COUNT_SCHEMA_TEXT = _schema_text("pans-counts/1", COUNT_MESSAGES)
-SCHEMA, AUTOMATON_SCHEMA, COUNT_SCHEMA = (
-    zlib.crc32(text.encode("ascii")) for text in (SCHEMA_TEXT, AUTOMATON_SCHEMA_TEXT, COUNT_SCHEMA_TEXT)
+EXPOSED_SCHEMA_TEXT = _schema_text("pans-exposed/1", EXPOSED_MESSAGES)
+SCHEMA, AUTOMATON_SCHEMA, COUNT_SCHEMA, EXPOSED_SCHEMA = (
+    zlib.crc32(text.encode("ascii"))
+    for text in (SCHEMA_TEXT, AUTOMATON_SCHEMA_TEXT, COUNT_SCHEMA_TEXT, EXPOSED_SCHEMA_TEXT)
 )
 STRUCTS = {name: _struct(fields) for name, fields in _WHOLE.items()}
 HEADER = STRUCTS["HEADER"]
