@@ -11,6 +11,7 @@ from pans.runtime.instrument.click_law import cannot_count
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.fit import scene_facts
 from pans.runtime.wire.commands import Extension, announcement, count_announcement
+from pans.runtime.wire.schema import EXPOSED_SCHEMA
 
 from .gates import GATE_CHANNELS
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS
@@ -48,6 +49,7 @@ def facts_of(view: View, extension: Extension | None, number_max: int, now: Now)
         | counts
         | _image_facts(scene)
         | {
+            "exposed_schema": EXPOSED_SCHEMA,
             "firmware": FIRMWARE,
             "serial": f"SIM-{view.seed & 0xFFFFFFFF:08X}",
             "epoch": now.epoch,

@@ -60,10 +60,16 @@ class Instrument:
         epoch: int = 1,
         buffer_messages: int = BUFFER_MESSAGES,
         optics: Analyser | None = None,
+        exposure_late_us: float = 0.0,
+        exposure_short_us: float = 0.0,
     ) -> None:
         self.profile = profile
         scene = SceneFile(scene.name, scene) if isinstance(scene, Scene) else scene
-        self.view = View(profile, scene, optics, seed)
+        # by how much exposures begin later and are shorter than planned: a fault
+        self._late_ticks, short_ticks = (
+            round(us * 1e-6 * profile.clock.tick_hz) for us in (exposure_late_us, exposure_short_us)
+        )
+        self.view = View(profile, scene, optics, seed, short_ticks)
         self.view.check_and_warm_up()
         self.decoder = wire.FrameDecoder()
         self.state, self.reason = DeviceState.IDLE, StateReason.POWER_ON
@@ -92,9 +98,10 @@ class Instrument:
         self._light: tuple[tuple[int, int, int, bool, bytes], Table | PatternLight] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
         self._run: Measurement | FrameRun | None = None
+        self._errors = 0, 0  # of its exposures' start and length, in ticks
         self._lease_tick: int | None = None
         self._status_tick: int | None = None
-        self._exposures_ended = 0
+        self._exposures_ended = self._exposures_told = 0
         self.stream.limit = 0
         self.stream.restart()
 
@@ -190,8 +197,16 @@ class Instrument:
         self._status_tick = self._tick + self._tick_hz
         left = 0 if self._lease_tick is None else (self._lease_tick - self._tick) * 1000 // self._tick_hz
         following = self._exposures_ended if self._run is None else self._run.begun_by(self._tick)
+        self._send_exposed(self._exposures_ended if self._run is None else self._run.ended_by(self._tick))
         status = wire.Status(self.state, self.reason, left, self.stream.dropped_exposures & U32, self._tick, following)
         self._out.append(wire.encode_status(status, self.session))
+
+    def _send_exposed(self, ended: int) -> None:
+        """Tell when the exposures happened that have ended since it was told last: all are off alike, so the first stands for them."""
+        told, self._exposures_told = self._exposures_told, ended
+        if ended > told:
+            exposed = wire.Exposed(ended - told, *self._errors, told, told)
+            self._out.append(wire.encode_exposed(exposed, self.session))
 
     # -- what the device receives --------------------------------------------------------------------------------------
 
@@ -340,10 +355,12 @@ class Instrument:
         shows = ShowList(states.extension, states.channels) if program.adaptive and states.states is None else None
         drive = states.states if shows is None else shows
         reading = ReadCounts(states.largest, states.channels)
-        self._run = self.view.run(program, arm, self._light_table(program), self._draws, drive, reading)
+        begun = arm._replace(start_tick=arm.start_tick + self._late_ticks)
+        self._errors = begun.start_tick - arm.start_tick, self.view.exposure_ticks(program) - program.exposure_ticks
+        self._run = self.view.run(program, begun, self._light_table(program), self._draws, drive, reading)
         self._shows = shows
         self.stream.restart()
-        self._exposures_ended = 0
+        self._exposures_ended = self._exposures_told = 0
         self._renew(arm.lease_ms)
         self._enter(DeviceState.ARMED, StateReason.NONE)
 

@@ -48,6 +48,7 @@ class View:
     scene: SceneFile
     optics: Analyser | None = None
     seed: int = 0
+    short_ticks: int = 0  # by which exposures are shorter than planned
 
     @property
     def bleaches(self) -> bool:
@@ -80,9 +81,13 @@ class View:
             detector_kernels.warm_up()
             frame_writer.warm_up()
 
+    def exposure_ticks(self, program: Program) -> int:
+        """The ticks that an exposure of `program` lasts: as planned, unless there is a fault."""
+        return max(1, program.exposure_ticks - self.short_ticks)
+
     def exposure_us(self, program: Program) -> float:
         """The exposure time of `program` on this instrument's clock."""
-        return program.exposure_ticks * 1e6 / self.profile.clock.tick_hz
+        return self.exposure_ticks(program) * 1e6 / self.profile.clock.tick_hz
 
     def stay(self, program: Program) -> bytes:
         """What the light of an object's stay depends on beside the patterns: where it bleaches, their order; else nothing."""

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SCENE = "fashion200"
 MAX_DRIFT_PPM = 1000.0
+MAX_EXPOSURE_ERROR_US = 1e6
 GOODBYE_S = 2.0
 MAX_BUFFER_MESSAGES = 1 << 16
 
@@ -69,6 +70,8 @@ class SimOptions:
         metavar="D0[:mixed]",
     )
     changes: str = option("", "like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)")
+    exposure_late_us: float = option(0.0, "a fault: exposures begin so much later than planned")
+    exposure_short_us: float = option(0.0, "a fault: exposures are so much shorter than planned")
 
 
 def parse_sim_url(url: str) -> SimOptions:
@@ -112,6 +115,9 @@ def check_options(options: SimOptions) -> SimOptions:
     if options.bleach:
         with as_usage_error():
             bleaching_of(options.bleach)
+    for name in ("exposure_late_us", "exposure_short_us"):
+        if not 0 <= getattr(options, name) <= MAX_EXPOSURE_ERROR_US:
+            raise UsageError(f"{name}={getattr(options, name)}: allowed are 0..{MAX_EXPOSURE_ERROR_US:g}")
     if not abs(options.drift_ppm) <= MAX_DRIFT_PPM:
         raise UsageError(f"drift_ppm={options.drift_ppm}: allowed are -{MAX_DRIFT_PPM:g}..{MAX_DRIFT_PPM:g}")
     return options
@@ -140,6 +146,8 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
             epoch=epoch,
             buffer_messages=options.buffer,
             optics=optics,
+            exposure_late_us=options.exposure_late_us,
+            exposure_short_us=options.exposure_short_us,
         )
 
     start_tick = clock.tick_at(host_ns)

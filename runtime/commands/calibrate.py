@@ -14,7 +14,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_TIMING, Command, add_force, emit, say
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_TIMING, Command, add_force, emit, say, warn
 from pans.runtime.cli.option_fields import refuse_without
 from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import LinkError, UsageError, as_usage_error
@@ -107,7 +107,7 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     from pans.runtime.link.base import open_link
     from pans.runtime.live import Observers, RunOptions, run_live
     from pans.runtime.live.continuous import INTERRUPTED
-    from pans.runtime.report.summary import contradictions_of
+    from pans.runtime.report.summary import contradictions_of, exposure_fault
 
     core = CalibrationCore(design.plan, design.n_cycles)
     seconds = design.n_cycles * design.plan.cycle_us * 1e-6
@@ -120,6 +120,8 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
         raise KeyboardInterrupt(result.ended)
     if result.ended != "completed":
         raise LinkError(f"the calibration was not completed: {result.ended}", remedy="check the link and try again")
+    if fault := exposure_fault(result.exposure_timing, result.stream["exposures"]):
+        warn(fault)
     keep = {"serial", "firmware", "name", "simulated"}
     facts = {key: value for key, value in result.device.items() if key in keep}
     return core, facts, Counter(contradictions_of(result))

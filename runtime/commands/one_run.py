@@ -332,6 +332,7 @@ class _Run:
             simulated=link.simulated,
             expected=self.expected_decisions,
             deadline_us=options.deadline_us,
+            exposure_tolerance_us=self.profile.exposure_tolerance_us(self.plan.exposure_us),
             trials=options.trials,
             illumination=self.bundle.illumination() * self.frames,
         )
@@ -511,6 +512,7 @@ def _exit_code(summary: Summary) -> int:
         return EXIT_ALERT
     if summary.link_lost or summary.ended.startswith(REFUSED):
         return EXIT_DEVICE
-    if summary.late or summary.lost or summary.stream["lost_messages"] or summary.contradictions:
+    off = summary.exposure_timing.get("within") is False
+    if summary.late or summary.lost or summary.stream["lost_messages"] or summary.contradictions or off:
         return EXIT_TIMING
     return EXIT_FINE if summary.verdict == "PASS" else EXIT_ALERT

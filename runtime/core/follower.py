@@ -10,6 +10,7 @@ import math
 from base64 import b64decode, b64encode
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from pans.runtime.wire.messages import (
     UNKNOWN_TRUTH,
     ClickBlock,
     DeviceState,
+    Exposed,
     Frame,
     FrameBlock,
     MalformedMessage,
@@ -29,6 +31,7 @@ from pans.runtime.wire.messages import (
     MessageType,
     StateReason,
     Status,
+    decode_exposed,
     decode_status,
 )
 from pans.runtime.wire.schema import MAX_GAP_EXPOSURES
@@ -122,8 +125,19 @@ class PlanRules:
         return None
 
 
+NOTHING_EXPOSED = Exposed(0, 0, 0, 0, 0)
 ANY_CLASS = 1 << 15  # where nothing is classified, every truth that fits its field is one
 PART_MARKS = 16  # of them that a part of a recording begins with
+
+
+def exposure_timing(told: Exposed, tick_us: float, tolerance_us: float, *, announced: bool) -> dict[str, Any]:
+    """Return when exposures happened, under the summary's keys, judged; what the device has not told is None."""
+    start_us, length_us = told.start_error * tick_us, told.length_error * tick_us
+    keys = ("within", "worst_start_us", "worst_length_us", "worst_start_exposure", "worst_length_exposure")
+    within = max(abs(start_us), abs(length_us)) <= tolerance_us
+    values = (within, start_us, length_us, told.start_exposure, told.length_exposure)
+    facts = dict(zip(keys, values if told.exposures else [None] * len(keys)))
+    return {"announced": announced, "exposures": told.exposures, "tolerance_us": tolerance_us, **facts}
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +191,7 @@ class Follower:
         self.n_abstained = 0
         self.last_tick = 0
         self.jitter_ticks = 0  # most that a block's end differed from the plan
+        self.exposed = NOTHING_EXPOSED  # what the device told of all streams
         self._plan = plan
         self._rules = PlanRules(plan, n_classes, moving=self.moving)
         self._exposure_ticks = plan.exposure_ticks
@@ -184,6 +199,8 @@ class Follower:
         self.end_exposure = self._exposures_of(n_cycles)
         self._begun = False
         self._idle_steps: Any = None
+        self._exposed = NOTHING_EXPOSED  # the latest, and how many exposures all of this stream have
+        self._n_exposed = 0
         self._status: Status | None = None  # the latest of this stream
         self._told_end: int | None = None  # tick of the first STATUS that told of the end
         self._told_wrong = False  # whether that one has been found to contradict the plan
@@ -271,6 +288,7 @@ class Follower:
             self.marks.keep(0)
         self._begun, self.completed, self._told_end, self._told_wrong, self._status = True, False, None, False, None
         self.start_tick, self.end_exposure = start_tick, self._exposures_of(n_cycles)
+        self._exposed, self._n_exposed = NOTHING_EXPOSED, 0
         return output
 
     def begin_later(self, start_tick: int) -> None:
@@ -295,9 +313,11 @@ class Follower:
         return n_cycles * self._slots_per_cycle if n_cycles else 1 << 63
 
     def step(self, frame: Frame) -> Output:
-        """Take one frame (CLICKS, FRAMES, MARK or STATUS) in the order of arrival."""
+        """Take one frame (CLICKS, FRAMES, MARK, STATUS or EXPOSED) in the order of arrival."""
         if frame.type == MessageType.STATUS:
             return self._on_status(frame)
+        if frame.type == MessageType.EXPOSED:
+            return self._on_exposed(frame)
         unexplained = self.tracker.counters.unexplained_drops
         message, gap = self.tracker.accept(frame)
         if message is None:
@@ -332,6 +352,21 @@ class Follower:
     def _contradicts(self, wrong: Contradiction) -> Contradiction:
         self.contradictions[wrong.what] += 1
         return wrong
+
+    def _on_exposed(self, frame: Frame) -> Output:
+        """Note when exposures happened. No two are equal, as each is of other exposures: an equal one is a repetition."""
+        with suppress(MalformedMessage):
+            told = decode_exposed(frame.payload)
+            if told == self._exposed:
+                return Output([], [], None)
+            self._exposed = told
+            last = max(self._n_exposed + told.exposures - 1, told.start_exposure, told.length_exposure)
+            if last >= self.end_exposure:
+                wrong = Contradiction("exposed", told.start_exposure, last, self.end_exposure - 1)
+                return Output([], [self._contradicts(wrong)], None)
+            self._n_exposed += told.exposures
+            self.exposed = self.exposed.joined(told)
+        return Output([], [], None)
 
     def _on_status(self, frame: Frame) -> Output:
         """When the device says that the plan is done, settle what will never be complete.

@@ -102,6 +102,11 @@ class Profile:
             return middle
         return replace(middle, flat=_read_flat((self.folder or Path()) / stated.flat_field_file))
 
+    def exposure_tolerance_us(self, exposure_us: float) -> float:
+        """Return by how much start and length of an exposure of `exposure_us` may be off: 1 % or a tick if nothing is stated."""
+        tick_us = 1e6 / self.clock.tick_hz
+        return self.timing.exposure_tolerance_us or max(0.01 * exposure_us, tick_us + 0.001)
+
     @property
     def min_transmission(self) -> float:
         """Transmission of a black object pixel: as declared, else 1/contrast of the modulator, 0 without one."""

@@ -163,6 +163,7 @@ class Timing:
     host_turn_us: Annotated[float, number(0, 1e9, "host-driven automata: the same, both ways of the link included")] = (
         1000.0
     )
+    exposure_tolerance_us: Annotated[float, number(0, 1e9, "of an exposure's start and length; 0: 1 % of it")] = 0.0
 
 
 SECTIONS: dict[str, type[Any]] = {

@@ -275,7 +275,7 @@ class Kernel:
         return self.heads(MessageType.MARK, MARK_DTYPE)[1]
 
 
-_CORE_TYPES = STREAM_TYPES | {MessageType.STATUS}
+_CORE_TYPES = STREAM_TYPES | {MessageType.STATUS, MessageType.EXPOSED}
 _NO_ROWS: npt.NDArray[np.void] = np.zeros(0, DECISION_DTYPE)
 
 

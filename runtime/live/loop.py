@@ -20,7 +20,7 @@ import numpy as np
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard
-from pans.runtime.core.follower import Follower
+from pans.runtime.core.follower import Follower, exposure_timing
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
@@ -231,7 +231,8 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
     tallies, stream = run.core.tallies, run.core.tracker.counters
     found = dark_report(dark, int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
     guard: DarkGuard | None = getattr(run.core, "guard", None)
-    fit = run.connection.known_clock().fit
+    fit, announced = run.connection.known_clock().fit, run.connection.session.tells_exposed
+    tolerance_us = profile.exposure_tolerance_us(run.plan.exposure_us)
     return RunResult(
         tally=run.tally,
         timing=run.timing,
@@ -244,6 +245,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         page_faults=run.page_faults,
         device=device,
         slot_jitter_us=run.core.jitter_ticks * run.plan.tick_us,
+        exposure_timing=exposure_timing(run.core.exposed, run.plan.tick_us, tolerance_us, announced=announced),
         wrong_patterns=int(tallies[WRONG_PATTERNS]),
         armed_after_s=run.armed_after_s,
         seconds=(run.now_ns() - run.start_ns) / NS_PER_S,

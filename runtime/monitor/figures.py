@@ -127,6 +127,13 @@ def _instrument(history: History) -> list[Row]:
     drift = picture.get("clock_drift_ppm")
     text = "not known yet" if drift is None else f"drift {drift:+.2f} ppm"
     rows.append(Row("instrument", "clock", f"{text}, uncertainty at most {picture['clock_uncertainty_us']:,.0f} us"))
+    n, start_us, length_us = picture.get("exposed", (0, 0.0, 0.0))
+    text, allowed_us = "not told by the device", history.begin.get("exposure_tolerance_us", 0.0)
+    if n:
+        text = f"start {start_us:+.3g} us, length {length_us:+.3g} us at most, allowed {allowed_us:.3g} us"
+    rows.append(
+        Row("instrument", "exposures", text, "bad" if n and max(abs(start_us), abs(length_us)) > allowed_us else "")
+    )
     if repeated := picture.get("repeated", 0):
         differing = picture.get("repeats_differing", 0)
         text = f"{repeated:,} messages, {differing:,} with other content"

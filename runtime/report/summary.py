@@ -60,6 +60,7 @@ class Summary:
     deadline_us: float
     clock: dict[str, Any]
     slot_jitter_us: float
+    exposure_timing: dict[str, Any]  # of what the device told (core.follower.exposure_timing)
     wrong_patterns: int
     dark: DarkReport
     stream: dict[str, int]
@@ -137,6 +138,7 @@ def summarise(
         deadline_us=timing.deadline_ns / 1000,
         clock=result.clock | {"worst_uncertainty_us": timing.worst_uncertainty_ns / 1000},
         slot_jitter_us=result.slot_jitter_us,
+        exposure_timing=result.exposure_timing,
         wrong_patterns=result.wrong_patterns,
         dark=result.dark,
         stream=result.stream,
@@ -194,10 +196,26 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
         faults.append(f"{tally.abstained - tally.unsure} decisions abstained")
     if expected_decisions and tally.decisions != expected_decisions:
         faults.append(f"{tally.decisions} of {expected_decisions} decisions were made; the run ended: {result.ended}")
+    if fault := exposure_fault(result.exposure_timing, stream["exposures"]):
+        faults.append(fault)
     if result.dark.alarm:
         faults.append(result.dark.alarm)
     faults += [event["words"] for event in result.dark.findings if event["level"] == "alarm"]
     return faults
+
+
+def exposure_fault(timing: Mapping[str, Any], received: int) -> str:
+    """Return what is wrong with when the `received` exposures happened, as the device told; "" if nothing is, or it need not tell."""
+    if timing.get("announced") and received and not timing["exposures"]:
+        return (
+            f"the device announces EXPOSED, and told of none of {received} exposures: pans conform --rule 15.1 tries it"
+        )
+    if timing.get("within") is not False:
+        return ""
+    late = f"exposure {timing['worst_start_exposure']} began {timing['worst_start_us']:+.3g} us off its tick"
+    long = f"exposure {timing['worst_length_exposure']} was {timing['worst_length_us']:+.3g} us off its length"
+    allowed = f"allowed are {timing['tolerance_us']:.3g} us (timing.exposure_tolerance_us)"
+    return f"{late}, {long}: {allowed}; pans conform --rule 15.2 tries the device"
 
 
 def contradictions_of(result: RunResult) -> dict[str, int]:

@@ -15,7 +15,7 @@ from pans.runtime.safe_text import markdown
 from pans.runtime.timing.realtime import fault_words
 
 from .summary import Summary
-from .words import flow_rows, is_unresolved, objects_words, repeat_words, walk_rows
+from .words import exposure_words, flow_rows, is_unresolved, objects_words, repeat_words, walk_rows
 
 
 def write_markdown(
@@ -107,6 +107,7 @@ def _timing(summary: Summary) -> list[str]:
         f"- deadline {summary.deadline_us:.0f} us: {summary.late} late; {summary.lost} exposures lost{repeat_words(summary.stream)}",
         f"- clock: uncertainty at most {summary.clock['worst_uncertainty_us']:.0f} us, "
         f"drift {summary.clock.get('drift_ppm', 0.0):.1f} ppm; slot jitter at most {summary.slot_jitter_us:.1f} us",
+        f"- exposures: {exposure_words(summary.exposure_timing)}",
         f"- armed {summary.armed_after_s:.2f} s after the start; measured for {summary.seconds:.1f} s; ended: {markdown(summary.ended)}",
         f"- real-time set-up: {granted}",
         f"- page faults of the loop while armed: {fault_words(summary.page_faults)}",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime.safe_text import one_line
 
@@ -29,6 +29,7 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
         f"{banner}{summary.verdict}: {tally.decisions} decisions ({objects_words(tally)})",
         f"  accuracy      {accuracy} at {clicks:.2f} clicks, {photons} photons, illumination {summary.illumination:.1f} each",
         f"  latency       {latency_words(summary)}; late {summary.late}, lost {summary.lost}",
+        f"  exposures     {exposure_words(summary.exposure_timing)}",
         *([] if summary.flow is None else flow_words(summary.flow)),
         *([] if summary.walks is None else walk_words(summary.walks)),
         *(f"  fault         {one_line(fault)}" for fault in summary.faults),
@@ -66,6 +67,18 @@ def latency_words(summary: Summary) -> str:
 def is_unresolved(latency_us: float, uncertainty_us: float) -> bool:
     """Whether a latency of (nearly) 0 says nothing, because the device's clock was not known to a millisecond."""
     return latency_us < 0.5 and uncertainty_us >= UNRESOLVED_US
+
+
+def exposure_words(timing: Mapping[str, Any]) -> str:
+    """Return when exposures happened, as the device told.
+
+    >>> exposure_words({"announced": False, "exposures": 0})
+    'not told by the device'
+    """
+    if not timing.get("exposures"):
+        return f"{'none ' if timing.get('announced') else 'not '}told by the device"
+    start, length = (f"{timing[key]:+.3g} us" for key in ("worst_start_us", "worst_length_us"))
+    return f"start {start}, length {length} at most, of {timing['exposures']}; allowed {timing['tolerance_us']:.3g} us"
 
 
 def walk_rows(walks: WalkFigures) -> list[tuple[str, str]]:

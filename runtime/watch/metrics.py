@@ -25,6 +25,16 @@ FIGURES = {
     "dark_clicks": ("pans_dark_clicks", True, "Clicks in exposures without light"),
     "latency_p99_us": ("pans_latency_p99_microseconds", False, "Exposure end to decision, 99 % quantile of the run"),
     "latency_max_us": ("pans_latency_max_microseconds", False, "Exposure end to decision, longest of the run"),
+    "exposure_start_us": (
+        "pans_exposure_start_error_microseconds",
+        False,
+        "Farthest start of an exposure off its tick",
+    ),
+    "exposure_length_us": (
+        "pans_exposure_length_error_microseconds",
+        False,
+        "Farthest length of an exposure off the plan",
+    ),
     "rss_bytes": ("pans_resident_memory_bytes", False, "Resident memory"),
     "handles": ("pans_open_handles", False, "Open file handles"),
     "threads": ("pans_threads", False, "Threads"),

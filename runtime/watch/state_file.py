@@ -60,6 +60,8 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
     if run is None:
         return picture
     timing, stream, tallies = run.timing, run.core.tracker.counters, run.core.tallies
+    told = run.core.exposed
+    exposed = {"exposure_start_us": told.start_error, "exposure_length_us": told.length_error} if told.exposures else {}
     incidents, trouble = run.lateness.incidents, run.journal.trouble or {}
     reason = next((trouble[key] for key in ("why", "reason", "message", "text") if trouble.get(key)), "")
     return picture | {
@@ -78,6 +80,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         "latency_max_us": timing.total.max_ns / 1000,
         "dark_exposures": int(tallies[DARK_EXPOSURES]),
         "dark_clicks": int(tallies[DARK_CLICKS]),
+        **{key: ticks * run.plan.tick_us for key, ticks in exposed.items()},
         "reconnects": run.reconnects,
         "last_error": f"{trouble.get('kind')}: {reason}" if trouble else "",
     }

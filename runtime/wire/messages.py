@@ -127,6 +127,16 @@ class Exposed(NamedTuple):
     start_exposure: int
     length_exposure: int
 
+    def joined(self, later: Exposed) -> Exposed:
+        """Return what this and a later one tell together; the first of equal errors stays.
+
+        >>> Exposed(3, 0, -2, 0, 1).joined(Exposed(2, 5, 2, 4, 3))
+        Exposed(exposures=5, start_error=5, length_error=-2, start_exposure=4, length_exposure=1)
+        """
+        start = max(self[1::2], later[1::2], key=lambda one: abs(one[0]))
+        length = max(self[2::2], later[2::2], key=lambda one: abs(one[0]))
+        return Exposed(self.exposures + later.exposures, start[0], length[0], start[1], length[1])
+
 
 class ClickBlock(NamedTuple):
     """Consecutive, equally spaced exposures of one detector: one bit and one shown pattern index each.

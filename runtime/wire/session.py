@@ -14,6 +14,7 @@ from pans.runtime.errors import DeviceError, LinkError
 
 from . import messages as wire
 from .messages import AckStatus, Frame, MessageType, Opcode
+from .schema import EXPOSED_SCHEMA
 
 NS_PER_MS = 1_000_000
 # The times and limits of the conversation are those of docs/reference/protocol.md, sections 2, 4 and 9.
@@ -218,8 +219,13 @@ class HostSession:
 
     # -- what the device says ------------------------------------------------------------------------------------------
 
+    @property
+    def tells_exposed(self) -> bool:
+        """Whether the device has announced EXPOSED; one that has not is not listened to."""
+        return self.welcome is not None and self.welcome.facts.get("exposed_schema") == EXPOSED_SCHEMA
+
     def on_frame(self, frame: Frame, now_ns: int) -> bool:
-        """Digest one frame; return True when the core should see it too (stream messages, and STATUS)."""
+        """Digest one frame; return True when the core should see it too (stream messages, STATUS, EXPOSED)."""
         if frame.session != self.nonce:
             self.counters.wrong_session += 1
             return False
@@ -233,7 +239,7 @@ class HostSession:
             if frame.type == MessageType.WELCOME:
                 self._welcome_fault = str(error)
             return False
-        return frame.type == MessageType.STATUS
+        return frame.type == MessageType.STATUS or (frame.type == MessageType.EXPOSED and self.tells_exposed)
 
     def _digest(self, frame: Frame, now_ns: int) -> None:
         if frame.type == MessageType.PONG:
@@ -244,6 +250,8 @@ class HostSession:
             self.status = wire.decode_status(frame.payload)
         elif frame.type == MessageType.WELCOME:
             self._on_welcome(wire.decode_welcome(frame.payload))
+        elif frame.type == MessageType.EXPOSED and self.tells_exposed:
+            wire.decode_exposed(frame.payload)
         else:
             self.counters.unknown_type += 1
 
