@@ -95,6 +95,8 @@ class Bench:
             raise Broken(
                 "COUNTS came from a device that announces neither photon numbers nor several detectors at once"
             )
+        if frame.type == MessageType.EXPOSED and "exposed_schema" not in self.facts:
+            raise Broken("EXPOSED came from a device that does not announce it")
         if frame.type == MessageType.CLICKS:
             self.raw_clicks = [*self.raw_clicks[-KEPT_PIECES:], frame.payload]
         self.inbox.append(Heard(frame.type, message, self.link.now_ns()))

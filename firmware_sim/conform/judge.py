@@ -13,7 +13,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link
 from pans.runtime.wire.messages import SCHEMA, Opcode
 
-from . import automata, counts, frames, orders, runs, sessions  # noqa: F401  (they register the rules)
+from . import automata, counts, exposed, frames, orders, runs, sessions  # noqa: F401  (they register the rules)
 from .bench import Bench, Piece
 from .rules import RULES, Broken, NotTried, Rule, Silent, in_order
 
