@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pans.runtime.wire.commands import announced, pack_command
+from pans.runtime.wire.commands import announced, announces_exposed, pack_command
 from pans.runtime.wire.messages import DeviceState, Exposed, MessageType, Opcode, Status, encode_command
 from pans.runtime.wire.schema import EXPOSED_SCHEMA
 from pans.runtime.wire.session import STREAM_TYPES
@@ -81,7 +81,7 @@ def _hold(others: list[Any], start: int) -> None:
     "Start and length of every exposure are off by the profile's tolerance at most, and no block is stamped later than EXPOSED says.",
 )
 def in_time(bench: Bench) -> None:
-    if bench.facts.get("exposed_schema") != EXPOSED_SCHEMA:
+    if not announces_exposed(bench.facts):
         raise NotTried("the device does not tell when exposures happened")
     extension = announced(bench.facts)
     follows = extension is not None and extension.states >= 4

@@ -27,6 +27,7 @@ from pans.runtime.record.pictures import PictureLog
 from pans.runtime.record.replaying import Replayed, replay
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.csv_files import FILES, write_csv
+from pans.runtime.report.summary import exposure_fault
 from pans.runtime.report.verify import file_kind
 from pans.runtime.report.words import passage_words
 
@@ -63,6 +64,7 @@ def _replay(args: argparse.Namespace) -> int:
         lines += [
             f"{head}: {_agreement_words(recording, found)}",
             *([] if found.passages is None else passage_words(found.passages)),
+            *([f"  fault         {fault}"] if (fault := exposure_fault(found.exposure_timing)) else []),
         ]
         if of_parts:
             rows[-1]["part"] = path.name
@@ -93,6 +95,7 @@ def _facts(recording: Recording, found: Replayed) -> dict[str, Any]:
         "decisions_recorded": found.recorded,
         "decisions_more": found.more,
         "contradictions": found.contradictions,
+        "exposure_timing": found.exposure_timing,
         **({} if found.passages is None else found.passages.as_json()),
     }
 

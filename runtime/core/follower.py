@@ -192,7 +192,7 @@ class Follower:
         self.last_tick = 0
         self.jitter_ticks = 0  # most that a block's end differed from the plan
         self.exposed = NOTHING_EXPOSED  # what the device told of all streams
-        self._plan = plan
+        self.plan = plan
         self._rules = PlanRules(plan, n_classes, moving=self.moving)
         self._exposure_ticks = plan.exposure_ticks
         self._slots_per_cycle, self._cycles_per_object = plan.slots_per_cycle, plan.cycles_per_object

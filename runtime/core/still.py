@@ -54,14 +54,14 @@ class Core(Follower):
     @property
     def takes(self) -> bool:
         """Whether the kernel may take messages: exposures are clicks, not numbers, and no guard changes decisions."""
-        return self._plan.largest == 1 and (self.guard is None or self.guard.policy == "warn")
+        return self.plan.largest == 1 and (self.guard is None or self.guard.policy == "warn")
 
     def steps(self, session: int) -> CoreState | IdleSteps:
         """See Follower."""
         if not self.takes:
             return super().steps(session)
         if self._bulk is None:
-            self._bulk = CoreState(self, self.windows, self._plan, self._decider, self.shots)
+            self._bulk = CoreState(self, self.windows, self.plan, self._decider, self.shots)
         if not self._session_known:
             self._bulk.begin(session)
             self._session_known = True
@@ -107,7 +107,7 @@ class Core(Follower):
         begins = np.cumsum(heads["count"], dtype=np.int64) - heads["count"]
         some = np.logical_or.reduceat(lit, begins)
         seen = any_click(words, begins, lit)[some]
-        clicked = np.unpackbits(seen, axis=1, count=self._plan.n_patterns, bitorder="little").view(np.bool_)
+        clicked = np.unpackbits(seen, axis=1, count=self.plan.n_patterns, bitorder="little").view(np.bool_)
         self.guard.take_objects(clicked, heads["object_index"][some])
         return events
 

@@ -28,7 +28,7 @@ ADVICE = (
     ("contradict the evidence", "Messages do not fit the plan or each other: check the device's firmware (pans conform) and the link."),
     ("another pattern than planned", "Check the trigger between projector and detector: a pattern was skipped or shown twice."),
     ("named their state too late", "Let the device choose the pattern (`--drive device`), or give the loop a core of its own (`--core`)."),
-    ("off its tick", "Begin and end exposures by a timer or its interrupt, not in the main loop (docs/how-to/reference-instrument.md)."),
+    ("exposure_tolerance_us", "Begin and end exposures by a timer, not in the main loop (docs/how-to/reference-instrument.md)."),
     ("decisions abstained", "The flags in the decision log say why; “Events” below has the moments."),
     ("decisions were made", "The run ended early; run it again for the rest."),
     ("the calibration contradicts", "Calibrate again with `pans calibrate`: the dark counts are not those of the calibration."),
@@ -124,7 +124,7 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     found.append(("late", f"{late:,}", f"decisions; {lost:,} exposures lost{repeat_words(summary.get('stream', {}))}"))
     if timing := summary.get("exposure_timing"):  # not of older recordings
         start = f"{timing['worst_start_us']:+.3g} us" if timing["exposures"] else "unknown"
-        found.append(("exposures off their tick", start, exposure_words(timing)))
+        found.append(("exposures off the plan", start, exposure_words(timing)))
     dark = summary.get("dark")
     if isinstance(dark, Mapping) and dark.get("exposures"):
         more = f"95 % interval {dark['low']:.3g} to {dark['high']:.3g}, expected {dark['expected']:.3g}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import recorded_guard
 from pans.runtime.core.decision import DECISION_DTYPE, Decision, DecisionFlag
-from pans.runtime.core.follower import Follower, Place
+from pans.runtime.core.follower import Follower, Place, exposure_timing
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider, Verdict, Verdicts, verdicts_of
@@ -23,10 +23,11 @@ from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import recorded_flow_core, replayed_figures
 from pans.runtime.flow.matching import PassageFigures
+from pans.runtime.instrument.profile import parse_profile
 from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.ranges import Range
-from pans.runtime.wire.commands import Arm
-from pans.runtime.wire.messages import Frame, MalformedMessage, unpack_body
+from pans.runtime.wire.commands import Arm, announces_exposed
+from pans.runtime.wire.messages import Frame, MalformedMessage, MessageType, decode_welcome, unpack_body
 
 from .log import LogEncoder
 from .parts import place_of
@@ -86,6 +87,7 @@ class Replayed(NamedTuple):
     recorded: int
     as_recorded: bool
     contradictions: dict[str, int]
+    exposure_timing: dict[str, Any]  # as in the summary; empty where the header has no profile
 
     @property
     def more(self) -> int:
@@ -96,12 +98,26 @@ class Replayed(NamedTuple):
 def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = None) -> Replayed:
     """Decide `recording` again with `bundle`; `pictures`, or another log, collects what the back end is asked."""
     if never_armed(recording):
-        return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True, contradictions={})
+        return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True, contradictions={}, exposure_timing={})
     core, log = _replayed(recording, bundle, pictures)
     passages = replayed_figures(core, recording.events()) if isinstance(core, FlowCore) else None
     sha256 = log.encoder.hexdigest()
     agrees = (sha256 if recording.complete else log.sha256_as_far) == recording.decisions_sha256
-    return Replayed(log.decisions, sha256, passages, recording.n_decisions, agrees, dict(core.contradictions))
+    told = log.decisions, sha256, passages, recording.n_decisions, agrees, dict(core.contradictions)
+    return Replayed(*told, _exposure_timing(recording, core))
+
+
+def _exposure_timing(recording: Recording, core: Follower) -> dict[str, Any]:
+    toml, frames = (
+        (recording.header.get("profile") or {}).get("toml"),
+        (unpack_body(body) for _, body in recording.answers()),
+    )
+    if not toml:
+        return {}
+    welcomes = (decode_welcome(frame.payload) for frame in frames if frame.type == MessageType.WELCOME)
+    announced = any(announces_exposed(welcome.facts) for welcome in welcomes)
+    tolerance_us = parse_profile(toml, f"{recording.path}: its profile").exposure_tolerance_us(core.plan.exposure_us)
+    return exposure_timing(core.exposed, core.plan.tick_us, tolerance_us, announced=announced)
 
 
 class _Log:

@@ -204,7 +204,7 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
     return faults
 
 
-def exposure_fault(timing: Mapping[str, Any], received: int) -> str:
+def exposure_fault(timing: Mapping[str, Any], received: int = 0) -> str:
     """Return what is wrong with when the `received` exposures happened, as the device told; "" if nothing is, or it need not tell."""
     if timing.get("announced") and received and not timing["exposures"]:
         return (
@@ -212,10 +212,15 @@ def exposure_fault(timing: Mapping[str, Any], received: int) -> str:
         )
     if timing.get("within") is not False:
         return ""
-    late = f"exposure {timing['worst_start_exposure']} began {timing['worst_start_us']:+.3g} us off its tick"
-    long = f"exposure {timing['worst_length_exposure']} was {timing['worst_length_us']:+.3g} us off its length"
-    allowed = f"allowed are {timing['tolerance_us']:.3g} us (timing.exposure_tolerance_us)"
-    return f"{late}, {long}: {allowed}; pans conform --rule 15.2 tries the device"
+    allowed_us = timing["tolerance_us"]
+    off = " and ".join(
+        f"the {what} of exposure {timing[f'worst_{what}_exposure']} was {timing[f'worst_{what}_us']:+.3g} us off"
+        for what in ("start", "length")
+        if abs(timing[f"worst_{what}_us"]) > allowed_us
+    )
+    return (
+        f"{off}, allowed {allowed_us:.3g} us (timing.exposure_tolerance_us): pans conform --rule 15.2 tries the device"
+    )
 
 
 def contradictions_of(result: RunResult) -> dict[str, int]:

@@ -16,6 +16,7 @@ from .messages import U8, U16, fields
 from .schema import (
     AUTOMATON_SCHEMA,
     COUNT_SCHEMA,
+    EXPOSED_SCHEMA,
     MAX_PHOTON_NUMBER,
     SLOT_DTYPE,
     STRUCTS,
@@ -261,6 +262,11 @@ def announced_counts(facts: Mapping[str, Any]) -> int:
 def announced_channels(facts: Mapping[str, Any]) -> int:
     """Return how many detectors a device reads at once by WELCOME's map; 1 of one that does not, or that speaks another version."""
     return int(facts.get("channels_at_once", 1)) if facts.get("count_schema") == COUNT_SCHEMA else 1
+
+
+def announces_exposed(facts: Mapping[str, Any]) -> bool:
+    """Whether a device tells when exposures happened, by WELCOME's map; the EXPOSED of another one mean nothing."""
+    return bool(facts.get("exposed_schema") == EXPOSED_SCHEMA)
 
 
 def count_announcement(largest: int, channels: int = 1) -> dict[str, int]:

@@ -13,8 +13,8 @@ from typing import NamedTuple
 from pans.runtime.errors import DeviceError, LinkError
 
 from . import messages as wire
+from .commands import announces_exposed
 from .messages import AckStatus, Frame, MessageType, Opcode
-from .schema import EXPOSED_SCHEMA
 
 NS_PER_MS = 1_000_000
 # The times and limits of the conversation are those of docs/reference/protocol.md, sections 2, 4 and 9.
@@ -222,7 +222,7 @@ class HostSession:
     @property
     def tells_exposed(self) -> bool:
         """Whether the device has announced EXPOSED; one that has not is not listened to."""
-        return self.welcome is not None and self.welcome.facts.get("exposed_schema") == EXPOSED_SCHEMA
+        return self.welcome is not None and announces_exposed(self.welcome.facts)
 
     def on_frame(self, frame: Frame, now_ns: int) -> bool:
         """Digest one frame; return True when the core should see it too (stream messages, STATUS, EXPOSED)."""
