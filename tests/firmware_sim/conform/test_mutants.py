@@ -1,14 +1,20 @@
-"""Single faults planted in the C core: each is found by the rules that it breaks, or listed as one that no link can show."""
+"""Single faults planted in the C core and in the simulator: each is found by the rules that it breaks."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from c_device import needs_compiler
 from mutants import Mutant, built, c_core, tried
 
 from pans.firmware_sim.conform import RULES
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.virtual import START_NS
+from pans.firmware_sim.scene.scene_file import open_scene
+from pans.runtime.instrument.profile import load_profile
 
 SOUND = ("1.1", "2.1", "4.1", "6.1")  # rules that no fault of the quick set touches
 SLOW_LINE = 100_000  # bytes per second: a fifth of what the fastest stream of rule 6.6 brings
@@ -220,3 +226,58 @@ def test_each_planted_fault_is_found(fault: str, tmp_path: Path) -> None:
 def test_a_line_that_the_stream_fills_is_no_fault() -> None:
     found = tried("ideal", *c_core("ideal", line_bytes_s=SLOW_LINE))
     assert {number: one.why for number, one in found.items() if one.verdict in ("broken", "gone")} == {}
+
+
+class UnderCounting(Instrument):
+    """Leaves one exposure out of every EXPOSED."""
+
+    def _send_exposed(self, ended: int) -> None:
+        super()._send_exposed(ended - 1)
+        self._exposures_told = ended
+
+
+class TellingBehind(Instrument):
+    """Sends EXPOSED behind STATUS."""
+
+    def _send_status(self) -> None:
+        super()._send_status()
+        self._out[-2:] = self._out[:-3:-1]
+
+
+class Denying(Instrument):
+    """Tells of exposures that are on the tick, whenever they were."""
+
+    def _send_exposed(self, ended: int) -> None:
+        self._errors = 0, 0
+        super()._send_exposed(ended)
+
+
+class Unannounced(Instrument):
+    """Sends EXPOSED, and does not say so."""
+
+    def _facts(self) -> dict[str, Any]:
+        return {key: value for key, value in super()._facts().items() if key != "exposed_schema"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "late_us", "short_us", "broken"),
+    [
+        (Instrument, 0.0, 0.0, set()),
+        (Instrument, 5.0, 0.0, {"15.2"}),
+        (Instrument, 0.0, 5.0, {"15.2"}),
+        (UnderCounting, 0.0, 0.0, {"15.1"}),
+        (TellingBehind, 0.0, 0.0, {"15.1"}),
+        (Denying, 5.0, 0.0, {"15.2"}),
+        (Unannounced, 0.0, 0.0, {"15.1"}),
+    ],
+    ids=lambda one: getattr(one, "__name__", None),
+)
+@pytest.mark.parametrize("name", ["ideal", "wdm-snspd"])
+def test_a_device_that_is_wrong_about_its_exposures_is_found(
+    name: str, kind: type[Instrument], late_us: float, short_us: float, broken: set[str]
+) -> None:
+    profile, clock = load_profile(name), DeviceClock(load_profile(name).clock.tick_hz)
+    errors = {"exposure_late_us": late_us, "exposure_short_us": short_us}
+    device = kind(profile, open_scene("uniform"), power_on_tick=clock.tick_at(START_NS), **errors)  # type: ignore[arg-type]
+    found = tried(name, device, clock, "4.1", "15.1", "15.2")
+    assert {number for number, one in found.items() if one.verdict == "broken"} == broken

@@ -20,6 +20,8 @@ from pans.runtime.wire.schema import (
     AUTOMATON_SCHEMA_TEXT,
     COUNT_SCHEMA,
     COUNT_SCHEMA_TEXT,
+    EXPOSED_SCHEMA,
+    EXPOSED_SCHEMA_TEXT,
     FACTS,
     FROM_DEVICE,
     LARGEST_TICK,
@@ -42,6 +44,7 @@ GOOD: dict[str, tuple[Any, ...]] = {
     "FRAMES": (0, 0, 100, 4, 10, 8, 2, 1),
     "MARK": (0, 1, 2, 0, 4, 100, 1.5),
     "COUNTS": (0, 0, 100, 4, 10, 8, 2, 1),
+    "EXPOSED": (3, 5, -2, 1, 2),
 }
 TAILS = {"CLICKS": bytes(8 * 2 + 1), "FRAMES": bytes(8 * 2), "COUNTS": bytes(8 * 3)}
 FACTS_OF_A_DEVICE = {
@@ -121,7 +124,11 @@ def test_the_schema_is_that_of_version_1() -> None:
 
 @pytest.mark.parametrize(
     ("schema", "text", "value"),
-    [(AUTOMATON_SCHEMA, AUTOMATON_SCHEMA_TEXT, 0xD00A27FF), (COUNT_SCHEMA, COUNT_SCHEMA_TEXT, 0xEEF01CE1)],
+    [
+        (AUTOMATON_SCHEMA, AUTOMATON_SCHEMA_TEXT, 0xD00A27FF),
+        (COUNT_SCHEMA, COUNT_SCHEMA_TEXT, 0xEEF01CE1),
+        (EXPOSED_SCHEMA, EXPOSED_SCHEMA_TEXT, 0x9D499DC7),
+    ],
 )
 def test_an_extension_has_the_schema_of_the_document(schema: int, text: str, value: int) -> None:
     assert schema == value

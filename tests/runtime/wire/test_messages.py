@@ -76,6 +76,14 @@ def test_hello_is_the_worked_example() -> None:
     assert wire.encode_hello(SESSION) == frame_by_hand(0x01, wire.SCHEMA.to_bytes(4, "little") + b"\x01\0\0\0", seed=0)
 
 
+def test_exposed_is_the_worked_example() -> None:
+    (text,) = re.findall(r"^(02 85 [0-9A-F ]+ 00)$", PROTOCOL, re.MULTILINE)
+    exposed = wire.Exposed(1000, 970, -450, 1203, 4660)
+    payload = struct.pack("<IiiQQ", *exposed)
+    assert wire.encode_exposed(exposed, SESSION) == bytes.fromhex(text) == frame_by_hand(0x85, payload)
+    assert wire.decode_exposed(payload) == exposed
+
+
 GOLDEN = [
     (wire.encode_ping(7, 0x0102030405060708, SESSION), 0x02, "07000000 0807060504030201"),
     (wire.encode_pong(wire.Pong(7, 1, 2, 3), SESSION), 0x82, "07000000 0100000000000000 0200000000000000 0300000000000000"),
@@ -86,6 +94,11 @@ GOLDEN = [
         wire.encode_status(wire.Status(2, 0, 900, 1, 5, 6), SESSION),
         0x84,
         "02 00 0000 84030000 01000000 0500000000000000 0600000000000000",
+    ),
+    (
+        wire.encode_exposed(wire.Exposed(7, 0x0102, -2, 5, 6), SESSION),
+        0x85,
+        "07000000 02010000 feffffff 0500000000000000 0600000000000000",
     ),
     (
         wire.encode_clicks(
