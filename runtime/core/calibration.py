@@ -204,7 +204,7 @@ class CalibrationCore(Follower):
     def _fits(self, block: ClickBlock | FrameBlock) -> bool:
         if isinstance(block, FrameBlock):
             return self.parallel and 8 * block.words.shape[1] >= self.channels
-        return not self.parallel and block.largest == self._plan.largest
+        return not self.parallel and block.largest == self.plan.largest
 
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
         self.take_block(block)

@@ -57,6 +57,7 @@ def test_a_whole_run_tick_by_tick() -> None:
         (2000, wire.Status(DeviceState.RUNNING, StateReason.NONE, 99, 0, 2000, 1)),
         (2000, wire.Mark(0, 0, -1, 0, 2000, np.float32(photons))),
         (2300, wire.Mark(2, 1, -1, 3, 2300, np.float32(photons))),
+        (2600, wire.Exposed(6, 0, 0, 0, 0)),
         (2600, wire.Status(DeviceState.IDLE, StateReason.COMPLETED, 0, 0, 2600, 6)),
     ]
     blocks = [(tick, message) for tick, message in bench.got if isinstance(message, wire.ClickBlock)]
@@ -288,7 +289,7 @@ def test_a_grant_just_before_arm_counts() -> None:
     bench = Bench().ready()
     bench.grant(limit=2)
     bench.arm(cycles=3)
-    stream = [message for message in bench.run_to(5000) if not isinstance(message, wire.Status)]
+    stream = [message for message in bench.run_to(5000) if not isinstance(message, wire.Status | wire.Exposed)]
     assert [message.seq for message in stream] == [0, 1]
 
 
@@ -297,7 +298,7 @@ def test_a_full_buffer_drops_whole_blocks_and_says_so() -> None:
     bench.run_to(2000 + 5 * 300 - 1)  # five marks and blocks: four messages are held, three blocks and marks dropped
     kept = bench.grant(limit=100)
     assert [message.seq for message in kept] == [0, 1, 2, 3]
-    following = [message for message in bench.run_to(9000) if not isinstance(message, wire.Status)]
+    following = [message for message in bench.run_to(9000) if not isinstance(message, wire.Status | wire.Exposed)]
     assert following[0].seq == 4  # a dropped message takes no number
     first_block = of_type(following, wire.ClickBlock)[0]
     assert first_block.exposure_index == 15

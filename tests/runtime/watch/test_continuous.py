@@ -141,13 +141,21 @@ def _running(bundle_file: Path, folder: Path, *more: str) -> Iterator[subprocess
         ({"verdict": "PASS", "ended": ASKED_TO_STOP}, 0),
         ({"verdict": "FAIL", "ended": ASKED_TO_STOP}, 1),  # reconnections alone
         ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "late": 1}, 4),
+        ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "exposure_timing": {"within": False}}, 4),
         ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "link_lost": True}, 3),
         ({"verdict": "FAIL", "ended": RECORDING_DELETED}, 1),
         ({"verdict": "PASS", "ended": INTERRUPTED}, 130),
     ],
 )
 def test_exit_codes_of_a_run(facts: dict[str, Any], code: int) -> None:
-    fine = {"link_lost": False, "late": 0, "lost": 0, "stream": {"lost_messages": 0}, "contradictions": {}}
+    fine = {
+        "link_lost": False,
+        "late": 0,
+        "lost": 0,
+        "stream": {"lost_messages": 0},
+        "contradictions": {},
+        "exposure_timing": {},
+    }
     assert _exit_code(SimpleNamespace(**{**fine, **facts})) == code  # type: ignore[arg-type]
 
 
