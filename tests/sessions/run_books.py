@@ -32,7 +32,7 @@ from pans.runtime.wire.messages import (
 )
 from pans.runtime.wire.session import ANSWER_TYPES, STREAM_TYPES
 
-RECORDED = STREAM_TYPES | {MessageType.STATUS}
+RECORDED = STREAM_TYPES | {MessageType.STATUS, MessageType.EXPOSED}
 WAITS_NS = (0, 300_000, 3_000_000, 16_000_000)  # USB's frame is 1 ms, a serial adapter's latency timer up to 16 ms
 
 
