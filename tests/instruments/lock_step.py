@@ -1,4 +1,4 @@
-"""A link to an emulated instrument in lock-step: time passes only while the host waits, and is the emulator's; and how it becomes a device URL."""
+"""A link to an emulated instrument, whose time passes only while the host waits; and how that becomes a device URL."""
 
 from __future__ import annotations
 

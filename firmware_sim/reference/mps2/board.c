@@ -1,5 +1,5 @@
 /* The instrument on an Arm MPS2 board as QEMU emulates it: FPGAIO's counter is the clock (25 MHz), CMSDK timer 0 calls pans_edge LEAD ticks
- * ahead, UART 1 takes a log. Addresses: Arm DAI0385, DDI0479. The line to the host is canned.c's or mailbox.c's.
+ * ahead, UART 1 takes a log. Addresses: Arm DAI0385, DDI0479. The line to the host is canned.c's or lockstep.c's.
  */
 #include <string.h>
 

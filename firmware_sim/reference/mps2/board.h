@@ -25,7 +25,7 @@ bool light_click(const struct pans_exposure *exposure);
 int16_t light_class(uint32_t object);
 uint32_t light_objects(void);
 
-/* mailbox.c or canned.c: the host's end of the line */
+/* lockstep.c or canned.c: the host's end of the line */
 size_t line_read(uint8_t *bytes, size_t room);
 size_t line_write(const uint8_t *bytes, size_t count);
 void line_wait(uint64_t next); /* nothing happens by itself before the tick `next` */

@@ -15,10 +15,12 @@ STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow
 SANITIZERS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 # name -> compiler and its words; what the document states for each, in bytes
 TARGETS = {
+    "Cortex-M0+": ("arm-none-eabi-gcc", ("-mcpu=cortex-m0plus", "-mthumb"), 17_000),
     "Cortex-M4": ("arm-none-eabi-gcc", ("-mcpu=cortex-m4", "-mthumb"), 15_500),
+    "Cortex-M33": ("arm-none-eabi-gcc", ("-mcpu=cortex-m33", "-mthumb"), 15_500),
     "RV32": ("riscv64-unknown-elf-gcc", ("-march=rv32imac", "-mabi=ilp32", "--specs=picolibc.specs"), 18_000),
 }
-MOST_STACK_OF_A_FUNCTION = 160
+MOST_STACK_OF_A_FUNCTION = 176
 ALLOCATORS = re.compile(r"\b(malloc|calloc|realloc|free|alloca)\b")
 
 
@@ -29,12 +31,11 @@ def run(*words: str | Path, folder: Path, seconds: float = 120) -> str:
 
 
 def compiled_for(target: str, folder: Path) -> list[Path]:
-    """The core's and the board's objects for one of TARGETS, warnings being errors; skipped without its compiler."""
+    """The core's objects for one of TARGETS, warnings being errors; skipped without its compiler."""
     compiler, words, _ = TARGETS[target]
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not installed")
-    sources = [*core_sources(), *sorted((FOLDER / "rp2040").glob("*.c"))]
-    run(compiler, *STRICT, "-Os", *words, "-fstack-usage", "-c", *sources, folder=folder)
+    run(compiler, *STRICT, "-Os", *words, "-fstack-usage", "-c", *core_sources(), folder=folder)
     return [folder / f"{path.stem}.o" for path in core_sources()]
 
 
@@ -54,7 +55,7 @@ def test_strange_input_harms_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_the_core_and_the_board_fit_a_small_processor(target: str, tmp_path: Path) -> None:
+def test_the_core_fits_a_small_processor(target: str, tmp_path: Path) -> None:
     objects = compiled_for(target, tmp_path)
     compiler, _, most = TARGETS[target]
     sizes = run(compiler.replace("gcc", "size"), "-t", *objects, folder=tmp_path).splitlines()[-1].split()

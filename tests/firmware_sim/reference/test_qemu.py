@@ -1,4 +1,4 @@
-"""The firmware as an Arm image in QEMU: exposures on the tick, in instructions; every rule of the protocol; decisions of the shipped automaton.
+"""The firmware as an Arm image in QEMU: exposures on the tick, in instructions; every rule; decisions of the shipped automaton.
 
 Times are those of the emulated processor, so that they are the same on every machine. Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi
 qemu-system-arm.
@@ -81,7 +81,7 @@ def emulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callab
     monkeypatch.syspath_prepend(register(tmp_path / "site", "qemu", "qemu_link:open_qemu"))
 
     def made(*defines: str) -> list[str]:
-        return [f"qemu:{build(tmp_path, 'm0plus', 'mailbox', *defines)}", "--profile", str(tmp_path / "mps2.toml")]
+        return [f"qemu:{build(tmp_path, 'm0plus', 'lockstep', *defines)}", "--profile", str(tmp_path / "mps2.toml")]
 
     yield made
     while open_links:
