@@ -127,13 +127,7 @@ def _instrument(history: History) -> list[Row]:
     drift = picture.get("clock_drift_ppm")
     text = "not known yet" if drift is None else f"drift {drift:+.2f} ppm"
     rows.append(Row("instrument", "clock", f"{text}, uncertainty at most {picture['clock_uncertainty_us']:,.0f} us"))
-    n, start_us, length_us = picture.get("exposed", (0, 0.0, 0.0))
-    text, allowed_us = "not told by the device", history.begin.get("exposure_tolerance_us", 0.0)
-    if n:
-        text = f"start {start_us:+.3g} us, length {length_us:+.3g} us at most, allowed {allowed_us:.3g} us"
-    rows.append(
-        Row("instrument", "exposures", text, "bad" if n and max(abs(start_us), abs(length_us)) > allowed_us else "")
-    )
+    rows.append(_exposures(picture.get("exposed"), history.begin.get("exposure_tolerance_us", 0.0)))
     if repeated := picture.get("repeated", 0):
         differing = picture.get("repeats_differing", 0)
         text = f"{repeated:,} messages, {differing:,} with other content"
@@ -143,6 +137,15 @@ def _instrument(history: History) -> list[Row]:
     if picture["trouble"]:
         rows.append(Row("instrument", "latest trouble", one_line(picture["trouble"], 200), "warn"))
     return rows
+
+
+def _exposures(told: list[float] | None, allowed_us: float) -> Row:
+    """When exposures happened: how many were told of, and the farthest start and length."""
+    if not told or not told[0]:
+        return Row("instrument", "exposures", "not told by the device" if told is None else "not told yet", "note")
+    _, start_us, length_us = told
+    text = f"start {start_us:+.3g} us, length {length_us:+.3g} us at most, allowed {allowed_us:.3g} us"
+    return Row("instrument", "exposures", text, "bad" if max(abs(start_us), abs(length_us)) > allowed_us else "good")
 
 
 def _dark(picture: dict[str, Any]) -> Row:

@@ -172,11 +172,12 @@ class Snapshots:
 
     def _clock(self) -> dict[str, Any]:
         clock, told, tick_us = self._run.connection.clock, self._run.core.exposed, self._run.plan.tick_us
+        tells = self._run.connection.session.tells_exposed
         fit = None if clock is None else clock.fit
         trouble = self._run.journal.trouble
         return {
             "clock_drift_ppm": None if fit is None else round(fit.drift_ppm, 4),
-            "exposed": [told.exposures, told.start_error * tick_us, told.length_error * tick_us],
+            "exposed": [told.exposures, told.start_error * tick_us, told.length_error * tick_us] if tells else None,
             "clock_uncertainty_us": self._run.timing.worst_uncertainty_ns / 1000,
             "trouble": "" if trouble is None else _words_of(trouble),
         }

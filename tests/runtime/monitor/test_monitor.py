@@ -98,6 +98,24 @@ def test_what_is_wrong_is_marked_and_in_words() -> None:
 
 
 @pytest.mark.parametrize(
+    ("told", "words", "level"),
+    [
+        (None, "not told by the device", "note"),
+        ([0, 0.0, 0.0], "not told yet", "note"),
+        ([9, 1.5, -1.5], "start +1.5 us, length -1.5 us at most, allowed 1.5 us", "good"),
+        ([9, 0.0, -1.6], "length -1.6 us", "bad"),
+    ],
+)
+def test_exposures_off_the_plan_are_marked(told: list[float] | None, words: str, level: str) -> None:
+    history = History()
+    history.take({"kind": "begin", "exposure_tolerance_us": 1.5})
+    history.take(picture(1.0, exposed=told))
+    row = next(row for row in rows_of(history) if row.name == "exposures")
+    assert words in row.text
+    assert row.level == level
+
+
+@pytest.mark.parametrize(
     ("clicks", "words", "level"),
     [(2, "higher than expected, not yet sure (alarm after about", "note"), (0, "as expected", "good")],
 )
@@ -179,6 +197,7 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
     assert set(history.pixels) == {str(number) for number in range(bundle.n_patterns)}
     text = " ".join(row.text for row in rows_of(history))
     assert f"{100 * tally.accuracy:.1f}%" in text
+    assert "start +0 us, length +0 us at most, allowed 30 us" in text
     assert f"{tally.clicks / 120:.2f} clicks, {tally.photons / 120:.2f} photons" in text
 
 
