@@ -21,7 +21,8 @@
 
 static struct {
     uint64_t dice, tick, exposures, frames_in, frames_out, bytes_in, armed, blocks, devices;
-    uint32_t last_id;
+    uint32_t last_id, sequence, drops; /* of the message that comes next, and of the block before */
+    uint64_t exposure;
     uint64_t exposing;
     bool is_open[4], held;
     struct pans_device *device; /* that the interrupt is of; NULL: none */
@@ -334,11 +335,19 @@ static void judge(uint32_t count)
         here.blocks++;
         if (get16(payload + 28) == 0 || get64(payload + 8) > here.tick)
             wrong("a block that cannot be meant");
+        if (get32(payload) == here.sequence && get64(payload + 16) != here.exposure + (get32(payload + 4) - here.drops))
+            wrong("an exposure that is neither in a block nor dropped");
+        here.sequence = get32(payload) + 1;
+        here.drops = get32(payload + 4);
+        here.exposure = get64(payload + 16) + get16(payload + 28);
         break;
     case WELCOME:
         here.last_id = roll(2) == 0 ? 0 : here.last_id;
         break;
     case MARK:
+        if (get32(payload) == 0)
+            here.drops = 0, here.exposure = 0, here.sequence = 0;
+        here.sequence += get32(payload) == here.sequence;
         break;
     default:
         wrong("a message of no known type");
