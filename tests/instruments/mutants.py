@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from c_core import FOLDER, CDevice, build_library
+from c_core import CDevice
 
 from pans.firmware_sim.conform import Finding, conform
 from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
+from pans.firmware_sim.lab.core import FOLDER, build_library
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime.instrument.profile import load_profile
 
@@ -69,7 +70,7 @@ class SlowLine(CDevice):
     def step(self, tick: int, data: bytes) -> bytes:
         """As CDevice.step, but no more than the line takes by then."""
         sent = self._drain(tick)
-        self._digest(tick, data)
+        self._call("pans_step", tick, data, len(data))
         self.tick = tick
         return sent + self._drain(tick)
 
@@ -81,7 +82,7 @@ class SlowLine(CDevice):
         sent = b""
         while self._free_tick <= tick:
             at = max(self._free_tick, self.tick)
-            count = self._library.instrument_output(self._handle, at, self._out, PIECE)
+            count = self._call("pans_output", at, self._out, PIECE)
             self.tick = at
             sent += self._out.raw[:count]
             if count:

@@ -8,8 +8,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from c_core import COMPILER, FOLDER, core_sources
+from c_core import COMPILER
 from c_device import needs_compiler
+
+from pans.firmware_sim.lab.core import FOLDER, core_sources
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZERS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -42,7 +44,7 @@ def compiled_for(target: str, folder: Path) -> list[Path]:
 @needs_compiler
 def test_strange_input_harms_nothing(tmp_path: Path) -> None:
     program = tmp_path / "fuzz"
-    words = [COMPILER, "-std=c99", *SANITIZERS, *core_sources(), FOLDER / "fuzz" / "fuzz.c", "-o", program]
+    words = [*COMPILER, "-std=c99", *SANITIZERS, *core_sources(), FOLDER / "fuzz" / "fuzz.c", "-o", program]
     built = subprocess.run([*map(str, words)], capture_output=True, text=True)
     if built.returncode and "asan" in built.stderr:
         pytest.skip("this compiler has no sanitizers")

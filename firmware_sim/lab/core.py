@@ -1,0 +1,388 @@
+"""The C core of firmware_sim/reference in this process: compiled once for each user, called through ctypes, with hardware in Python.
+
+`Core` takes bytes and ticks and returns bytes, as the simulator's `Instrument` does. `Hardware` is what it asks of the instrument.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import importlib.util
+import math
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from ctypes import POINTER, Structure, c_bool, c_char_p, c_float, c_int16, c_size_t, c_uint8, c_uint16, c_uint32, c_uint64, c_void_p
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.firmware_sim.device.states import MAX_SHOWS
+from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, MAX_SLOTS, MAX_UPLOAD_BYTES, Refused
+from pans.runtime.errors import ConfigError
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.wire.commands import PatternChunk
+from pans.runtime.wire.messages import MAX_PAYLOAD_BYTES, AckStatus
+
+FOLDER = Path(__file__).parents[1] / "reference"
+FLAGS = ("-std=c99", "-O2")
+ROOM = 1 << 18  # bytes of output that are taken at once
+NEVER = (1 << 64) - 1
+CALLS = {  # name: result, arguments after the device
+    "pans_edge_tick": (c_uint64, ()),
+    "pans_edge": (None, ()),
+    "pans_step": (None, (c_uint64, c_char_p, c_size_t)),
+    "pans_output": (c_size_t, (c_uint64, c_void_p, c_size_t)),
+    "pans_next_tick": (c_uint64, ()),
+}
+
+
+class Fact(Structure):
+    """`struct pans_fact`."""
+
+    _fields_ = (("key", c_char_p), ("text", c_char_p), ("number", c_uint64))
+
+
+class Limits(Structure):
+    """`struct pans_limits`."""
+
+    _fields_ = (
+        ("tick_hz", c_uint64), ("parallel", c_bool), ("simulated", c_bool), ("channels", c_uint16), ("levels", c_uint32),
+        ("pattern_memory", c_uint16), ("pattern_pixels", c_uint32), ("pixel_memory", c_uint64), ("slot_memory", c_uint32),
+        ("automaton_states", c_uint16), ("dwell_steps", c_uint16), ("show_memory", c_uint16),
+        ("exposure_min_ticks", c_uint32), ("exposure_max_ticks", c_uint32), ("readout_ticks", c_uint32),
+        ("pattern_ticks", c_uint32), ("turn_ticks", c_uint32), ("buffer_messages", c_uint32), ("buffer_bytes", c_uint32),
+        ("block_bytes", c_uint32), ("payload_bytes", c_uint32), ("port_bytes", c_uint32), ("pending_exposures", c_uint16),
+        ("lead_ticks", c_uint32), ("gate_outputs", c_uint16), ("gate_pulses", c_uint16), ("epoch", c_uint64),
+        ("firmware", c_char_p), ("serial", c_char_p), ("facts", POINTER(Fact)), ("n_facts", c_size_t),
+    )  # fmt: skip
+
+
+class Pixels(Structure):
+    """`struct pans_pixels`."""
+
+    _fields_ = (
+        ("pattern", c_uint16), ("first", c_uint32), ("count", c_uint32), ("whole", c_uint32), ("bits", c_bool), ("data", c_void_p),
+    )  # fmt: skip
+
+
+class Light(Structure):
+    """`struct pans_light`: `pattern` is DARK_PATTERN without light, which is on for `ticks` from the start of the exposure."""
+
+    pattern: int
+    ticks: int
+    dwell: int
+    dwell_steps: int
+    _fields_ = (("pattern", c_uint16), ("dwell", c_uint16), ("dwell_steps", c_uint16), ("ticks", c_uint32))
+
+
+class Exposure(Structure):
+    """`struct pans_exposure`: when it shall begin, its number and object since ARM, its length, its state (DARK_PATTERN: none), its light."""
+
+    tick: int
+    number: int
+    object: int
+    ticks: int
+    state: int
+    light: Light
+    _fields_ = (
+        ("tick", c_uint64), ("number", c_uint64), ("object", c_uint32), ("ticks", c_uint32), ("state", c_uint16), ("light", Light),
+    )  # fmt: skip
+
+
+_STATE = ctypes.CFUNCTYPE(Light, c_void_p, c_uint16, POINTER(c_uint32))
+
+
+class Task(Structure):
+    """`struct pans_task`: the measurement that ARM begins."""
+
+    patterns_revision: int
+    states_revision: int
+    n_patterns: int
+    n_states: int
+    adaptive: bool
+    exposure_ticks: int
+    _fields_ = (
+        ("patterns_revision", c_uint32), ("states_revision", c_uint32), ("n_patterns", c_uint16), ("n_states", c_uint16),
+        ("adaptive", c_bool), ("exposure_ticks", c_uint32), ("state", _STATE), ("device", c_void_p),
+    )  # fmt: skip
+
+    def states(self) -> NDArray[np.int64]:
+        """Pattern, dwell, dwell steps and the two successors of every state, int64 (states, 5)."""
+        rows, after = np.zeros((self.n_states, 5), np.int64), (c_uint32 * 2)()
+        for number, row in enumerate(rows):
+            light = self.state(self.device, number, after)
+            row[:] = light.pattern, light.dwell, light.dwell_steps, *after
+        return rows
+
+
+_FUNCTIONS = {  # of `struct pans_hardware`, in its order: result, arguments after `self`
+    "now": (c_uint64, ()),
+    "read": (c_size_t, (c_void_p, c_size_t)),
+    "write": (c_size_t, (c_void_p, c_size_t)),
+    "store": (None, (POINTER(Pixels),)),
+    "prepare": (ctypes.c_int, (POINTER(Task), POINTER(c_char_p))),
+    "dark": (None, ()),
+    "mark": (c_bool, (c_uint32, POINTER(c_int16), POINTER(c_float))),
+    "hold": (None, (c_bool,)),
+    "show": (None, (POINTER(Exposure),)),
+    "expose": (c_uint64, (POINTER(Exposure),)),
+    "clicks": (c_uint64, (POINTER(c_uint8), c_uint16)),
+    "gate": (None, (c_uint16, c_bool, c_uint64)),
+}
+_KINDS = {name: ctypes.CFUNCTYPE(result, c_void_p, *words) for name, (result, words) in _FUNCTIONS.items()}
+
+
+class _Functions(Structure):
+    _fields_ = (("self", c_void_p), *_KINDS.items())
+
+
+class Hardware:
+    """What the C core asks of the instrument; ticks are those of `now`, and nothing waits for the host.
+
+    An exception ends the run: the instrument is told to go dark, and `Core.step` raises it.
+    """
+
+    lead_ticks = 0  # by how much `expose` and `clicks` are called ahead of their tick
+
+    def now(self) -> int:
+        """Return the tick; it never goes back."""
+        raise NotImplementedError
+
+    def store(self, chunk: PatternChunk | None) -> None:
+        """Take pixels of a pattern, in order; None: forget all."""
+
+    def prepare(self, task: Task) -> None:
+        """Get ready for a measurement, or raise `Refused`."""
+
+    def show(self, exposure: Exposure) -> None:
+        """Get ready for the next exposure: called as soon as it is known, and again when the host names its pattern."""
+
+    def expose(self, exposure: Exposure) -> int:
+        """Wait for its tick, let there be light; return the tick at which it began."""
+        raise NotImplementedError
+
+    def clicks(self) -> tuple[int, Any]:
+        """Wait for the end of the exposure; return the tick at which it ended, and the click of each channel."""
+        raise NotImplementedError
+
+    def dark(self) -> None:
+        """End all light at once: the run is over."""
+
+    def gate(self, output: int, is_open: bool, tick: int) -> None:
+        """Wait for the tick, switch the output."""
+
+    def mark(self, number: int) -> tuple[int, float] | None:
+        """Return class (-1: unknown) and expected photoelectrons (NaN: unknown) of an object, None where neither is known."""
+        return None
+
+    def idle(self, ticks: int) -> bool:
+        """Do a piece of work while nothing is due for so long; whether there was any."""
+        return False
+
+
+class Core:
+    """The C core from power-on at `tick`: a `SteppedDevice`."""
+
+    session = 0  # not known here
+
+    def __init__(self, limits: Limits, hardware: Hardware, tick: int, library: Path | None = None) -> None:
+        self.tick = tick
+        self._hardware, self._limits, self._error = hardware, limits, None  # type: BaseException | None
+        self._why, self._out = b"", ctypes.create_string_buffer(ROOM)
+        self._library = ctypes.CDLL(str(library or build_library()))
+        for name, (result, words) in CALLS.items():
+            function = getattr(self._library, name)
+            function.restype, function.argtypes = result, (c_void_p, *words)
+        self._library.pans_memory_bytes.restype = c_size_t
+        self._library.pans_start.restype = c_void_p
+        needed = self._library.pans_memory_bytes(ctypes.byref(limits))
+        self._memory = (c_uint64 * (needed // 8 + 1))()
+        self._functions = _Functions(None, *(self._kind_of(name) for name in _KINDS))
+        words = limits, self._functions, self._memory
+        start = *map(ctypes.byref, words), c_size_t(needed), c_uint64(tick)
+        self._device = c_void_p(self._library.pans_start(*start) if needed else None)
+        if not self._device:
+            raise ConfigError("the profile asks for an instrument that the C core cannot be", remedy="see pans_device.h")
+
+    def step(self, tick: int, data: bytes) -> bytes:
+        """Advance to `tick`, digest `data` as having arrived then, and return what has been sent by then.
+
+        With hardware that leads, and nothing to send, the next edge follows where it is near: it waits for its own tick.
+        """
+        sent, lead = b"", self._hardware.lead_ticks
+        # The line takes all: what is due is taken at once, so that nothing waits in the buffer that the window lets out.
+        while (due := self._call("pans_next_tick")) <= tick:
+            self._call("pans_step", due, b"", 0)
+            sent += self._take(due)
+        self._call("pans_step", tick, data, len(data))
+        sent += self._take(self._hardware.now() if lead else tick)
+        if lead and not sent and self._call("pans_edge_tick") - lead <= tick:
+            self._call("pans_edge")
+            tick = self._hardware.now()
+            self._call("pans_step", tick, b"", 0)
+            sent = self._take(tick)
+        self.tick = tick
+        return sent
+
+    def next_event_tick(self) -> int | None:
+        """Tick at which `step` has something to do; None: when bytes come."""
+        due = self._call("pans_next_tick")
+        edge = self._call("pans_edge_tick") - self._hardware.lead_ticks
+        return None if due == NEVER else min(due, edge)
+
+    def draw_ahead(self) -> bool:
+        """See `SteppedDevice`."""
+        due = self.next_event_tick()
+        return self._hardware.idle(NEVER if due is None else due - self._hardware.now())
+
+    def _take(self, tick: int, room: int = ROOM) -> bytes:
+        sent = b""
+        while count := self._call("pans_output", tick, self._out, room):
+            sent += self._out.raw[:count]
+        return sent
+
+    def _call(self, name: str, *words: Any) -> Any:
+        result = getattr(self._library, name)(self._device, *words)
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+        return result
+
+    # -- called by the library
+
+    def _kind_of(self, name: str) -> Any:
+        kind, result = _KINDS[name], _FUNCTIONS[name][0]
+        if name in ("read", "write", "hold"):  # not called: the bytes are `step`'s, and no interrupt needs to be kept away
+            return kind()
+        own: Callable[..., Any] = getattr(self, f"_{name}", None) or getattr(self._hardware, name)
+
+        def call(_self: int, *words: Any) -> Any:
+            try:
+                return own(*words) if self._error is None or name == "dark" else result and 0
+            except BaseException as error:  # through C it cannot pass: `_call` raises it
+                self._error = self._error or error
+                return result and 0
+
+        return kind(call)
+
+    def _store(self, piece: Any) -> None:
+        if not piece:
+            self._hardware.store(None)
+            return
+        one = piece.contents
+        data = np.frombuffer(ctypes.string_at(one.data, (one.count + 7) // 8 if one.bits else 2 * one.count), np.uint8)
+        levels = np.unpackbits(data, count=one.count, bitorder="little") if one.bits else data.view("<u2")
+        self._hardware.store(PatternChunk(one.pattern, one.first, one.whole, levels.astype(np.uint16)))
+
+    def _prepare(self, task: Any, why: Any) -> int:
+        try:
+            self._hardware.prepare(task.contents)
+        except Refused as refusal:
+            self._why = why[0] = refusal.text.encode()
+            return int(refusal.status)
+        return int(AckStatus.DONE)
+
+    def _mark(self, number: int, truth: Any, photons: Any) -> bool:
+        known = self._hardware.mark(number)
+        if known is not None:
+            truth[0], photons[0] = known
+        return known is not None
+
+    def _show(self, exposure: Any) -> None:
+        self._hardware.show(exposure.contents)
+
+    def _expose(self, exposure: Any) -> int:
+        return self._hardware.expose(exposure.contents)
+
+    def _clicks(self, word: Any, room: int) -> int:
+        tick, clicks = self._hardware.clicks()
+        packed = np.packbits(np.asarray(clicks, np.uint8), bitorder="little").tobytes()
+        ctypes.memmove(word, packed, min(room, len(packed)))
+        return tick
+
+
+def limits_of(profile: Profile, facts: Mapping[str, str | int], *, firmware: str, serial: str, **words: Any) -> Limits:
+    """Return the limits of an instrument with this profile, and more keys of WELCOME; `words` are fields that are not the profile's."""
+    hz, projector, exposure = profile.clock.tick_hz, profile.projector, profile.exposure
+    parallel = profile.mode == "parallel"
+    buffer = words.setdefault("buffer_messages", 256)
+    known = [Fact(key.encode(), *((of.encode(), 0) if isinstance(of, str) else (None, of))) for key, of in facts.items()]
+    return Limits(
+        tick_hz=hz,
+        parallel=parallel,
+        channels=profile.detector.channels,
+        levels=projector.levels,
+        pattern_memory=projector.pattern_memory,
+        pattern_pixels=min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS),
+        pixel_memory=MAX_UPLOAD_BYTES // 2,
+        slot_memory=MAX_SLOTS,
+        automaton_states=0 if parallel else projector.automaton_states,
+        dwell_steps=0 if parallel else projector.dwell_steps,
+        show_memory=0 if parallel else MAX_SHOWS,
+        # a tick more or less is allowed for rounding, as by the simulator in Python
+        exposure_min_ticks=max(1, round(exposure.min_us * hz / 1e6) - 1),
+        exposure_max_ticks=round(exposure.max_us * hz / 1e6) + 1,
+        readout_ticks=max(0, math.ceil(exposure.readout_us * hz / 1e6) - 1),
+        pattern_ticks=max(0, math.ceil(hz / projector.pattern_rate_max_hz) - 1),
+        turn_ticks=max(0, math.ceil(profile.timing.device_turn_us * hz / 1e6) - 1),
+        buffer_bytes=min(buffer * (MAX_PAYLOAD_BYTES + MAX_PAYLOAD_BYTES // 254 + 64), 1 << 26),
+        block_bytes=MAX_PAYLOAD_BYTES,
+        payload_bytes=MAX_PAYLOAD_BYTES,
+        port_bytes=1,  # pans_turn is not called
+        pending_exposures=2,
+        firmware=firmware.encode(),
+        serial=serial.encode(),
+        facts=(Fact * len(known))(*known),
+        n_facts=len(known),
+        **words,
+    )
+
+
+# -- the library
+
+
+def find_compiler() -> tuple[str, ...]:
+    """Return the words that start a C compiler: the system's, or that of the `compiler` extra; none: ()."""
+    found = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    if found is None and importlib.util.find_spec("ziglang") is not None:
+        return (sys.executable, "-m", "ziglang", "cc")
+    return () if found is None else (found,)
+
+
+def core_sources(folder: Path = FOLDER) -> list[Path]:
+    """Return the C files of the core, which need nothing of a system."""
+    return sorted(folder.glob("*.c"))
+
+
+def build_library(folder: Path = FOLDER, cache: Path | None = None, flags: tuple[str, ...] = FLAGS) -> Path:
+    """Return the core as a shared library; it is compiled where no build of these sources is in `cache`, by default the user's."""
+    compiler, place = find_compiler(), "-fPIC" if os.name == "posix" else "-Wl,--export-all-symbols"
+    digest = hashlib.sha256(" ".join((sys.platform, *flags)).encode())
+    for path in sorted(folder.glob("*.[ch]")):
+        digest.update(path.read_bytes())
+    cache = cache or _user_cache()
+    cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+    target = cache / f"pans-core-{digest.hexdigest()[:20]}.{'so' if os.name == 'posix' else 'dll'}"
+    if target.is_file():
+        return target
+    if not compiler:
+        raise ConfigError("no C compiler was found, and the core is C", remedy="pip install 'pans-runtime[compiler]'")
+    with tempfile.TemporaryDirectory(dir=cache) as made:
+        library = Path(made) / target.name
+        words = [*compiler, *flags, "-shared", place, *map(str, core_sources(folder)), "-o", str(library)]
+        done = subprocess.run(words, capture_output=True, text=True)
+        if done.returncode:
+            raise ConfigError(f"the C core did not compile: {done.stderr[:500]}", remedy=f"try {compiler[0]} by itself")
+        library.replace(target)
+    return target
+
+
+def _user_cache() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
+    return (Path(home) if home else Path.home() / ".cache") / "pans"
