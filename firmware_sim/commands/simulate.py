@@ -42,7 +42,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.echo is not None:
         instrument = FrameEcho(args.echo)
     port = open_port(args.listen)
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGTERM, leave)
     orphaned = _watch_stdin() if args.until_stdin_closes else threading.Event()
     try:
         _announce(args, port.url)
@@ -98,7 +98,7 @@ def _watch_stdin() -> threading.Event:
     return closed
 
 
-def _leave(signum: int, frame: FrameType | None) -> NoReturn:
+def leave(signum: int, frame: FrameType | None) -> NoReturn:
     raise SystemExit(0)
 
 

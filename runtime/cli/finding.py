@@ -14,10 +14,11 @@ from pans.runtime.offered import load_offered
 
 from .command import Command
 
-EXTRAS = {"torch": "train", "onnx": "train", "optuna": "sweep", "matplotlib": "plot", "h5py": "export"}
+EXTRAS = {"torch": "train", "onnx": "train", "optuna": "sweep", "matplotlib": "plot", "h5py": "export", "ALP4": "alp"}
+EXTRAS["Swabian"] = "tagger"
 GROUPS = {
     "Run and look": ("demo", "run", "replay", "verify", "info", "report", "compare", "export", "runs", "service"),
-    "Instruments": ("profile", "calibrate", "refit", "tune", "simulate", "devices", "doctor"),
+    "Instruments": ("profile", "calibrate", "refit", "tune", "simulate", "instrument", "devices", "doctor"),
     "Train and compare": ("train", "evaluate", "order", "baseline", "reproduce", "sweep", "batch", "data", "bundle"),
     "Measure and test": ("bench", "conform"),
     "Shell": ("completion",),
