@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import signal
 import time
 
@@ -61,6 +62,7 @@ def _run(args: argparse.Namespace) -> int:
         opened.callback(port.close)
         emit(args, {"device": port.url, "simulated": simulated, **facts}, port.url)
         say(f"{profile.name} by {args.projector} and {args.counter}; Ctrl-C ends it")
+        gc.freeze()  # what was made so far is never collected
         try:
             serve(core, hardware.clock, port, lambda: False, args.core)
         finally:

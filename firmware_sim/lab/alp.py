@@ -24,13 +24,19 @@ REMEDY = "check its power and its USB cable, then start `pans instrument` again"
 
 
 class Alp:
-    """The projector `alp`. version and folder: of the vendor's library; serial: 0 for the first device; width: pixels of a pattern, 0: square.
+    """The projector `alp`. version, folder: of the vendor's library; serial: 0 for the first device; width: of a pattern, 0: square.
 
     A pattern is shown in the middle, each of its pixels as a square of mirrors. With 2 levels a picture is one bit, else 8 bits.
     """
 
     def __init__(
-        self, profile: Profile, version: str = "4.3", folder: str = "", serial: int = 0, width: int = 0, shortest_us: float = 0.0
+        self,
+        profile: Profile,
+        version: str = "4.3",
+        folder: str = "",
+        serial: int = 0,
+        width: int = 0,
+        shortest_us: float = 0.0,
     ) -> None:
         import ALP4
 
@@ -41,9 +47,14 @@ class Alp:
             self._device = self._told(lambda: ALP4.ALP4(version=version, libDir=folder or None), "load the library")
             self._told(lambda: self._device.Initialize(serial or None), "open")
         self._size = self._device.nSizeY, self._device.nSizeX
-        found, stated = f"{self._device.nSizeX} x {self._device.nSizeY}", f"{projector.width_px} x {projector.height_px}"
+        found, stated = (
+            f"{self._device.nSizeX} x {self._device.nSizeY}",
+            f"{projector.width_px} x {projector.height_px}",
+        )
         if found != stated:
-            raise ConfigError(f"{profile.name}: projector has {stated} pixels, the DMD {found}", remedy="correct the profile")
+            raise ConfigError(
+                f"{profile.name}: projector has {stated} pixels, the DMD {found}", remedy="correct the profile"
+            )
         if self._levels > 256:
             raise ConfigError(f"{profile.name}: projector.levels is {self._levels}, a DMD shows 2 to 256")
         depth, memory = 1 if self._levels == 2 else 8, self._inquire(ALP4.ALP_AVAIL_MEMORY)
@@ -77,7 +88,10 @@ class Alp:
             if number != self._shown:
                 self._control(frame, number)
         if round(light_us) != self._timed:
-            self._told(lambda: self._device.SetTiming(self._sequence, illuminationTime=round(light_us)), "set the time of light")
+            self._told(
+                lambda: self._device.SetTiming(self._sequence, illuminationTime=round(light_us)),
+                "set the time of light",
+            )
         self._shown, self._timed = number, round(light_us)
 
     def start(self) -> None:

@@ -26,16 +26,21 @@ from .core import Exposure, Hardware, Task
 
 SPIN_NS = 300_000  # a sleep ends late by about a tenth of this: the rest is waited for awake
 AHEAD_NS = 500_000  # how much earlier than needed an exposure is attended to
-GAIN = 1 / 16  # of what is measured once an exposure: the clock and the projector's delay
-LONGEST_DELAY_NS = 20_000_000  # of a projector
-CHECK_NS, CHECK_WITHIN_NS = 1_000_000_000, 50_000_000  # how often an idle instrument is looked at, and the time that takes at most
+GAIN = 1 / 64  # of what the clock is found to be wrong by
+USUAL = 1.5  # times the shortest time of an answer: what took longer says little
+EARLIEST_NS = 100_000  # kept free below a projector's least delay: no exposure may begin before its tick
+RISE = 1 / 1024  # of the way from the least delay to that of an exposure
+CHECK_NS, CHECK_WITHIN_NS = (
+    1_000_000_000,
+    50_000_000,
+)  # how often an idle instrument is looked at, and the time that takes at most
 
 
 class SteeredClock:
     """The instrument's ticks on this computer's clock, moved towards another clock; `tick_hz` ticks per second."""
 
     def __init__(self, tick_hz: int) -> None:
-        self._hz, self._offset, self._last, self._known = tick_hz, 0.0, 0, False
+        self._hz, self._offset, self._last, self._width_ns = tick_hz, 0.0, 0, math.inf
 
     def tick_at(self, host_ns: int) -> int:
         """The tick at `time.perf_counter_ns()` = host_ns; it never goes back."""
@@ -47,10 +52,12 @@ class SteeredClock:
         return -(-(tick - round(self._offset)) * 10**9 // self._hz)
 
     def steer(self, before_ns: int, tick: int, after_ns: int) -> None:
-        """Learn that it was `tick` at some time between the two: the middle is taken, by a part of the difference after the first time."""
-        error = tick - (before_ns + after_ns) // 2 * self._hz / 10**9 - self._offset
-        self._offset += error * (GAIN if self._known else 1.0)
-        self._known = True
+        """Learn that it was `tick` at some time between the two, of which the middle is taken, unless it took longer than usual."""
+        width, first = after_ns - before_ns, self._width_ns == math.inf
+        self._width_ns = min(width, self._width_ns * (1 + GAIN))
+        if width <= USUAL * self._width_ns:
+            error = tick - (before_ns + after_ns) // 2 * self._hz / 10**9 - self._offset
+            self._offset += error * (1.0 if first else GAIN)
 
     def wait(self, tick: int, early_ns: int = 0) -> None:
         """Return `early_ns` before `tick`; it sleeps, and spins at the end."""
@@ -87,11 +94,11 @@ class Counter(Protocol):
 
     clock: SteeredClock
 
-    def light_on(self, told_ns: int) -> int:
-        """Return the tick at which the light came that the projector was told of at `told_ns`; steer the clock by it."""
+    def light_on(self) -> int:
+        """Wait for the light that the projector has been told of; return the tick at which it came."""
 
     def count(self, began: int, ticks: int, light_ticks: int) -> tuple[int, int]:
-        """Wait until tick began + ticks is over; return the clicks since `began`, and for how many ticks the light was on.
+        """Wait until tick began + ticks is over; return the clicks since `began`, and for how many ticks the light was on. Steer the clock.
 
         `light_ticks` is what it should be, 0 of the dark; it is returned where nothing else is known.
         """
@@ -112,14 +119,16 @@ class Objects(Protocol):
 class Apparatus(Hardware):
     """A projector and a counter as the hardware of the C core."""
 
-    def __init__(self, profile: Profile, projector: Projector, counter: Counter, objects: Objects | None = None) -> None:
+    def __init__(
+        self, profile: Profile, projector: Projector, counter: Counter, objects: Objects | None = None
+    ) -> None:
         self._projector, self._counter, self._objects = projector, counter, objects
         self._hz, self.clock = profile.clock.tick_hz, counter.clock
         self._parts: dict[int, NDArray[np.uint16]] = {}  # patterns that have not come as a whole
         self._refusal: Refused | None = None
         self._lit = self._exposing = False
         self._place: tuple[int, int] | None = None  # number and class of the object
-        self._delay_ns, self._checked_ns = AHEAD_NS, 0
+        self._delay_ns, self._checked_ns = math.inf, 0  # the least delay of the projector in this run
         shortest = profile.exposure.min_us / max(1, profile.projector.dwell_steps)
         if shortest < projector.shortest_us:
             what = f"{profile.name}: exposure.min_us / projector.dwell_steps is {shortest:g}"
@@ -132,7 +141,10 @@ class Apparatus(Hardware):
     def lead_ticks(self) -> int:  # type: ignore[override]
         """Ahead of light only: what ends is known from the counter."""
         ahead = self._lit and not self._exposing
-        return (self._delay_ns + AHEAD_NS) * self._hz // 10**9 if ahead else 0
+        return (self._early_ns() + AHEAD_NS) * self._hz // 10**9 if ahead else 0
+
+    def _early_ns(self) -> int:
+        return max(0, round(self._delay_ns) - EARLIEST_NS) if self._delay_ns < math.inf else 0
 
     def now(self) -> int:
         return self.clock.tick_at(time.perf_counter_ns())
@@ -154,7 +166,7 @@ class Apparatus(Hardware):
     def prepare(self, task: Task) -> None:
         if self._refusal is not None:
             raise self._refusal
-        self._place = None
+        self._place, self._delay_ns = None, math.inf
 
     def show(self, exposure: Exposure) -> None:
         self._lit = exposure.light.pattern != DARK_PATTERN
@@ -165,19 +177,20 @@ class Apparatus(Hardware):
 
     def expose(self, exposure: Exposure) -> int:
         self._exposing, self._ticks, self._began = True, exposure.ticks, exposure.tick
-        self._light = exposure.light.ticks if self._lit else 0
-        if self._lit:
-            self.clock.wait(exposure.tick, self._delay_ns)
+        self._light = 0 if exposure.light.pattern == DARK_PATTERN else exposure.light.ticks
+        if self._light:
+            self.clock.wait(exposure.tick, self._early_ns())
             told = time.perf_counter_ns()
             self._projector.start()
-            self._began = self._counter.light_on(told)
-            late_ns = (self._began - exposure.tick) * 10**9 / self._hz
-            self._delay_ns = min(max(0, self._delay_ns + round(GAIN * late_ns)), LONGEST_DELAY_NS)
+            self._began = self._counter.light_on()
+            delay = self.clock.host_ns_at(self._began) - told
+            risen = self._delay_ns + RISE * (delay - self._delay_ns) if self._delay_ns < math.inf else math.inf
+            self._delay_ns = min(delay, risen)
         return self._began
 
     def clicks(self) -> tuple[int, Any]:
         clicks, light = self._counter.count(self._began, self._ticks, self._light)
-        self._exposing = False
+        self._exposing = self._lit = False  # an exposure that the host has not named is not shown
         if abs(light - self._light) > self._light // 50 + 2 * self._hz // 10**6:
             found, asked = (f"{one * 1e6 / self._hz:g} us" for one in (light, self._light))
             remedy = "compare the synch output's polarity and pulse width on an oscilloscope"
@@ -214,7 +227,9 @@ def make_adapter(kind: str, text: str, profile: Profile) -> Any:
     name, *pairs = text.split(",")
     known = {point.name: point for point in entry_points(group=f"pans.{kind}")}
     if name not in known and ":" not in name:
-        raise UsageError(f"there is none of the {kind} called {name!r}", remedy=f"known: {', '.join(known)}, or module:Class")
+        raise UsageError(
+            f"there is none of the {kind} called {name!r}", remedy=f"known: {', '.join(known)}, or module:Class"
+        )
     make = load_offered(known.get(name) or EntryPoint(name, name, f"pans.{kind}"))
     defaults = {one.name: one.default for one in list(inspect.signature(make).parameters.values())[1:]}
     settings = {}
@@ -224,5 +239,7 @@ def make_adapter(kind: str, text: str, profile: Profile) -> Any:
             settings[key] = type(defaults[key])(value)
         except (KeyError, ValueError) as error:
             words = ", ".join(f"{one}={usual!r}" for one, usual in defaults.items())
-            raise UsageError(f"{name}: {pair!r} is no setting", remedy=f"those with their usual values: {words}") from error
+            raise UsageError(
+                f"{name}: {pair!r} is no setting", remedy=f"those with their usual values: {words}"
+            ) from error
     return make(profile, **settings)

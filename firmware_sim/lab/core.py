@@ -15,7 +15,20 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
-from ctypes import POINTER, Structure, c_bool, c_char_p, c_float, c_int16, c_size_t, c_uint8, c_uint16, c_uint32, c_uint64, c_void_p
+from ctypes import (
+    POINTER,
+    Structure,
+    c_bool,
+    c_char_p,
+    c_float,
+    c_int16,
+    c_size_t,
+    c_uint8,
+    c_uint16,
+    c_uint32,
+    c_uint64,
+    c_void_p,
+)
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +95,7 @@ class Light(Structure):
 
 
 class Exposure(Structure):
-    """`struct pans_exposure`: when it shall begin, its number and object since ARM, its length, its state (DARK_PATTERN: none), its light."""
+    """`struct pans_exposure`: when it shall begin, its number and object since ARM, its length, its light; state DARK_PATTERN: none."""
 
     tick: int
     number: int
@@ -193,7 +206,8 @@ class Core:
 
     def __init__(self, limits: Limits, hardware: Hardware, tick: int, library: Path | None = None) -> None:
         self.tick = tick
-        self._hardware, self._limits, self._error = hardware, limits, None  # type: BaseException | None
+        self._hardware, self._limits = hardware, limits
+        self._error: BaseException | None = None
         self._why, self._out = b"", ctypes.create_string_buffer(ROOM)
         self._library = ctypes.CDLL(str(library or build_library()))
         for name, (result, words) in CALLS.items():
@@ -204,11 +218,13 @@ class Core:
         needed = self._library.pans_memory_bytes(ctypes.byref(limits))
         self._memory = (c_uint64 * (needed // 8 + 1))()
         self._functions = _Functions(None, *(self._kind_of(name) for name in _KINDS))
-        words = limits, self._functions, self._memory
-        start = *map(ctypes.byref, words), c_size_t(needed), c_uint64(tick)
+        blocks = (ctypes.byref(one) for one in (limits, self._functions, self._memory))
+        start = *blocks, c_size_t(needed), c_uint64(tick)
         self._device = c_void_p(self._library.pans_start(*start) if needed else None)
         if not self._device:
-            raise ConfigError("the profile asks for an instrument that the C core cannot be", remedy="see pans_device.h")
+            raise ConfigError(
+                "the profile asks for an instrument that the C core cannot be", remedy="see pans_device.h"
+            )
 
     def step(self, tick: int, data: bytes) -> bytes:
         """Advance to `tick`, digest `data` as having arrived then, and return what has been sent by then.
@@ -258,7 +274,11 @@ class Core:
 
     def _kind_of(self, name: str) -> Any:
         kind, result = _KINDS[name], _FUNCTIONS[name][0]
-        if name in ("read", "write", "hold"):  # not called: the bytes are `step`'s, and no interrupt needs to be kept away
+        if name in (
+            "read",
+            "write",
+            "hold",
+        ):  # not called: the bytes are `step`'s, and no interrupt needs to be kept away
             return kind()
         own: Callable[..., Any] = getattr(self, f"_{name}", None) or getattr(self._hardware, name)
 
@@ -312,7 +332,9 @@ def limits_of(profile: Profile, facts: Mapping[str, str | int], *, firmware: str
     hz, projector, exposure = profile.clock.tick_hz, profile.projector, profile.exposure
     parallel = profile.mode == "parallel"
     buffer = words.setdefault("buffer_messages", 256)
-    known = [Fact(key.encode(), *((of.encode(), 0) if isinstance(of, str) else (None, of))) for key, of in facts.items()]
+    known = [
+        Fact(key.encode(), *((of.encode(), 0) if isinstance(of, str) else (None, of))) for key, of in facts.items()
+    ]
     return Limits(
         tick_hz=hz,
         parallel=parallel,

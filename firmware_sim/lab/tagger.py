@@ -55,13 +55,10 @@ class Tagger:
         probes = [self._probe() for _ in range(FIRST_PROBES)]
         self.clock.steer(*min(probes, key=lambda one: one[2] - one[0]))
 
-    def light_on(self, told_ns: int) -> int:
+    def light_on(self) -> int:
         """See `Counter`."""
-        rose, seen_ns = self._edge(self._synch, self._counted, "begin")
-        tick = self._tick(rose)
-        self.clock.steer(told_ns, tick, seen_ns)
-        self._rose = rose
-        return tick
+        self._rose = self._edge(self._synch, self._counted, "begin", self._read)
+        return self._tick(self._rose)
 
     def count(self, began: int, ticks: int, light_ticks: int) -> tuple[int, int]:
         """See `Counter`."""
@@ -69,10 +66,9 @@ class Tagger:
         end = start + ticks * PS // self._hz
         light = light_ticks
         self.clock.wait(began + ticks)
+        self._until(lambda: self._position >= end, "no tags have come", self._steer)
         if light_ticks:
-            fell, _ = self._edge(self._fell, start, "end")
-            light = self._tick(fell) - began
-        self._until(lambda: self._position >= end, "no tags have come")
+            light = self._tick(self._edge(self._fell, start, "end", self._steer)) - began
         here = (self._channels == self._clicks) & (self._times >= start) & (self._times < end)
         self._counted = max(end, start + light * PS // self._hz)
         later = self._times > self._counted
@@ -81,7 +77,7 @@ class Tagger:
 
     def check(self) -> None:
         """See `Counter`."""
-        self.clock.steer(*self._probe())
+        self._steer()
         self._times, self._channels = self._times[:0], self._channels[:0]
         self._counted = self._position
 
@@ -100,28 +96,30 @@ class Tagger:
         self._read()
         return before, self._tick(self._position), time.perf_counter_ns()
 
-    def _edge(self, channel: int, after: int, what: str) -> tuple[int, int]:
-        """Wait for a tag of `channel` after `after` ps; return it, and when it was seen."""
-        found = np.zeros(0, np.int64)
+    def _edge(self, channel: int, after: int, what: str, read: Callable[[], None]) -> int:
+        """Wait for a tag of `channel` after `after` ps."""
 
-        def seen() -> bool:
-            nonlocal found
-            found = self._times[(self._channels == channel) & (self._times > after)]
-            return bool(found.size)
+        def found() -> Any:
+            return self._times[(self._channels == channel) & (self._times > after)]
 
-        self._until(seen, f"no {what} of a synch pulse has come on channel {self._synch}")
-        return int(found[0]), time.perf_counter_ns()
+        self._until(lambda: bool(found().size), f"no {what} of a synch pulse has come on channel {self._synch}", read)
+        return int(found()[0])
 
-    def _until(self, done: Callable[[], bool], what: str) -> None:
+    def _until(self, done: Callable[[], bool], what: str, read: Callable[[], None]) -> None:
         deadline = time.perf_counter_ns() + PATIENCE_NS
         while not done():
             if time.perf_counter_ns() > deadline:
-                remedy = "check the projector's synch output, its cable and synch_level_v, and the time tagger's own cable"
+                remedy = (
+                    "check the projector's synch output, its cable and synch_level_v, and the time tagger's own cable"
+                )
                 raise LinkError(f"the time tagger: {what} for 1 s", remedy=remedy)
             before = self._position
-            self._read()
+            read()
             if self._position == before:
                 time.sleep(LOOK_EVERY_S)
+
+    def _steer(self) -> None:
+        self.clock.steer(*self._probe())
 
     def _read(self) -> None:
         data: Any = self._told(lambda: self._stream.getData())

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Protocol
 
-from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
+from pans.firmware_sim.device.clock import SteppedDevice
 from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.timing.realtime import busy_core
 
@@ -23,6 +23,14 @@ MAX_BACKLOG_BYTES = 1 << 20
 FIFO_PRIORITY = 20  # above the host's loop: light does not wait for a computer
 LONGEST_WAIT_S = 0.25  # how late a stop request may be noticed
 DRAW_S = 100e-6  # with nothing due for so long, what comes is made ahead
+
+
+class Clock(Protocol):
+    """From this computer's clock to the instrument's ticks and back."""
+
+    def tick_at(self, host_ns: int) -> int: ...
+
+    def host_ns_at(self, tick: int) -> int: ...
 
 
 class Port(Protocol):
@@ -171,14 +179,14 @@ def prompt_thread() -> Iterator[None]:
 
 
 def serve(
-    device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callable[[], bool], core: int | None = None
+    device: SteppedDevice, clock: Clock, port: Port, stopped: Callable[[], bool], core: int | None = None
 ) -> None:
     """Step `device` in real time and carry its bytes over `port` until `stopped()`; on `core`, kept awake, if one is given."""
     with prompt_thread(), busy_core(core):
         _serve(device, clock, port, stopped)
 
 
-def _serve(device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callable[[], bool]) -> None:
+def _serve(device: SteppedDevice, clock: Clock, port: Port, stopped: Callable[[], bool]) -> None:
     backlog = bytearray()
     session = device.session
     readable = True

@@ -1,7 +1,7 @@
-"""A stand-in of Swabian-TimeTagger 2.22.6 by its public interface, with the table of bench_light behind it: clicks on input 1, synch on 2.
+"""A stand-in of Swabian-TimeTagger 2.22.6 by its public interface, on the table of bench_light: clicks on 1, synch on 2.
 
-Tags come in blocks, as late as the stream's latency says (20 ms unless set); `sync` waits for all up to now. An input whose trigger level is
-above the pulse sees nothing. A device that is pulled falls silent: the stream's position stands still, and `sync` fails after its time.
+Tags come in blocks, as late as the stream's latency says (20 ms unless set); `sync` waits for all up to now. An input whose level is above
+the pulse sees nothing. A device that is pulled falls silent: the stream's position stands still, and `sync` fails after its time.
 """
 
 from __future__ import annotations

@@ -1,0 +1,241 @@
+"""`pans instrument` with stand-ins of both libraries before one table: runs over TCP, and cables that are pulled."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import inspect
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from c_core import COMPILER
+from c_device import needs_compiler
+from commands import json_of
+from tree import ROOT
+
+from pans.firmware_sim.lab import core
+from pans.firmware_sim.testing import small_automaton_bundle
+from pans.runtime.bundle.model import load_bundle, write_bundle
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_command
+
+STAND_INS = ROOT / "tests" / "instruments" / "lab"
+MAIN = "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))"
+PARTS = ("--projector", "alp", "--counter", "tagger", "--objects", "bench_light:Shelf")
+PATIENCE_S = 30.0
+BINARY = {
+    "levels = 124": "levels = 2",
+    "dwell_steps = 1": "dwell_steps = 4",
+    "min_us = 3500.0": "min_us = 100.0",
+    "peak_photoelectrons_hz = 3000.0": "peak_photoelectrons_hz = 2000.0",
+}
+pytestmark = needs_compiler
+
+
+@contextmanager
+def serving(*words: str, **table: Any) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """An instrument in a process of its own, and its URL, "" where it did not come up."""
+    environment = {**os.environ, "PYTHONPATH": str(STAND_INS), "PANS_TABLE": json.dumps(table)}
+    command = [sys.executable, "-c", MAIN, "instrument", *PARTS, *words]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.terminate()
+
+
+def profile_with(path: Path, changes: dict[str, str]) -> Path:
+    text = (ROOT / "hw_profiles" / "alp-tagger.toml").read_text()
+    for old, new in changes.items():
+        assert text.count(f"\n{old}\n") == 1, old
+        text = text.replace(f"\n{old}\n", f"\n{new}\n")
+    path.write_text(text)
+    return path
+
+
+def table_light(levels: Any, images: Any, exposure_us: float, peak_hz: float) -> Any:
+    """Chances of a click, float64 (objects, patterns): Poisson light and 25 dark counts a second."""
+    shown = levels.reshape(len(levels), -1) / (levels.max() if levels.max() > 1 else 1)
+    mean = images.reshape(len(images), -1) @ shown.T * peak_hz
+    return -np.expm1(-(mean + 25.0) * exposure_us * 1e-6)
+
+
+def test_the_shipped_bundle_passes_and_is_as_right_as_expected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle, objects = load_bundle("fashion10")[0], 60
+    with serving("--profile", "alp-tagger") as (_, url):
+        words = ("--device", url, "--profile", "alp-tagger", "--decisions", objects, "--out", tmp_path / "run")
+        found = json_of(capsys, "run fashion10 --no-realtime", *words, code=None)
+    assert (found["lost"], found["wrong_patterns"], found["simulated"]) == (0, 0, True)
+    assert found["decisions"] == objects
+    with np.load(ROOT / "firmware_sim" / "scenes" / "fashion200.npz") as scene:
+        images, labels = scene["images"][:objects] / 255.0, scene["labels"][:objects]
+    chance = table_light(bundle.pattern_levels, images, bundle.photons_per_level * 123 / 3000 * 1e6, 3000.0)
+    bits = np.arange(1024)[:, None] >> np.arange(10) & 1
+    of_word = np.where(bits, chance[:, None], 1 - chance[:, None]).prod(axis=2)
+    right = (of_word * (bundle.table.argmax(axis=1) == labels[:, None])).sum(axis=1)
+    error = np.sqrt((right * (1 - right)).sum()) / objects
+    assert abs(found["accuracy"] - right.mean()) < 3 * error
+    assert abs(found["clicks_mean"] - chance.sum(axis=1).mean()) < 3 * np.sqrt((chance * (1 - chance)).sum()) / objects
+
+
+@pytest.mark.parametrize("drive", ["device", "host"])
+def test_an_automaton_walks_by_the_clicks_of_the_table(
+    drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle, objects, exposure_us = small_automaton_bundle(exposure_us=500.0), 60, 2500.0
+    write_bundle(bundle, tmp_path / "small.pans")
+    profile = profile_with(tmp_path / "binary.toml", BINARY)
+    with serving("--profile", str(profile), pixels=2, peak_hz=2000.0) as (_, url):
+        words = ("--device", url, "--profile", profile, "--decisions", objects, "--drive", drive)
+        words += ("--out", tmp_path / "run", "--no-realtime")
+        found = json_of(capsys, f"run {tmp_path / 'small.pans'}", *words, code=None)
+    assert (found["lost"], found["wrong_patterns"], found["decisions"]) == (0, 0, objects)
+    walk, images = bundle.automaton, np.random.default_rng(2).random((200, 2, 2))[:objects]
+    dwell = np.asarray(walk.dwell) / walk.dwell_steps
+    levels = bundle.pattern_levels[walk.pattern] * 1.0
+    chance = table_light(levels * dwell[:, None], images, exposure_us, 2000.0)
+    clicks, spread = 0.0, 0.0
+    for of_object in chance:
+        reached, mean, square = {(0, 0): 1.0}, 0.0, 0.0
+        for _ in range(4):  # all walks of four slots, with the clicks so far; a leaf is dark
+            after: dict[tuple[int, int], float] = {}
+            for (node, seen), weight in reached.items():
+                if node >= walk.n_states:
+                    after[node, seen] = after.get((node, seen), 0.0) + weight
+                    continue
+                for click, p in enumerate((1 - of_object[node], of_object[node])):
+                    key = int(walk.successors[node, click]), seen + click
+                    after[key] = after.get(key, 0.0) + weight * p
+            reached = after
+        for (_, seen), weight in reached.items():
+            mean, square = mean + weight * seen, square + weight * seen**2
+        clicks, spread = clicks + mean, spread + square - mean**2
+    assert abs(found["clicks_mean"] - clicks / objects) < 3 * np.sqrt(spread) / objects
+
+
+def run_on(link: socket.socket) -> None:
+    """Begin a run of one pattern without end, and return at its first clicks."""
+    decoder, nonce, heard = wire.FrameDecoder(), 7, set()
+    pattern = pack_command(PatternChunk(0, 0, 784, np.full(784, 100, np.uint16)))
+    slot = np.zeros(1, wire.SLOT_DTYPE)
+    plan = pack_command(PlanChunk(0, 1, 1, 0, 40_000, 90_000, 90_000, 1, 1, slot))
+    link.sendall(wire.encode_hello(nonce))
+    sent = False
+    while wire.MessageType.CLICKS not in heard:
+        for frame in decoder.feed(link.recv(1 << 16)):
+            heard.add(frame.type)
+            if frame.type == wire.MessageType.WELCOME and not sent:
+                sent, tick = True, wire.decode_welcome(frame.payload).facts["tick"]
+                arm = pack_command(Arm(tick + 5_000_000, 0, 60_000))
+                bodies = ((wire.Opcode.LOAD_PATTERN, pattern), (wire.Opcode.LOAD_PLAN, plan), (wire.Opcode.ARM, arm))
+                for number, (opcode, body) in enumerate(bodies, 1):
+                    link.sendall(wire.encode_command(number, opcode, body, nonce))
+                link.sendall(wire.encode_grant(wire.Grant(1 << 20, 0), nonce))
+
+
+@pytest.mark.parametrize(
+    ("what", "says"), [("alp", "DMD could not .*removed"), ("tagger", "time tagger does not answer|time tagger: no ")]
+)
+@pytest.mark.parametrize("when", ["before", "idle", "run"])
+def test_a_pulled_cable_ends_the_instrument_with_a_remedy(what: str, says: str, when: str, tmp_path: Path) -> None:
+    cable = tmp_path / "pulled"
+    if when == "before":
+        cable.write_text(what)
+        says = "DMD could not open: .*not been found" if what == "alp" else "No Time Tagger attached"
+    with serving("--profile", "alp-tagger", "--json", unplug=str(cable)) as (process, line):
+        if when != "before":
+            host, port = json.loads(line)["device"].rsplit(":", 2)[1:]
+            with socket.create_connection((host.strip("/"), int(port)), timeout=PATIENCE_S) as link:
+                if when == "run":
+                    run_on(link)
+                cable.write_text(what)
+                while link.recv(1 << 16):  # until the link ends
+                    pass
+        output, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 3, said
+    assert re.search(says, said), said
+    assert re.search("remedy: .*cable", said), said
+    if when == "before":
+        assert json.loads(line or output)["error"]["exit"] == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        ("--counter none --profile alp-tagger", 2, "counters called 'none'.*tagger"),
+        ("--counter tagger,click=3 --profile alp-tagger", 2, "'click=3' is no setting.*clicks=1"),
+        ("--counter tagger,synch=3 --profile alp-tagger --listen tcp:x", 2, "cannot listen on"),
+        ("--counter tagger --profile dmd-8bit-spad", 2, "exposure.min_us .*3400"),
+        ("--counter tagger --profile wdm-snspd", 2, "pixels"),
+    ],
+)
+def test_what_cannot_be_is_refused(words: str, code: int, says: str) -> None:
+    with serving(*words.split()) as (process, _):
+        _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == code, said
+    assert re.search(says, said, re.DOTALL), said
+
+
+def test_the_adapters_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    found = json_of(capsys, "instrument --list")
+    assert "alp" in found["projectors"]
+    assert "tagger" in found["counters"]
+
+
+def test_the_structures_are_those_of_the_header(tmp_path: Path) -> None:
+    kinds = {"fact": core.Fact, "limits": core.Limits, "pixels": core.Pixels, "light": core.Light}
+    kinds |= {"exposure": core.Exposure, "task": core.Task, "hardware": core._Functions}
+    places = [(name, field[0], kind) for name, kind in kinds.items() for field in kind._fields_]
+    lines = [f"(size_t)offsetof(struct pans_{name}, {field})," for name, field, _ in places]
+    sizes = [f"sizeof(struct pans_{name})," for name in kinds]
+    table = "\n".join(
+        ["#include <stdio.h>", '#include "pans_device.h"', "const size_t all[] = {", *lines, *sizes, "};"]
+    )
+    (tmp_path / "places.c").write_text(
+        table
+        + '\nint main(void) { for (size_t i = 0; i < sizeof all / sizeof *all; i++) printf("%zu ", all[i]); return 0; }'
+    )
+    program = tmp_path / "places"
+    subprocess.run([*COMPILER, f"-I{core.FOLDER}", tmp_path / "places.c", "-o", program], check=True)
+    told = list(map(int, subprocess.run([program], capture_output=True, text=True, check=True).stdout.split()))
+    assert told == [getattr(kind, field).offset for _, field, kind in places] + list(map(ctypes.sizeof, kinds.values()))
+
+
+@pytest.mark.parametrize("name", ["ALP4", "Swabian.TimeTagger"])
+def test_the_stand_in_is_called_like_the_library(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = pytest.importorskip(name, reason=f"{name} is not installed: its extra is alp or tagger")
+    for one in [one for one in sys.modules if one.split(".")[0] == name.split(".")[0]]:
+        monkeypatch.delitem(sys.modules, one)
+    monkeypatch.syspath_prepend(STAND_INS)
+    stand_in = importlib.import_module(name)
+    assert stand_in.__file__ != real.__file__
+    classes = {
+        key: one
+        for key, one in vars(stand_in).items()
+        if inspect.isclass(one) and one.__module__ == name and key[0] != "_"
+    }
+    for key, value in vars(stand_in).items():
+        if key.startswith("ALP_") and isinstance(value, int):
+            assert getattr(real, key) == value
+    for key, one in classes.items():
+        for method in [method for method in vars(one) if not method.startswith("_") or method == "__init__"]:
+            ours = inspect.signature(getattr(one, method))
+            theirs = inspect.signature(getattr(getattr(real, key), method))
+            assert list(ours.parameters) == list(theirs.parameters) or "args" in theirs.parameters, (key, method)
+    for key, one in vars(stand_in).items():
+        assert not inspect.isfunction(one) or callable(getattr(real, key))
