@@ -25,10 +25,11 @@ from pans.runtime.wire.messages import DARK_PATTERN
 from .core import Exposure, Hardware, Task
 
 SPIN_NS = 300_000  # a sleep ends late by about a tenth of this: the rest is waited for awake
-AHEAD_NS = 500_000  # how much earlier than needed an exposure is attended to
+AHEAD_NS = 300_000  # how much earlier than needed an exposure is attended to
 GAIN = 1 / 64  # of what the clock is found to be wrong by
 USUAL = 1.5  # times the shortest time of an answer: what took longer says little
 EARLIEST_NS = 100_000  # kept free below a projector's least delay: no exposure may begin before its tick
+LEARN = 16  # displays before any is started ahead of its tick
 RISE = 1 / 1024  # of the way from the least delay to that of an exposure
 CHECK_NS, CHECK_WITHIN_NS = (
     1_000_000_000,
@@ -128,7 +129,7 @@ class Apparatus(Hardware):
         self._refusal: Refused | None = None
         self._lit = self._exposing = False
         self._place: tuple[int, int] | None = None  # number and class of the object
-        self._delay_ns, self._checked_ns = math.inf, 0  # the least delay of the projector in this run
+        self._delay_ns, self._displays, self._checked_ns = math.inf, 0, 0  # the least delay of the projector, of so many
         shortest = profile.exposure.min_us / max(1, profile.projector.dwell_steps)
         if shortest < projector.shortest_us:
             what = f"{profile.name}: exposure.min_us / projector.dwell_steps is {shortest:g}"
@@ -144,7 +145,7 @@ class Apparatus(Hardware):
         return (self._early_ns() + AHEAD_NS) * self._hz // 10**9 if ahead else 0
 
     def _early_ns(self) -> int:
-        return max(0, round(self._delay_ns) - EARLIEST_NS) if self._delay_ns < math.inf else 0
+        return max(0, round(self._delay_ns) - EARLIEST_NS) if self._displays >= LEARN else 0
 
     def now(self) -> int:
         return self.clock.tick_at(time.perf_counter_ns())
@@ -166,7 +167,7 @@ class Apparatus(Hardware):
     def prepare(self, task: Task) -> None:
         if self._refusal is not None:
             raise self._refusal
-        self._place, self._delay_ns = None, math.inf
+        self._place = None
 
     def show(self, exposure: Exposure) -> None:
         self._lit = exposure.light.pattern != DARK_PATTERN
@@ -184,8 +185,8 @@ class Apparatus(Hardware):
             self._projector.start()
             self._began = self._counter.light_on()
             delay = self.clock.host_ns_at(self._began) - told
-            risen = self._delay_ns + RISE * (delay - self._delay_ns) if self._delay_ns < math.inf else math.inf
-            self._delay_ns = min(delay, risen)
+            risen = self._delay_ns + RISE * (delay - self._delay_ns) if self._displays else math.inf
+            self._delay_ns, self._displays = min(delay, risen), self._displays + 1
         return self._began
 
     def clicks(self) -> tuple[int, Any]:
