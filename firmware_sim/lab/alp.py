@@ -67,7 +67,6 @@ class Alp:
         self._control(ALP4.ALP_SEQ_REPEAT, 1)
 
     def load(self, number: int, levels: NDArray[np.uint16]) -> None:
-        """See `Projector`."""
         width = self._width or math.isqrt(len(levels))
         height, rest = divmod(len(levels), width)
         scale = min(self._size[0] // height, self._size[1] // width) if height else 0
@@ -95,15 +94,12 @@ class Alp:
         self._shown, self._timed = number, round(light_us)
 
     def start(self) -> None:
-        """See `Projector`."""
         self._told(lambda: self._device.Run(self._sequence, loop=False), "show a pattern")
 
     def dark(self) -> None:
-        """See `Projector`."""
         self._told(lambda: self._device.Halt(), "go dark")
 
     def check(self) -> None:
-        """See `Projector`."""
         self._inquire(self._library.ALP_DEV_STATE)
 
     def close(self) -> None:

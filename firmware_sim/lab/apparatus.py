@@ -1,7 +1,7 @@
 """A projector and a counter as one instrument: patterns, exposures and clicks, on a clock that the counter keeps right.
 
-A lab's own adapters are classes like `Projector`, `Counter` and `Objects`, made with the profile and settings by name; they join through
-the entry points `pans.projectors`, `pans.counters`, `pans.objects`, or are named as module:Class.
+A lab's own adapters are classes like `Projector`, `Counter` and `Objects`, made from the profile and settings by name, with `close` where
+that is needed. They join through the entry points `pans.projectors`, `pans.counters`, `pans.objects`, or are named as module:Class.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pans.runtime.offered import load_offered
 from pans.runtime.wire.commands import PatternChunk
 from pans.runtime.wire.messages import DARK_PATTERN
 
-from .core import Exposure, Hardware, Task
+from .core import Hardware
 
 SPIN_NS = 300_000  # a sleep ends late by about a tenth of this: the rest is waited for awake
 AHEAD_NS = 300_000  # how much earlier than needed an exposure is attended to
@@ -38,7 +38,7 @@ CHECK_NS, CHECK_WITHIN_NS = (
 
 
 class SteeredClock:
-    """The instrument's ticks on this computer's clock, moved towards another clock; `tick_hz` ticks per second."""
+    """The instrument's ticks by this computer's clock, moved towards another clock; `tick_hz` ticks per second."""
 
     def __init__(self, tick_hz: int) -> None:
         self._hz, self._offset, self._last, self._width_ns = tick_hz, 0.0, 0, math.inf
@@ -68,53 +68,45 @@ class SteeredClock:
 
 
 class Projector(Protocol):
-    """What shows patterns; all calls come from one thread. LinkError where it is gone."""
+    """What shows patterns; LinkError where it is gone.
+
+    `load` keeps a pattern, uint16 (pixels,) of the profile's levels, or raises `Refused`. `show` gets ready to show one for so long; `start`
+    shows it as soon as possible and returns at once. It goes dark by itself, or at once by `dark`. `check` tells whether it is there.
+    """
 
     shortest_us: float  # light that it can show
 
-    def load(self, number: int, levels: NDArray[np.uint16]) -> None:
-        """Keep a pattern, uint16 (pixels,) from 0 to the profile's levels - 1; `Refused` where it cannot be shown."""
+    def load(self, number: int, levels: NDArray[np.uint16]) -> None: ...
 
-    def show(self, number: int, light_us: float) -> None:
-        """Get ready to show a pattern for so long."""
+    def show(self, number: int, light_us: float) -> None: ...
 
-    def start(self) -> None:
-        """Show it, from as soon as possible; return at once. It goes dark by itself."""
+    def start(self) -> None: ...
 
-    def dark(self) -> None:
-        """Go dark at once."""
+    def dark(self) -> None: ...
 
-    def check(self) -> None:
-        """Raise LinkError where the projector is gone."""
-
-    def close(self) -> None: ...
+    def check(self) -> None: ...
 
 
 class Counter(Protocol):
-    """What counts clicks and knows when light was; ticks are those of its `clock`. LinkError where it is gone."""
+    """What counts clicks and knows when light was; ticks are those of its `clock`, which it steers. LinkError where it is gone.
+
+    `light_on` waits for the light that the projector was told of: the tick at which it came. `count` waits until `ticks` after `began` are
+    over; it returns the clicks in them, and for how many ticks the light was on, which should be `light_ticks` (0 of the dark).
+    """
 
     clock: SteeredClock
 
-    def light_on(self) -> int:
-        """Wait for the light that the projector has been told of; return the tick at which it came."""
+    def light_on(self) -> int: ...
 
-    def count(self, began: int, ticks: int, light_ticks: int) -> tuple[int, int]:
-        """Wait until tick began + ticks is over; return the clicks since `began`, and for how many ticks the light was on. Steer the clock.
+    def count(self, began: int, ticks: int, light_ticks: int) -> tuple[int, int]: ...
 
-        `light_ticks` is what it should be, 0 of the dark; it is returned where nothing else is known.
-        """
-
-    def check(self) -> None:
-        """Raise LinkError where the counter is gone; steer the clock."""
-
-    def close(self) -> None: ...
+    def check(self) -> None: ...
 
 
 class Objects(Protocol):
-    """What brings objects before the detector, where this computer does."""
+    """What brings objects before the detector: `place` brings one by its number since ARM, and returns its class or -1."""
 
-    def place(self, number: int) -> int:
-        """Bring object `number` since ARM, before its first exposure; return its class, -1 where it is not known."""
+    def place(self, number: int) -> int: ...
 
 
 class Apparatus(Hardware):
@@ -129,7 +121,8 @@ class Apparatus(Hardware):
         self._refusal: Refused | None = None
         self._lit = self._exposing = False
         self._place: tuple[int, int] | None = None  # number and class of the object
-        self._delay_ns, self._displays, self._checked_ns = math.inf, 0, 0  # the least delay of the projector, of so many
+        self._delay_ns, self._displays = math.inf, 0  # the least delay of the projector, of so many displays
+        self._checked_ns = 0
         shortest = profile.exposure.min_us / max(1, profile.projector.dwell_steps)
         if shortest < projector.shortest_us:
             what = f"{profile.name}: exposure.min_us / projector.dwell_steps is {shortest:g}"
@@ -164,19 +157,19 @@ class Apparatus(Hardware):
             except Refused as refusal:  # ARM tells it
                 self._refusal = refusal
 
-    def prepare(self, task: Task) -> None:
+    def prepare(self, task: Any) -> None:
         if self._refusal is not None:
             raise self._refusal
         self._place = None
 
-    def show(self, exposure: Exposure) -> None:
+    def show(self, exposure: Any) -> None:
         self._lit = exposure.light.pattern != DARK_PATTERN
         if self._objects is not None and (self._place is None or self._place[0] != exposure.object):
             self._place = exposure.object, self._objects.place(exposure.object)
         if self._lit:
             self._projector.show(exposure.light.pattern, exposure.light.ticks * 1e6 / self._hz)
 
-    def expose(self, exposure: Exposure) -> int:
+    def expose(self, exposure: Any) -> int:
         self._exposing, self._ticks, self._began = True, exposure.ticks, exposure.tick
         self._light = 0 if exposure.light.pattern == DARK_PATTERN else exposure.light.ticks
         if self._light:
@@ -228,9 +221,8 @@ def make_adapter(kind: str, text: str, profile: Profile) -> Any:
     name, *pairs = text.split(",")
     known = {point.name: point for point in entry_points(group=f"pans.{kind}")}
     if name not in known and ":" not in name:
-        raise UsageError(
-            f"there is none of the {kind} called {name!r}", remedy=f"known: {', '.join(known)}, or module:Class"
-        )
+        remedy = f"known: {', '.join(known)}, or module:Class"
+        raise UsageError(f"there is none of the {kind} called {name!r}", remedy=remedy)
     make = load_offered(known.get(name) or EntryPoint(name, name, f"pans.{kind}"))
     defaults = {one.name: one.default for one in list(inspect.signature(make).parameters.values())[1:]}
     settings = {}
@@ -239,8 +231,6 @@ def make_adapter(kind: str, text: str, profile: Profile) -> Any:
         try:
             settings[key] = type(defaults[key])(value)
         except (KeyError, ValueError) as error:
-            words = ", ".join(f"{one}={usual!r}" for one, usual in defaults.items())
-            raise UsageError(
-                f"{name}: {pair!r} is no setting", remedy=f"those with their usual values: {words}"
-            ) from error
+            words = "they are " + ", ".join(f"{one}={usual!r}" for one, usual in defaults.items())
+            raise UsageError(f"{name}: {pair!r} is no setting", remedy=words) from error
     return make(profile, **settings)

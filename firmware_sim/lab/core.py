@@ -10,25 +10,13 @@ import hashlib
 import importlib.util
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
-from ctypes import (
-    POINTER,
-    Structure,
-    c_bool,
-    c_char_p,
-    c_float,
-    c_int16,
-    c_size_t,
-    c_uint8,
-    c_uint16,
-    c_uint32,
-    c_uint64,
-    c_void_p,
-)
+from collections.abc import Callable, Iterator, Mapping
+from ctypes import c_char_p, c_size_t, c_uint64, c_void_p
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +31,7 @@ from pans.runtime.wire.commands import PatternChunk
 from pans.runtime.wire.messages import MAX_PAYLOAD_BYTES, AckStatus
 
 FOLDER = Path(__file__).parents[1] / "reference"
+WIDTHS = ("uint8", "uint16", "uint32", "uint64", "int16")
 FLAGS = ("-std=c99", "-O2")
 ROOM = 1 << 18  # bytes of output that are taken at once
 NEVER = (1 << 64) - 1
@@ -55,128 +44,75 @@ CALLS = {  # name: result, arguments after the device
 }
 
 
-class Fact(Structure):
-    """`struct pans_fact`."""
+def _structures(header: str) -> dict[str, Any]:
+    """Return the structures of a header as ctypes has them: what stands there is the only description of them."""
+    known: dict[str, Any] = {f"{name}_t": getattr(ctypes, f"c_{name}") for name in WIDTHS}
+    known["size_t"] = c_size_t
+    known |= {"bool": ctypes.c_bool, "float": ctypes.c_float, "pans_status": ctypes.c_int, "void": None}
 
-    _fields_ = (("key", c_char_p), ("text", c_char_p), ("number", c_uint64))
+    def kind_of(words: str) -> tuple[str, Any]:
+        found = re.fullmatch(r"(?:const )?(?:struct |enum )?(\w+) (\**)(\w+)(\[\d+\])?", words)
+        assert found is not None, words
+        base, stars, name, many = found.groups()
+        depth, kind = len(stars) + bool(many), known[base] if base != "char" else None
+        if depth and kind is None:
+            depth, kind = depth - 1, c_char_p if base == "char" else c_void_p
+        for _ in range(depth):
+            kind = ctypes.POINTER(kind)
+        return name, kind
 
+    def fields_of(declaration: str) -> Iterator[tuple[str, Any]]:
+        if called := re.fullmatch(r"(.+?)\(\*(\w+)\)\((.*)\)", declaration):
+            result, name, arguments = called.groups()
+            kinds = [kind_of(words)[1] for words in (f"{result.strip()} it", *arguments.split(", "))]
+            yield name, ctypes.CFUNCTYPE(*kinds)
+            return
+        first, *others = declaration.split(", ")
+        for words in (first, *(f"{first.rsplit(' ', 1)[0]} {one}" for one in others)):
+            yield kind_of(words)
 
-class Limits(Structure):
-    """`struct pans_limits`."""
-
-    _fields_ = (
-        ("tick_hz", c_uint64), ("parallel", c_bool), ("simulated", c_bool), ("channels", c_uint16), ("levels", c_uint32),
-        ("pattern_memory", c_uint16), ("pattern_pixels", c_uint32), ("pixel_memory", c_uint64), ("slot_memory", c_uint32),
-        ("automaton_states", c_uint16), ("dwell_steps", c_uint16), ("show_memory", c_uint16),
-        ("exposure_min_ticks", c_uint32), ("exposure_max_ticks", c_uint32), ("readout_ticks", c_uint32),
-        ("pattern_ticks", c_uint32), ("turn_ticks", c_uint32), ("buffer_messages", c_uint32), ("buffer_bytes", c_uint32),
-        ("block_bytes", c_uint32), ("payload_bytes", c_uint32), ("port_bytes", c_uint32), ("pending_exposures", c_uint16),
-        ("lead_ticks", c_uint32), ("gate_outputs", c_uint16), ("gate_pulses", c_uint16), ("epoch", c_uint64),
-        ("firmware", c_char_p), ("serial", c_char_p), ("facts", POINTER(Fact)), ("n_facts", c_size_t),
-    )  # fmt: skip
-
-
-class Pixels(Structure):
-    """`struct pans_pixels`."""
-
-    _fields_ = (
-        ("pattern", c_uint16), ("first", c_uint32), ("count", c_uint32), ("whole", c_uint32), ("bits", c_bool), ("data", c_void_p),
-    )  # fmt: skip
-
-
-class Light(Structure):
-    """`struct pans_light`: `pattern` is DARK_PATTERN without light, which is on for `ticks` from the start of the exposure."""
-
-    pattern: int
-    ticks: int
-    dwell: int
-    dwell_steps: int
-    _fields_ = (("pattern", c_uint16), ("dwell", c_uint16), ("dwell_steps", c_uint16), ("ticks", c_uint32))
+    plain = " ".join(re.sub(r"/\*.*?\*/", "", header, flags=re.DOTALL).split())
+    for name, body in re.findall(r"struct (pans_\w+) \{(.*?)\};", plain):
+        fields = [field for one in body.split(";") if one.strip() for field in fields_of(one.strip())]
+        known[name] = type(name, (ctypes.Structure,), {"_fields_": fields})
+    return known
 
 
-class Exposure(Structure):
-    """`struct pans_exposure`: when it shall begin, its number and object since ARM, its length, its light; state DARK_PATTERN: none."""
-
-    tick: int
-    number: int
-    object: int
-    ticks: int
-    state: int
-    light: Light
-    _fields_ = (
-        ("tick", c_uint64), ("number", c_uint64), ("object", c_uint32), ("ticks", c_uint32), ("state", c_uint16), ("light", Light),
-    )  # fmt: skip
+STRUCTURES = _structures((FOLDER / "pans_device.h").read_text())
+_HARDWARE = dict(STRUCTURES["pans_hardware"]._fields_)
 
 
-_STATE = ctypes.CFUNCTYPE(Light, c_void_p, c_uint16, POINTER(c_uint32))
-
-
-class Task(Structure):
-    """`struct pans_task`: the measurement that ARM begins."""
-
-    patterns_revision: int
-    states_revision: int
-    n_patterns: int
-    n_states: int
-    adaptive: bool
-    exposure_ticks: int
-    _fields_ = (
-        ("patterns_revision", c_uint32), ("states_revision", c_uint32), ("n_patterns", c_uint16), ("n_states", c_uint16),
-        ("adaptive", c_bool), ("exposure_ticks", c_uint32), ("state", _STATE), ("device", c_void_p),
-    )  # fmt: skip
-
-    def states(self) -> NDArray[np.int64]:
-        """Pattern, dwell, dwell steps and the two successors of every state, int64 (states, 5)."""
-        rows, after = np.zeros((self.n_states, 5), np.int64), (c_uint32 * 2)()
-        for number, row in enumerate(rows):
-            light = self.state(self.device, number, after)
-            row[:] = light.pattern, light.dwell, light.dwell_steps, *after
-        return rows
-
-
-_FUNCTIONS = {  # of `struct pans_hardware`, in its order: result, arguments after `self`
-    "now": (c_uint64, ()),
-    "read": (c_size_t, (c_void_p, c_size_t)),
-    "write": (c_size_t, (c_void_p, c_size_t)),
-    "store": (None, (POINTER(Pixels),)),
-    "prepare": (ctypes.c_int, (POINTER(Task), POINTER(c_char_p))),
-    "dark": (None, ()),
-    "mark": (c_bool, (c_uint32, POINTER(c_int16), POINTER(c_float))),
-    "hold": (None, (c_bool,)),
-    "show": (None, (POINTER(Exposure),)),
-    "expose": (c_uint64, (POINTER(Exposure),)),
-    "clicks": (c_uint64, (POINTER(c_uint8), c_uint16)),
-    "gate": (None, (c_uint16, c_bool, c_uint64)),
-}
-_KINDS = {name: ctypes.CFUNCTYPE(result, c_void_p, *words) for name, (result, words) in _FUNCTIONS.items()}
-
-
-class _Functions(Structure):
-    _fields_ = (("self", c_void_p), *_KINDS.items())
+def states_of(task: Any) -> NDArray[np.int64]:
+    """Pattern, dwell, dwell steps and the two successors of every state of a `pans_task`, int64 (states, 5)."""
+    rows, after = np.zeros((task.n_states, 5), np.int64), (ctypes.c_uint32 * 2)()
+    for number, row in enumerate(rows):
+        light = task.state(task.device, number, after)
+        row[:] = light.pattern, light.dwell, light.dwell_steps, *after
+    return rows
 
 
 class Hardware:
-    """What the C core asks of the instrument; ticks are those of `now`, and nothing waits for the host.
+    """What the C core asks of the instrument; exposures and tasks are structures of pans_device.h, ticks those of `now`.
 
-    An exception ends the run: the instrument is told to go dark, and `Core.step` raises it.
+    Nothing waits for the host. An exception ends the run: the instrument is told to go dark, and `Core.step` raises it.
     """
 
-    lead_ticks = 0  # by how much `expose` and `clicks` are called ahead of their tick
+    lead_ticks = 0  # by how much `expose` is called ahead of its tick
 
     def now(self) -> int:
         """Return the tick; it never goes back."""
-        raise NotImplementedError
+        return 0
 
     def store(self, chunk: PatternChunk | None) -> None:
         """Take pixels of a pattern, in order; None: forget all."""
 
-    def prepare(self, task: Task) -> None:
+    def prepare(self, task: Any) -> None:
         """Get ready for a measurement, or raise `Refused`."""
 
-    def show(self, exposure: Exposure) -> None:
-        """Get ready for the next exposure: called as soon as it is known, and again when the host names its pattern."""
+    def show(self, exposure: Any) -> None:
+        """Get ready for the next exposure, as soon as it is known."""
 
-    def expose(self, exposure: Exposure) -> int:
+    def expose(self, exposure: Any) -> int:
         """Wait for its tick, let there be light; return the tick at which it began."""
         raise NotImplementedError
 
@@ -192,7 +128,6 @@ class Hardware:
 
     def mark(self, number: int) -> tuple[int, float] | None:
         """Return class (-1: unknown) and expected photoelectrons (NaN: unknown) of an object, None where neither is known."""
-        return None
 
     def idle(self, ticks: int) -> bool:
         """Do a piece of work while nothing is due for so long; whether there was any."""
@@ -204,7 +139,7 @@ class Core:
 
     session = 0  # not known here
 
-    def __init__(self, limits: Limits, hardware: Hardware, tick: int, library: Path | None = None) -> None:
+    def __init__(self, limits: Any, hardware: Hardware, tick: int, library: Path | None = None) -> None:
         self.tick = tick
         self._hardware, self._limits = hardware, limits
         self._error: BaseException | None = None
@@ -217,30 +152,29 @@ class Core:
         self._library.pans_start.restype = c_void_p
         needed = self._library.pans_memory_bytes(ctypes.byref(limits))
         self._memory = (c_uint64 * (needed // 8 + 1))()
-        self._functions = _Functions(None, *(self._kind_of(name) for name in _KINDS))
+        self._functions = STRUCTURES["pans_hardware"](None, *map(self._kind_of, list(_HARDWARE)[1:]))
         blocks = (ctypes.byref(one) for one in (limits, self._functions, self._memory))
         start = *blocks, c_size_t(needed), c_uint64(tick)
         self._device = c_void_p(self._library.pans_start(*start) if needed else None)
         if not self._device:
-            raise ConfigError(
-                "the profile asks for an instrument that the C core cannot be", remedy="see pans_device.h"
-            )
+            raise ConfigError("the C core cannot be what the profile says", remedy="see pans_limits in pans_device.h")
 
     def step(self, tick: int, data: bytes) -> bytes:
         """Advance to `tick`, digest `data` as having arrived then, and return what has been sent by then.
 
-        With hardware that leads, and nothing to send, the next edge follows where it is near: it waits for its own tick.
+        Where nothing is to be sent and an edge is near, it follows: hardware waits for the tick itself.
         """
-        sent, lead = b"", self._hardware.lead_ticks
+        sent = b""
         # The line takes all: what is due is taken at once, so that nothing waits in the buffer that the window lets out.
         while (due := self._call("pans_next_tick")) <= tick:
             self._call("pans_step", due, b"", 0)
             sent += self._take(due)
         self._call("pans_step", tick, data, len(data))
-        sent += self._take(self._hardware.now() if lead else tick)
-        if lead and not sent and self._call("pans_edge_tick") - lead <= tick:
+        tick = max(tick, self._hardware.now())  # later than it was, where an edge took time
+        sent += self._take(tick)
+        if not sent and self._call("pans_edge_tick") - self._hardware.lead_ticks <= tick:
             self._call("pans_edge")
-            tick = self._hardware.now()
+            tick = max(tick, self._hardware.now())
             self._call("pans_step", tick, b"", 0)
             sent = self._take(tick)
         self.tick = tick
@@ -257,9 +191,9 @@ class Core:
         due = self.next_event_tick()
         return self._hardware.idle(NEVER if due is None else due - self._hardware.now())
 
-    def _take(self, tick: int, room: int = ROOM) -> bytes:
+    def _take(self, tick: int) -> bytes:
         sent = b""
-        while count := self._call("pans_output", tick, self._out, room):
+        while count := self._call("pans_output", tick, self._out, ROOM):
             sent += self._out.raw[:count]
         return sent
 
@@ -273,12 +207,8 @@ class Core:
     # -- called by the library
 
     def _kind_of(self, name: str) -> Any:
-        kind, result = _KINDS[name], _FUNCTIONS[name][0]
-        if name in (
-            "read",
-            "write",
-            "hold",
-        ):  # not called: the bytes are `step`'s, and no interrupt needs to be kept away
+        kind, result = _HARDWARE[name], _HARDWARE[name]._restype_
+        if name in ("read", "write", "hold"):  # the bytes are `step`'s, and no interrupt is to be kept away
             return kind()
         own: Callable[..., Any] = getattr(self, f"_{name}", None) or getattr(self._hardware, name)
 
@@ -327,15 +257,14 @@ class Core:
         return tick
 
 
-def limits_of(profile: Profile, facts: Mapping[str, str | int], *, firmware: str, serial: str, **words: Any) -> Limits:
+def limits_of(profile: Profile, facts: Mapping[str, str | int], *, firmware: str, serial: str, **words: Any) -> Any:
     """Return the limits of an instrument with this profile, and more keys of WELCOME; `words` are fields that are not the profile's."""
     hz, projector, exposure = profile.clock.tick_hz, profile.projector, profile.exposure
     parallel = profile.mode == "parallel"
     buffer = words.setdefault("buffer_messages", 256)
-    known = [
-        Fact(key.encode(), *((of.encode(), 0) if isinstance(of, str) else (None, of))) for key, of in facts.items()
-    ]
-    return Limits(
+    fact, words_of = STRUCTURES["pans_fact"], lambda of: (of.encode(), 0) if isinstance(of, str) else (None, of)
+    known = [fact(key.encode(), *words_of(of)) for key, of in facts.items()]
+    return STRUCTURES["pans_limits"](
         tick_hz=hz,
         parallel=parallel,
         channels=profile.detector.channels,
@@ -360,7 +289,7 @@ def limits_of(profile: Profile, facts: Mapping[str, str | int], *, firmware: str
         pending_exposures=2,
         firmware=firmware.encode(),
         serial=serial.encode(),
-        facts=(Fact * len(known))(*known),
+        facts=(fact * len(known))(*known),
         n_facts=len(known),
         **words,
     )

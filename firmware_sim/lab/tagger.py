@@ -56,12 +56,10 @@ class Tagger:
         self.clock.steer(*min(probes, key=lambda one: one[2] - one[0]))
 
     def light_on(self) -> int:
-        """See `Counter`."""
         self._rose = self._edge(self._synch, self._counted, "begin", self._read)
         return self._tick(self._rose)
 
     def count(self, began: int, ticks: int, light_ticks: int) -> tuple[int, int]:
-        """See `Counter`."""
         start = self._rose if light_ticks else -(-began * PS // self._hz)
         end = start + ticks * PS // self._hz
         light = light_ticks
@@ -76,7 +74,6 @@ class Tagger:
         return int(here.sum()), light
 
     def check(self) -> None:
-        """See `Counter`."""
         self._steer()
         self._times, self._channels = self._times[:0], self._channels[:0]
         self._counted = self._position

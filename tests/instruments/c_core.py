@@ -12,7 +12,7 @@ from pans.firmware_sim.device import readings
 from pans.firmware_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES
 from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, PatternMemory
 from pans.firmware_sim.device.view import View
-from pans.firmware_sim.lab.core import Core, Exposure, Hardware, Task, find_compiler, limits_of
+from pans.firmware_sim.lab.core import Core, Hardware, find_compiler, limits_of, states_of
 from pans.firmware_sim.program import Program, States
 from pans.firmware_sim.scene.detector import sample_clicks
 from pans.firmware_sim.scene.detector_model import detector_model, first_click_probability
@@ -43,7 +43,7 @@ class SimulatedHardware(Hardware):
         else:
             self._patterns.load(chunk)
 
-    def prepare(self, task: Task) -> None:
+    def prepare(self, task: Any) -> None:
         view, ticks, n_patterns = self._view, task.exposure_ticks, task.n_patterns
         shown = np.full(1, ADAPTIVE_PATTERN if task.adaptive else 0, np.uint16)
         mode, one = MODES[view.profile.mode], np.zeros(1, np.int64)
@@ -52,10 +52,10 @@ class SimulatedHardware(Hardware):
         if self._key != key:
             self._key, self._light = key, view.tabulate(program, self._patterns.stack(n_patterns))
         self._model, self._channels = detector_model(view.profile, view.exposure_us(program)), program.channels
-        rows = task.states()
+        rows = states_of(task)
         self._states = States(rows[:, 0], rows[:, 1] / np.maximum(rows[:, 2], 1), rows[:, 3:])
 
-    def expose(self, exposure: Exposure) -> int:
+    def expose(self, exposure: Any) -> int:
         if exposure.number == 0:
             self._before = np.zeros(self._channels, np.uint8)
         self._draw += 1
