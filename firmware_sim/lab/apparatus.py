@@ -28,7 +28,7 @@ SPIN_NS = 300_000  # a sleep ends late by about a tenth of this: the rest is wai
 AHEAD_NS = 300_000  # how much earlier than needed an exposure is attended to
 GAIN = 1 / 64  # of what the clock is found to be wrong by
 USUAL = 1.5  # times the shortest time of an answer: what took longer says little
-EARLIEST_NS = 100_000  # kept free below a projector's least delay: no exposure may begin before its tick
+EARLIEST_NS = 200_000  # kept free below a projector's least delay: no exposure may begin before its tick
 LEARN = 16  # displays before any is started ahead of its tick
 RISE = 1 / 1024  # of the way from the least delay to that of an exposure
 CHECK_NS, CHECK_WITHIN_NS = (
@@ -70,8 +70,8 @@ class SteeredClock:
 class Projector(Protocol):
     """What shows patterns; LinkError where it is gone.
 
-    `load` keeps a pattern, uint16 (pixels,) of the profile's levels, or raises `Refused`. `show` gets ready to show one for so long; `start`
-    shows it as soon as possible and returns at once. It goes dark by itself, or at once by `dark`. `check` tells whether it is there.
+    `load` keeps a pattern, uint16 (pixels,) of the profile's levels, or raises `Refused`. `show` gets ready to show one for so long;
+    `start` shows it as soon as it can and returns at once. It goes dark by itself, or at once by `dark`. `check` tells whether it is there.
     """
 
     shortest_us: float  # light that it can show

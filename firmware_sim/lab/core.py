@@ -262,8 +262,9 @@ def limits_of(profile: Profile, facts: Mapping[str, str | int], *, firmware: str
     hz, projector, exposure = profile.clock.tick_hz, profile.projector, profile.exposure
     parallel = profile.mode == "parallel"
     buffer = words.setdefault("buffer_messages", 256)
-    fact, words_of = STRUCTURES["pans_fact"], lambda of: (of.encode(), 0) if isinstance(of, str) else (None, of)
-    known = [fact(key.encode(), *words_of(of)) for key, of in facts.items()]
+    fact = STRUCTURES["pans_fact"]
+    known = [fact(key.encode(), of.encode() if isinstance(of, str) else None, of if isinstance(of, int) else 0)
+             for key, of in facts.items()]  # fmt: skip
     return STRUCTURES["pans_limits"](
         tick_hz=hz,
         parallel=parallel,
