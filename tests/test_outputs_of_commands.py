@@ -42,7 +42,7 @@ COMMANDS = {  # words, what is there already, what else is read
     "bench": ("bench ingest --quick --plot OUT", "OUT", None),
     "tune": (f"tune b.pans --device {DEVICE} -o OUT", "OUT", "b.pans"),
 }
-WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "completion", "runs"}
+WRITES_NO_FILE = {"verify", "info", "simulate", "instrument", "devices", "doctor", "baseline", "completion", "runs"}
 CHECKED_ELSEWHERE = {"demo", "sweep", "conform"}  # tests/runtime/commands/test_run_files.py, below; conform writes none
 
 
