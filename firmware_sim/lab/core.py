@@ -194,7 +194,7 @@ class Core:
     def _take(self, tick: int) -> bytes:
         sent = b""
         while count := self._call("pans_output", tick, self._out, ROOM):
-            sent += self._out.raw[:count]
+            sent += ctypes.string_at(self._out, count)
         return sent
 
     def _call(self, name: str, *words: Any) -> Any:

@@ -84,7 +84,7 @@ class SlowLine(CDevice):
             at = max(self._free_tick, self.tick)
             count = self._call("pans_output", at, self._out, PIECE)
             self.tick = at
-            sent += self._out.raw[:count]
+            sent += bytes(memoryview(self._out)[:count])
             if count:
                 self._free_tick = at + max(1, round(count * self.ticks_per_byte))
             elif (due := super().next_event_tick()) is not None and due <= tick:
