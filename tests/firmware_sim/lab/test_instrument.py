@@ -39,7 +39,10 @@ BINARY = {
     "min_us = 3500.0": "min_us = 100.0",
     "peak_photoelectrons_hz = 3000.0": "peak_photoelectrons_hz = 2000.0",
 }
-PATIENT = {"decision_deadline_us = 20_000.0": "decision_deadline_us = 1e6"}  # the machine that tests may be busy
+PATIENT = {  # the machine may be busy
+    "decision_deadline_us = 20_000.0": "decision_deadline_us = 1e6",
+    "host_turn_us = 8000.0": "host_turn_us = 30_000.0",
+}
 pytestmark = needs_compiler
 
 
@@ -98,7 +101,8 @@ def test_the_shipped_bundle_passes_and_is_as_right_as_expected(
 def test_an_automaton_walks_by_the_clicks_of_the_table(
     drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bundle, objects, exposure_us = small_automaton_bundle(exposure_us=500.0), 60, 2500.0
+    bundle, exposure_us = small_automaton_bundle(exposure_us=500.0), 2500.0
+    objects = 80 if drive == "device" else 30
     write_bundle(bundle, tmp_path / "small.pans")
     profile = profile_with(tmp_path / "binary.toml", BINARY | PATIENT)
     with serving("--profile", str(profile), pixels=2, peak_hz=2000.0) as (_, url):
