@@ -12,7 +12,7 @@ from commands import fixed_run
 
 from pans.runtime.cli import main
 
-BLOCKED = ("torch", "onnx", "PIL", "optuna", "matplotlib", "sklearn", "h5py", "pyarrow", "prometheus_client")
+BLOCKED = ("torch", "onnx", "PIL", "optuna", "matplotlib", "sklearn", "h5py", "pyarrow", "prometheus_client", "ALP4")
 NEEDS = {  # command line: what it needs, and the extra that has it
     "train s.npz --features 2 -o new.pans": ("torch", "train"),
     "train s.npz --encoder automaton --photons 3 -o new.pans": ("torch", "train"),
@@ -21,6 +21,7 @@ NEEDS = {  # command line: what it needs, and the extra that has it
     "reproduce alpha --collect --cache new -o out": ("torch", "train"),
     "export r.pansrec --format photon-hdf5 -o new.h5": ("h5py", "export"),
     "run fashion10 --device sim:ideal?pace=fast --decisions 3 --metrics 0 --out new": ("prometheus-client", "metrics"),
+    "instrument --projector alp --counter tagger --profile alp-tagger": ("ALP4", "alp"),
     "bench decide --quick --plot new.png": ("matplotlib", "plot"),
     "export r.pansrec --format parquet -o new.parquet": ("pyarrow", "parquet"),
     "evaluate fashion10 --task s.npz --objects 2 --pictures new": ("matplotlib", "plot"),

@@ -31,7 +31,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from pans.firmware_sim.lab.apparatus import Apparatus, adapter_names, make_adapter
+    from pans.firmware_sim.lab import Apparatus, adapter_names, make_adapter
     from pans.firmware_sim.lab.core import Core, build_library, limits_of
 
     if args.list:

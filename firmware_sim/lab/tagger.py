@@ -15,7 +15,7 @@ import numpy as np
 from pans.runtime.errors import LinkError
 from pans.runtime.instrument.profile import Profile
 
-from .apparatus import SteeredClock
+from . import SteeredClock
 
 PS = 10**12
 MAX_TAGS = 1 << 20  # between two readings

@@ -14,8 +14,8 @@ from pans.runtime.offered import load_offered
 
 from .command import Command
 
-EXTRAS = {"torch": "train", "onnx": "train", "optuna": "sweep", "matplotlib": "plot", "h5py": "export", "ALP4": "alp"}
-EXTRAS["Swabian"] = "tagger"
+EXTRAS = {"torch": "train", "onnx": "train", "optuna": "sweep", "matplotlib": "plot", "h5py": "export"}
+EXTRAS |= {"ALP4": "alp", "Swabian": "tagger"}
 GROUPS = {
     "Run and look": ("demo", "run", "replay", "verify", "info", "report", "compare", "export", "runs", "service"),
     "Instruments": ("profile", "calibrate", "refit", "tune", "simulate", "instrument", "devices", "doctor"),
