@@ -10,6 +10,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from commands import Pans
 from tree import ROOT
 
 # these packages need the extra `train`
@@ -54,6 +55,11 @@ def _runs_uncompiled(item: pytest.Item) -> bool:
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     return Path(os.environ["PANS_DATA"])
+
+
+@pytest.fixture
+def pans(capsys: pytest.CaptureFixture[str]) -> Pans:
+    return Pans(capsys)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import fixed_run
+from commands import Pans, fixed_run
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import main
@@ -69,36 +69,35 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() if path.is_file() else b"" for path in sorted(folder.rglob("*"))}
 
 
-def refused(words: list[str], folder: Path, why: str, capsys: pytest.CaptureFixture[str]) -> None:
+def refused(words: list[str], folder: Path, why: str, pans: Pans) -> None:
     """Run a command that must be refused for `why`, with a remedy, and leave the folder as it is."""
     if words[0] in ("train", "reproduce", "evaluate"):
         pytest.importorskip("torch", reason="needs the train extra")
     if words[0] in ("bench", "evaluate"):
         pytest.importorskip("matplotlib", reason="needs the plot extra")
     before = contents(folder)
-    capsys.readouterr()
-    assert main(words) == 2
-    said = capsys.readouterr().err
+    pans.said()
+    said = pans.refuses(*words)
     assert why in said
     assert "remedy: " in said
     assert contents(folder) == before
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_no_command_replaces_a_file(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_command_replaces_a_file(name: str, folder: Path, pans: Pans) -> None:
     words, there, _ = COMMANDS[name]
     Path(there).parent.mkdir(exist_ok=True)
     Path(there).write_bytes(b"precious")
     why = "interrupted" if "checkpoint" in name else "exists already"
-    refused(words.split(), folder, why, capsys)
+    refused(words.split(), folder, why, pans)
 
 
 @pytest.mark.parametrize("name", [name for name, (_, _, read) in COMMANDS.items() if read])
-def test_no_command_writes_into_its_input(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_command_writes_into_its_input(name: str, folder: Path, pans: Pans) -> None:
     words, _, read = COMMANDS[name]
     assert read is not None
     Path("OUT").symlink_to(read)
-    refused([*words.split(), "--force"], folder, "is the input", capsys)
+    refused([*words.split(), "--force"], folder, "is the input", pans)
 
 
 def test_every_command_is_in_one_of_these_lists() -> None:
@@ -106,7 +105,7 @@ def test_every_command_is_in_one_of_these_lists() -> None:
     assert known == {point.name for point in entry_points(group="pans.commands")}
 
 
-def test_a_sweep_appends_to_no_foreign_file(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sweep_appends_to_no_foreign_file(folder: Path, pans: Pans) -> None:
     pytest.importorskip("optuna", reason="needs the sweep extra")
     from pans.runtime.errors import UsageError
     from pans.trainer.commands.sweep import open_storage
@@ -120,7 +119,7 @@ def test_a_sweep_appends_to_no_foreign_file(folder: Path, capsys: pytest.Capture
     open_storage("new-journal")
 
 
-def test_force_replaces(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_force_replaces(folder: Path, pans: Pans) -> None:
     for words, there in ((COMMANDS["bundle"][0], "OUT"), (COMMANDS["export csv"][0], "DIR/clicks.csv")):
         Path(there).parent.mkdir(exist_ok=True)
         Path(there).write_bytes(b"old")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import fixed_run
+from commands import Pans, fixed_run
 
 from pans.runtime import logs
 from pans.runtime.cli import main, warn
@@ -26,16 +26,14 @@ def asked(path: Path | None, form: str | None = None, rotate_mb: float | None = 
     return Namespace(log_file=path, log_format=form, log_rotate_mb=rotate_mb)
 
 
-def test_a_line_has_time_level_and_facts_as_text_or_as_one_object(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_line_has_time_level_and_facts_as_text_or_as_one_object(tmp_path: Path, pans: Pans) -> None:
     with logging_of(asked(tmp_path / "pans.log")):
         warn("arming\nnow")
         log_event("gap", {"lost": 3, "why": "a\nb\x1b[2J"})
     lines = (tmp_path / "pans.log").read_text().splitlines()
     texts = [line.split(" ", 1)[1] for line in lines]
     assert texts == ["WARNING arming\\nnow", "INFO gap lost=3 why=a\\nb\\x1b[2J"]
-    assert capsys.readouterr().err == "pans: warning: arming\nnow\n"
+    assert pans.said().err == "pans: warning: arming\nnow\n"
     with logging_of(asked(tmp_path / "json.log", "json")):
         log_event("gap", {"lost": np.int64(3), "rows": np.arange(2)}, logging.ERROR)
     line = json.loads(text := (tmp_path / "json.log").read_text())
@@ -82,7 +80,7 @@ def test_a_fault_that_repeats_does_not_fill_the_log(tmp_path: Path, monkeypatch:
 
 
 def test_a_full_queue_and_a_full_disk_cost_lines_and_say_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans
 ) -> None:
     monkeypatch.setattr(logs, "QUEUE_LINES", 5)
     emit = logs._FileHandler.emit
@@ -97,7 +95,7 @@ def test_a_full_queue_and_a_full_disk_cost_lines_and_say_so(
             LOGGER.info("line %d", number)
     written = len((tmp_path / "pans.log").read_text().splitlines())
     assert written < 20
-    assert f"pans: {20 - written} lines are missing" in capsys.readouterr().err
+    assert f"pans: {20 - written} lines are missing" in pans.said().err
 
     def full(handler: Any, record: logging.LogRecord) -> None:
         raise OSError("No space left on device")
@@ -106,7 +104,7 @@ def test_a_full_queue_and_a_full_disk_cost_lines_and_say_so(
     monkeypatch.setattr(logs._FileHandler, "shouldRollover", full)
     with logging_of(asked(tmp_path / "full.log")):
         LOGGER.info("a line")
-    assert "pans: 1 lines are missing" in capsys.readouterr().err
+    assert "pans: 1 lines are missing" in pans.said().err
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs the journal's environment")
@@ -132,7 +130,7 @@ def test_stderr_has_priorities_where_it_is_the_journal(tmp_path: Path) -> None:
         assert (tmp_path / "stderr").read_text() == wanted
 
 
-def test_a_run_logs_its_words_its_events_and_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_logs_its_words_its_events_and_its_end(tmp_path: Path, pans: Pans) -> None:
     log = tmp_path / "run.log"
     words = [*fixed_run(5), "--out", str(tmp_path / "out"), "--log-file", str(log), "--log-format", "json"]
     code = main(words)
@@ -142,6 +140,6 @@ def test_a_run_logs_its_words_its_events_and_its_end(tmp_path: Path, capsys: pyt
     assert "session" in [line["message"] for line in found]
     assert main(["verify", str(tmp_path / "none"), "--log-file", str(tmp_path / "e.log")]) == 2
     assert main(["info", str(tmp_path / "none"), "--log-file", str(tmp_path / "e.log")]) == 2
-    capsys.readouterr()
+    pans.said()
     lines = (tmp_path / "e.log").read_text().splitlines()
     assert "ERROR ends by an error: UsageError: " in lines[-1]

@@ -23,6 +23,22 @@ def json_of(capsys: pytest.CaptureFixture[str], command: str, *words: Any, code:
     return found
 
 
+class Pans:
+    """The fixture `pans`: called with a command's words it is `json_of`."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+        self.said = capsys.readouterr
+
+    def __call__(self, command: Any, *words: Any, code: int | None = 0) -> dict[str, Any]:
+        return json_of(self._capsys, str(command), *words, code=code)
+
+    def refuses(self, *words: Any, code: int = 2) -> str:
+        """Run `pans` with `words`, which must end with `code`; return what it prints to standard error."""
+        assert main([*map(str, words)]) == code
+        return self.said().err
+
+
 def page_of(path: Path, tmp_path: Path) -> str:
     assert main(["report", str(path), "-o", str(tmp_path / "page.html")]) == 0
     assert [entry.name for entry in tmp_path.iterdir() if "html" in entry.name] == ["page.html"]

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import fixed_run
+from commands import Pans, fixed_run
 
 from pans.runtime.cli import main
 from pans.runtime.cli import reading_bar as module
@@ -56,9 +56,7 @@ def test_of_two_passes_one_is_shown_until_nothing_is_heard_of_it(monkeypatch: py
     assert "1.pansrec" in screen.getvalue()
 
 
-def test_a_replay_shows_how_far_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_replay_shows_how_far_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans) -> None:
     screen, path = terminal(monkeypatch)[0], tmp_path / "run.pansrec"
     assert main([*fixed_run(3), "--record", str(path), "--quiet"]) == 0
     monkeypatch.setattr(module, "SHOWN_AFTER_S", 0.0)
@@ -67,4 +65,4 @@ def test_a_replay_shows_how_far_it_is(
     assert "reading" not in screen.getvalue()
     assert main(["replay", str(path)]) == 0
     assert "reading run.pansrec" in screen.getvalue()
-    assert "identical" in capsys.readouterr().out
+    assert "identical" in pans.said().out

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Pans
 from mutated_sessions import Evidence, MutatedLink, Mutation
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_TIMING, main
@@ -21,7 +21,7 @@ URL = "sim:ideal?scene=uniform&pace=fast&seed=1"
 
 
 def test_contradictions_are_a_fault_and_stand_in_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans
 ) -> None:
     opened = base.open_link
     for module in (one_run, reconnect, gates):  # imported before: else they would keep the false one for good
@@ -29,8 +29,9 @@ def test_contradictions_are_a_fault_and_stand_in_the_file(
     lie = Mutation("CLICKS", "object_index", by=17, most=3)
     monkeypatch.setattr(base, "open_link", lambda url: MutatedLink(opened(url), (lie,), Evidence(1 << 40, 2, 10**6)))
     out = tmp_path / "c.json"
-    assert main(["calibrate", "--device", URL, "--seconds", "0.5", "-o", str(out), "--json"]) == EXIT_TIMING
-    assert json.loads(capsys.readouterr().out)["contradictions"] == {"object": 6}  # in each of the two stages
+    assert pans("calibrate", "--device", URL, "--seconds", "0.5", "-o", out, code=EXIT_TIMING)["contradictions"] == {
+        "object": 6
+    }  # in each of the two stages
     (doubt,) = find_warnings(load_calibration(out), now_utc())
     assert "contradicted each other" in doubt
 
@@ -38,17 +39,15 @@ def test_contradictions_are_a_fault_and_stand_in_the_file(
 FOUR = "sim:dmd-four-snspd?scene=uniform&pace=fast&seed=3"
 
 
-def calibrated(out: Path, url: str, capsys: pytest.CaptureFixture[str], code: int = 0) -> str:
+def calibrated(out: Path, url: str, pans: Pans, code: int = 0) -> str:
     """What the command prints of `url`."""
     assert main(["calibrate", "--device", url, "--seconds", "2", "-o", str(out)]) == code
-    return capsys.readouterr().out
+    return pans.said().out
 
 
-def test_detectors_that_are_read_at_once_are_measured_together(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_detectors_that_are_read_at_once_are_measured_together(tmp_path: Path, pans: Pans) -> None:
     profile, out = load_profile("dmd-four-snspd"), tmp_path / "four.json"
-    said = calibrated(out, f"{FOUR}&changes=hot:at_s=0:channel=2:rate_hz=2000", capsys)
+    said = calibrated(out, f"{FOUR}&changes=hot:at_s=0:channel=2:rate_hz=2000", pans)
     calibration = load_calibration(out)
     low, high = calibration.values["photons_per_level_ci"]
     truth = profile.projector.peak_photoelectrons_hz * calibration.values["exposure_us"] * 1e-6
@@ -65,11 +64,9 @@ def test_detectors_that_are_read_at_once_are_measured_together(
 
 
 @pytest.mark.parametrize("url", [FOUR, "sim:wdm-snspd?scene=uniform&pace=fast&seed=3"], ids=["at once", "parallel"])
-def test_a_silent_detector_is_named_and_leaves_the_photon_level_alone(
-    url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_silent_detector_is_named_and_leaves_the_photon_level_alone(url: str, tmp_path: Path, pans: Pans) -> None:
     out = tmp_path / "dead.json"
-    said = calibrated(out, f"{url}&changes=dead:at_s=0:channel=1", capsys, EXIT_ALERT)
+    said = calibrated(out, f"{url}&changes=dead:at_s=0:channel=1", pans, EXIT_ALERT)
     assert "no click in light: channel 1" in said
     calibration = load_calibration(out)
     assert calibration.values["silent_channels"] == [1]
@@ -83,12 +80,10 @@ def test_a_silent_detector_is_named_and_leaves_the_photon_level_alone(
             save_calibration(tmp_path / "wrong.json", {**values, "silent_channels": wrong})
 
 
-def test_where_the_device_follows_no_automaton_the_first_detector_is_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_the_device_follows_no_automaton_the_first_detector_is_measured(tmp_path: Path, pans: Pans) -> None:
     shipped = Path(__file__).parents[3] / "hw_profiles" / "dmd-four-snspd.toml"
     text = shipped.read_text(encoding="utf-8").replace("automaton_states = 16_383", "automaton_states = 14")
     (tmp_path / "own.toml").write_text(text, encoding="utf-8")
     out = tmp_path / "one.json"
-    calibrated(out, f"sim:{tmp_path / 'own.toml'}?scene=uniform&pace=fast&seed=3", capsys)
+    calibrated(out, f"sim:{tmp_path / 'own.toml'}?scene=uniform&pace=fast&seed=3", pans)
     assert len(load_calibration(out).values["channels"]) == 1

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from commands import Pans
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
@@ -20,18 +21,15 @@ from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.link.base import TracedLink
 
 
-def test_doctor_on_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--json"]) == 0
-    findings = json.loads(capsys.readouterr().out)["findings"]
+def test_doctor_on_this_machine(pans: Pans) -> None:
+    findings = pans("doctor")["findings"]
     assert {"python", "numba", "onnxruntime", "libusb", "numba cache"} <= {finding["check"] for finding in findings}
     assert all(finding["ok"] or finding["remedy"] for finding in findings)
     assert main(["doctor"]) == 0
-    assert "ready to run" in capsys.readouterr().out
+    assert "ready to run" in pans.said().out
 
 
-def test_what_is_needed_and_missing_is_an_alert(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_needed_and_missing_is_an_alert(monkeypatch: pytest.MonkeyPatch, pans: Pans) -> None:
     def check_broken() -> Iterator[Finding]:
         raise ImportError("no module named numba")
         yield
@@ -45,17 +43,17 @@ def test_what_is_needed_and_missing_is_an_alert(
     assert all(finding.remedy for finding in findings if not finding.ok)
     monkeypatch.setattr("pans.runtime.commands.doctor.examine", lambda: findings)
     assert main(["doctor"]) == 1
-    assert "cannot run: broken" in capsys.readouterr().out
+    assert "cannot run: broken" in pans.said().out
 
 
-def test_the_udev_rule_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_udev_rule_is_printed(pans: Pans) -> None:
     assert main(["doctor", "--udev"]) == 0
-    assert capsys.readouterr().out.strip() == (SHIPPED / doctor.RULE).read_text().strip()
+    assert pans.said().out.strip() == (SHIPPED / doctor.RULE).read_text().strip()
     assert int(doctor.RULE.partition("-")[0]) < 73  # later, systemd has already handed out the access rights
 
 
 def test_devices_lists_ports_by_their_lasting_names(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, pans: Pans
 ) -> None:
     device = tmp_path / "ttyACM0"
     device.touch()
@@ -65,8 +63,7 @@ def test_devices_lists_ports_by_their_lasting_names(
     monkeypatch.setattr(list_ports, "comports", lambda: [port, gone])
     wanted = {"serial:1209:0001:A1": "free", f"serial:{gone.device}": "not there"}
     assert {state.url: state.state for state in serial_ports()} == wanted
-    assert main(["devices", "--no-usb", "--json"]) == 0
-    listed = json.loads(capsys.readouterr().out)
+    listed = pans("devices", "--no-usb")
     assert listed["devices"][0]["vid_pid_serial"] == "1209:0001:A1"
     assert {"serial", "usb", "sim", "simusb", "simserial"} <= set(listed["schemes"])
 
@@ -102,11 +99,11 @@ def test_a_trace_has_both_directions_and_times(tmp_path: Path) -> None:
         TracedLink(open_sim("sim:ideal?scene=uniform&pace=fast"), tmp_path / "none" / "trace.txt")
 
 
-def test_a_run_writes_its_trace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_writes_its_trace(tmp_path: Path, pans: Pans) -> None:
     path = tmp_path / "trace.txt"
     words = ["demo", "--pace", "fast", "--trials", "1", "--seconds", "0.5", "--out", str(tmp_path)]
     main([*words, "--trace", str(path), "--json"])
-    summary = json.loads(capsys.readouterr().out)
+    summary = json.loads(pans.said().out)
     sent, received = (
         [line.split(maxsplit=2) for line in path.read_text().splitlines() if line.split()[1] == mark] for mark in "><"
     )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from automata import automaton_bundle
 from bundles import made_bundle
-from commands import json_of
+from commands import Pans
 
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.automaton import STATES_MAX, DoseCap
@@ -76,12 +76,10 @@ def test_fixed_patterns_must_fit() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drive", ["device", "host"])
-def test_a_run_within_a_cap_replays_to_the_same_decisions(
-    drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_within_a_cap_replays_to_the_same_decisions(drive: str, tmp_path: Path, pans: Pans) -> None:
     device = "sim:dmd-spad?scene=fashion200&pace=fast"
     words = ("--dose-cap", 200, "--drive", drive, "--decisions", 40, "--no-realtime", "--out", tmp_path / "run")
-    ran = json_of(capsys, "run", SHIPPED / "fashion-adaptive.pans", "--device", device, *words)
+    ran = pans("run", SHIPPED / "fashion-adaptive.pans", "--device", device, *words)
     assert 100 < ran["illumination"] <= 200
-    again = json_of(capsys, "replay", tmp_path / "run" / "run.pansrec")
+    again = pans("replay", tmp_path / "run" / "run.pansrec")
     assert again["identical"]

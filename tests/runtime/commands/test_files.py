@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from automata import automaton_bundle, diamond, early_leaf
 from bundles import made_bundle
-from commands import fixed_run, json_of
+from commands import Pans, fixed_run
 from heads import affine_head
 
 from pans.runtime.bundle import Automaton, with_expected
@@ -58,23 +58,23 @@ def record(path: Path, decisions: list[tuple[Any, ...]], *, close: bool = True, 
     return path
 
 
-def test_whole_files_are_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_whole_files_are_fine(tmp_path: Path, pans: Pans) -> None:
     write_bundle(toy_bundle(), tmp_path / "a.pans")
     assert main([*fixed_run(3), "--record", str(tmp_path / "a.pansrec")]) == 0
-    capsys.readouterr()
+    pans.said()
     profile = tmp_path / "mine.toml"
     profile.write_text(load_profile("ideal").text)
     paths = [tmp_path / "a.pans", tmp_path / "a.pansrec", profile, "oled-qcmos"]
-    found = json_of(capsys, "verify", *paths)
+    found = pans("verify", *paths)
     assert (found["ok"], found["alerts"], found["violations"]) == (True, [], [])
     assert [file["kind"] for file in found["files"]] == ["bundle", "recording", "profile", "profile"]
     assert main(["verify", *map(str, paths)]) == 0
-    assert capsys.readouterr().out.count("ok ") == 4
+    assert pans.said().out.count("ok ") == 4
 
 
-def test_an_incomplete_recording_is_a_violation_not_damage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_incomplete_recording_is_a_violation_not_damage(tmp_path: Path, pans: Pans) -> None:
     path = record(tmp_path / "a.pansrec", [decision(0)], close=False)
-    found = json_of(capsys, "verify", path, code=1)
+    found = pans("verify", path, code=1)
     assert (found["ok"], found["files"][0]["damaged"]) == (False, False)
     assert "incomplete" in (message := found["violations"][0]["message"])
     assert "1 decisions" in message
@@ -82,7 +82,7 @@ def test_an_incomplete_recording_is_a_violation_not_damage(tmp_path: Path, capsy
 
 @pytest.mark.parametrize("name", ["a.pans", "a.pansrec", "a.toml"])
 @pytest.mark.parametrize("where", [0, 40, -1])
-def test_damage_is_exit_code_2(name: str, where: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damage_is_exit_code_2(name: str, where: int, tmp_path: Path, pans: Pans) -> None:
     path = tmp_path / name
     if name.endswith("pans"):
         write_bundle(toy_bundle(), path)
@@ -93,18 +93,18 @@ def test_damage_is_exit_code_2(name: str, where: int, tmp_path: Path, capsys: py
     data = bytearray(path.read_bytes())
     data[where] = 0xFF if data[where] != 0xFF else 0
     path.write_bytes(data)
-    found = json_of(capsys, "verify", path, code=2)
+    found = pans("verify", path, code=2)
     assert found["files"][0]["damaged"]
     assert found["violations"]
     if name.endswith("pansrec") and where == -1:
         assert "1 decisions in the first" in found["violations"][1]["message"]
 
 
-def test_one_damaged_file_does_not_hide_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_damaged_file_does_not_hide_the_others(tmp_path: Path, pans: Pans) -> None:
     (tmp_path / "bad.pans").write_bytes(b"PANSBNDL")
     (tmp_path / "odd.txt").write_bytes(b"hello")
     write_bundle(toy_bundle(), tmp_path / "good.pans")
-    found = json_of(capsys, "verify", *(tmp_path / n for n in ("bad.pans", "odd.txt", "good.pans")), code=2)
+    found = pans("verify", *(tmp_path / n for n in ("bad.pans", "odd.txt", "good.pans")), code=2)
     assert [file["ok"] for file in found["files"]] == [False, False, True]
     assert main(["verify", str(tmp_path / "none.pans")]) == 2
 
@@ -126,21 +126,19 @@ def test_one_damaged_file_does_not_hide_the_others(tmp_path: Path, capsys: pytes
         ),  # of the toy; an abstention itself is fine
     ],
 )
-def test_decisions_that_cannot_be_true(
-    rows: list[tuple[Any, ...]], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found = json_of(capsys, "verify", record(tmp_path / "a.pansrec", rows), code=1)
+def test_decisions_that_cannot_be_true(rows: list[tuple[Any, ...]], reason: str, tmp_path: Path, pans: Pans) -> None:
+    found = pans("verify", record(tmp_path / "a.pansrec", rows), code=1)
     assert reason in found["violations"][0]["message"]
 
 
-def test_timings_must_belong_and_be_in_order(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_timings_must_belong_and_be_in_order(tmp_path: Path, pans: Pans) -> None:
     path = tmp_path / "a.pansrec"
     with Recorder(path, {}) as recorder:
         recorder.add_timing_runs(np.array([(3, 0, 20, 10, 30, 1)], TIMING_RUN_DTYPE))
         recorder.add_message(5, b"")
         recorder.add_message(4, b"")
         recorder.close({})
-    found = json_of(capsys, "verify", path, code=1)
+    found = pans("verify", path, code=1)
     messages = " ".join(item["message"] for item in found["violations"])
     assert "belongs to decision 3" in messages
     assert "decided before it arrived" in messages
@@ -150,41 +148,41 @@ def test_timings_must_belong_and_be_in_order(tmp_path: Path, capsys: pytest.Capt
     assert "go back at 1" in alerts
 
 
-def test_a_profile_that_was_changed_inside_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_profile_that_was_changed_inside_a_recording(tmp_path: Path, pans: Pans) -> None:
     profile = {"sha256": "0" * 64, "toml": load_profile("ideal").text}
-    found = json_of(capsys, "verify", record(tmp_path / "a.pansrec", [], profile=profile), code=1)
+    found = pans("verify", record(tmp_path / "a.pansrec", [], profile=profile), code=1)
     assert "SHA-256 that stands beside" in found["violations"][0]["message"]
 
 
-def test_signs_of_a_bad_export_are_alerts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_signs_of_a_bad_export_are_alerts(tmp_path: Path, pans: Pans) -> None:
     odd = toy_bundle(pattern_levels=[[0, 0], [1, 2]], table=[[1, 0]] * 4)
     write_bundle(odd, tmp_path / "a.pans")
-    found = json_of(capsys, "verify", tmp_path / "a.pans", code=1)
+    found = pans("verify", tmp_path / "a.pans", code=1)
     assert found["violations"] == []
     messages = " ".join(item["message"] for item in found["alerts"])
     for sign in ("level 2 of 3", "1 of 2 patterns are dark", "never decided by any click word: b"):
         assert sign in messages
 
 
-def test_info_of_every_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_every_kind(tmp_path: Path, pans: Pans) -> None:
     digest = write_bundle(toy_bundle(), tmp_path / "a.pans")
-    found = json_of(capsys, "info", tmp_path / "a.pans")
+    found = pans("info", tmp_path / "a.pans")
     assert (found["kind"], found["sha256"], found["illumination"]) == ("bundle", digest, 3.0)
     assert (found["back_ends"], found["classes"], found["patterns"]) == (["table"], ["a", "b"], 2)
     record(tmp_path / "a.pansrec", [decision(0), decision(1, truth=0), decision(2, flags=9, label=0xFFFF)])
-    found = json_of(capsys, "info", tmp_path / "a.pansrec")
+    found = pans("info", tmp_path / "a.pansrec")
     assert (found["kind"], found["complete"], found["simulated"], found["bundle"]) == ("recording", True, True, "toy")
     assert (found["decisions"], found["abstained"], found["accuracy"]) == (3, 1, 0.5)
     assert found["events"] == {"gap": 1}
     assert "toml" not in found["header"]["profile"]
     assert main(["info", str(tmp_path / "a.pansrec")]) == 0
-    assert "SIMULATED" in capsys.readouterr().out
+    assert "SIMULATED" in pans.said().out
     for name in shipped_profiles():
-        found = json_of(capsys, "info", name)
+        found = pans("info", name)
         assert (found["kind"], found["name"]) == ("profile", name)
     perfect = tmp_path / "perfect.toml"
     perfect.write_text(re.sub(r"(?m)^contrast *=.*$", "contrast = inf", load_profile("oled-qcmos").text))
-    found = json_of(capsys, "info", perfect)
+    found = pans("info", perfect)
     assert found["object_modulator"]["contrast"] == "inf"
 
 
@@ -194,29 +192,29 @@ EXPECTED = {
 }
 
 
-def test_info_of_an_automaton(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_an_automaton(tmp_path: Path, pans: Pans) -> None:
     write_bundle(with_expected(automaton_bundle(diamond()), EXPECTED), tmp_path / "a.pans")
-    found = json_of(capsys, "info", tmp_path / "a.pans")
+    found = pans("info", tmp_path / "a.pans")
     assert (found["encoder"], found["patterns"], found["back_ends"]) == ("automaton", 3, ["automaton"])
     assert found["expected"] == EXPECTED
     wanted = {"dark_states": 0, "states": 5, "leaves": 3, "outcomes": 2, "dwell_steps": 2, "exposures_longest": 3}
     wanted |= {"exposures_shortest": 3, "states_of_most_used_patterns": {"0": 2, "1": 2, "2": 1}}
     assert {name: found["automaton"][name] for name in wanted} == wanted
     assert main(["info", str(tmp_path / "a.pans")]) == 0
-    text = capsys.readouterr().out
+    text = pans.said().out
     assert all(words in text for words in ("expected.accuracy", "automaton.states", "automaton.exposures_longest"))
     write_bundle(automaton_bundle(early_leaf()), tmp_path / "b.pans")
-    found = json_of(capsys, "info", tmp_path / "b.pans")
+    found = pans("info", tmp_path / "b.pans")
     assert found["automaton"]["exposures_shortest"] == 1
 
 
-def test_verify_tells_of_an_odd_automaton(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_tells_of_an_odd_automaton(tmp_path: Path, pans: Pans) -> None:
     write_bundle(automaton_bundle(diamond()), tmp_path / "good.pans")
-    json_of(capsys, "verify", tmp_path / "good.pans")
+    pans("verify", tmp_path / "good.pans")
     half = Automaton([0], [1], 2, [[1, 1]], [[0.4, 0.3, 0.3], [0.5, 0.3, 0.2]])
     levels = [[3, 0, 0, 0], [0, 0, 0, 0]]
     write_bundle(automaton_bundle(half, pattern_levels=levels), tmp_path / "odd.pans")
-    found = json_of(capsys, "verify", tmp_path / "odd.pans", code=1)
+    found = pans("verify", tmp_path / "odd.pans", code=1)
     assert found["violations"] == []
     messages = " ".join(item["message"] for item in found["alerts"])
     for sign in (
@@ -226,10 +224,10 @@ def test_verify_tells_of_an_odd_automaton(tmp_path: Path, capsys: pytest.Capture
         assert sign in messages
 
 
-def test_info_reads_a_damaged_recording_as_far_as_it_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_reads_a_damaged_recording_as_far_as_it_goes(tmp_path: Path, pans: Pans) -> None:
     path = record(tmp_path / "a.pansrec", [decision(0)])
     path.write_bytes(path.read_bytes()[:-1] + b"\x00\x00")
-    found = json_of(capsys, "info", path, code=2)
+    found = pans("info", path, code=2)
     assert found["damage"]
     assert found["decisions"] == 1
 
@@ -241,10 +239,10 @@ def make_inputs(folder: Path, d_f: int = 3, pixels: int = 4) -> list[str]:
     return ["bundle", "--patterns", str(folder / "p.npy"), "--table", str(folder / "t.npy"), "--classes", "left,right"]
 
 
-def test_a_bundle_from_arrays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bundle_from_arrays(tmp_path: Path, pans: Pans) -> None:
     words = make_inputs(tmp_path)
     out = tmp_path / "made.pans"
-    found = json_of(capsys, *words, "--levels", "16", "-o", out)
+    found = pans(*words, "--levels", "16", "-o", out)
     assert found["bundle"] == str(out)
     assert found["sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
     made, _ = load_bundle(out)
@@ -258,55 +256,52 @@ def test_a_bundle_from_arrays(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     np.testing.assert_array_equal(made.table, np.load(tmp_path / "t.npy").astype(np.float32))
     assert made.provenance["inputs"]["patterns"]["file"] == "p.npy"
     before = out.read_bytes()
-    json_of(capsys, *words, "--levels", "16", "-o", out, "--force")
+    pans(*words, "--levels", "16", "-o", out, "--force")
     assert out.read_bytes() == before  # the same inputs give the same bytes
-    json_of(capsys, "verify", out)
+    pans("verify", out)
 
 
-def test_a_bundle_of_photon_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bundle_of_photon_numbers(tmp_path: Path, pans: Pans) -> None:
     out, words = tmp_path / "numbers.pans", make_inputs(tmp_path)
     np.save(tmp_path / "p.npy", np.array([[0.2, 0.0], [0.2, 0.2]]))
     np.save(tmp_path / "t.npy", np.arange(18.0).reshape(9, 2) % 5)
-    found = json_of(capsys, *words, "--outcomes", "3", "--profile", "dmd-qcmos", "-o", out)
+    found = pans(*words, "--outcomes", "3", "--profile", "dmd-qcmos", "-o", out)
     assert found["exposure_us"] == pytest.approx(2000.0)
     assert load_bundle(out)[0].table[7].tolist() == [14 % 5, 15 % 5]
-    told = json_of(capsys, "info", out)
+    told = pans("info", out)
     assert (told["photon_number_max"], told["table_rows"]) == (2, 9)
-    found = json_of(capsys, *words, "--outcomes", "4", "-o", tmp_path / "never.pans", code=2)
+    found = pans(*words, "--outcomes", "4", "-o", tmp_path / "never.pans", code=2)
     assert "(4**d_f, classes) = (16, 2)" in found["error"]["message"]
     assert not (tmp_path / "never.pans").exists()
 
 
-def test_a_bundle_from_a_head(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bundle_from_a_head(tmp_path: Path, pans: Pans) -> None:
     weights = np.array([[1, -1], [2, 0], [0, 3]])
     (tmp_path / "h.onnx").write_bytes(affine_head(weights, np.zeros(2)))
     words = make_inputs(tmp_path)
     words[3:5] = ["--head", str(tmp_path / "h.onnx")]
     out = tmp_path / "made.pans"
-    json_of(capsys, *words, "-o", out)
+    pans(*words, "-o", out)
     made, _ = load_bundle(out)
     assert made.levels == 124
     np.testing.assert_array_equal(made.table[0b101], [1, 2])
     words += ["--table", str(tmp_path / "t.npy"), "-o", str(out), "--force"]
     assert main(words) == 2  # this table is another back end's
-    assert "disagree" in capsys.readouterr().err
+    assert "disagree" in pans.said().err
     assert load_bundle(out)[0].n_features == 3
 
 
-def test_a_profile_gives_levels_and_is_held_against_the_light(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_profile_gives_levels_and_is_held_against_the_light(tmp_path: Path, pans: Pans) -> None:
     profile = load_profile("oled-qcmos")
     words = make_inputs(tmp_path)
     middle_us = (profile.exposure.min_us + profile.exposure.max_us) / 2
     patterns = np.full((3, 4), profile.projector.peak_photoelectrons_hz * middle_us * 1e-6)
     np.save(tmp_path / "p.npy", patterns)
-    found = json_of(capsys, *words, "--profile", "oled-qcmos", "-o", tmp_path / "o.pans")
+    found = pans(*words, "--profile", "oled-qcmos", "-o", tmp_path / "o.pans")
     assert found["exposure_us"] == pytest.approx(middle_us)
     assert found["levels"] == profile.projector.levels
     np.save(tmp_path / "p.npy", patterns * 1e6)
-    assert main([*words, "--profile", "oled-qcmos", "-o", str(tmp_path / "o2.pans")]) == 2
-    assert "too weak" in capsys.readouterr().err
+    assert "too weak" in pans.refuses(*words, "--profile", "oled-qcmos", "-o", tmp_path / "o2.pans")
     assert not (tmp_path / "o2.pans").exists()
 
 
@@ -329,11 +324,9 @@ def halves() -> dict[str, Any]:
     return {"images": images, "labels": labels}
 
 
-def test_error_diffusion_keeps_the_accuracy_that_rounding_to_one_bit_loses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_error_diffusion_keeps_the_accuracy_that_rounding_to_one_bit_loses(tmp_path: Path, pans: Pans) -> None:
     words = dim_patterns(tmp_path, halves())
-    found, off = (json_of(capsys, *words, "--dither", one, "-o", tmp_path / f"{one}.pans") for one in ("auto", "off"))
+    found, off = (pans(*words, "--dither", one, "-o", tmp_path / f"{one}.pans") for one in ("auto", "off"))
     assert (found["dithered"], off["dithered"]) == (True, False)
     assert found["accuracy_given"] > 0.98  # nearly ten photons of the right half, one of the other at most
     assert found["accuracy_shown"] > 0.98

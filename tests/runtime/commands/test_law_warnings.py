@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from commands import json_of
+from commands import Pans
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import main
@@ -30,20 +30,20 @@ def microled(tmp_path: Path, *, blinded: bool) -> str:
     return str(tmp_path / "led.toml")
 
 
-def test_a_check_of_a_profile_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (row,) = json_of(capsys, "profile check", microled(tmp_path, blinded=True))["rows"]
+def test_a_check_of_a_profile_warns(tmp_path: Path, pans: Pans) -> None:
+    (row,) = pans("profile check", microled(tmp_path, blinded=True))["rows"]
     assert len(row["warnings"]) == 1
     assert REACHES in row["warnings"][0]
-    assert json_of(capsys, "profile check microled-spad")["rows"][0]["warnings"] == []
+    assert pans("profile check microled-spad")["rows"][0]["warnings"] == []
 
 
 @pytest.mark.parametrize("blinded", [False, True])
-def test_a_run_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_warns(blinded: bool, tmp_path: Path, pans: Pans) -> None:
     profile = microled(tmp_path, blinded=blinded)
     device = f"sim:{profile}?scene=fashion200&pace=fast&seed=1"
     words = ("--profile", profile, "--decisions", "2", "--no-realtime", "--out", str(tmp_path / "run"))
     assert main(["run", str(ADAPTIVE), "--device", device, *words]) in (0, 1)
-    assert (REACHES in capsys.readouterr().err) is blinded
+    assert (REACHES in pans.said().err) is blinded
 
 
 @pytest.mark.parametrize(
@@ -51,8 +51,7 @@ def test_a_run_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixtur
     [("active", "--features", "3"), ("automaton", "--exposures", "3", "--states", "4")],
     ids=lambda size: size[0],
 )
-def test_a_training_warns(size: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_training_warns(size: tuple[str, ...], tmp_path: Path, pans: Pans) -> None:
     pytest.importorskip("torch", reason="needs the train extra")
     words = ("train", "barcode", "--photons", "4", "--epochs", "1", "-o", str(tmp_path / "out.pans"))
-    assert main([*words, "--profile", microled(tmp_path, blinded=True), "--encoder", *size]) == 0
-    assert REACHES in capsys.readouterr().err
+    assert REACHES in pans.refuses(*words, "--profile", microled(tmp_path, blinded=True), "--encoder", *size, code=0)

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import json_of
+from commands import Pans
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import EXIT_DEVICE, main
@@ -45,26 +45,24 @@ REFUSED = [  # what is asked for, what is there already, and why it is refused
 
 
 @pytest.mark.parametrize(("words", "there", "why"), REFUSED)
-def test_a_refused_run_touches_nothing(
-    words: str, there: list[str], why: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_refused_run_touches_nothing(words: str, there: list[str], why: str, folder: Path, pans: Pans) -> None:
     for name in there:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(b"another run's")
     before = contents(folder)
     assert main([*RUN, *words.split()]) in (2, 3)
-    assert why in capsys.readouterr().err
+    assert why in pans.said().err
     assert contents(folder) == before
 
 
-def test_force_replaces_and_only_what_is_written(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    json_of(capsys, *words("--out", "a"))
+def test_force_replaces_and_only_what_is_written(folder: Path, pans: Pans) -> None:
+    pans(*words("--out", "a"))
     (folder / "a" / "run-2notes.pansrec").write_bytes(b"mine")
     first = read_recording("a/run.pansrec").decisions_sha256
     assert main([*RUN, "--out", "a"]) == 2
-    json_of(capsys, *words("--out", "a", "--force", "--shots", "2"))
+    pans(*words("--out", "a", "--force", "--shots", "2"))
     assert read_recording("a/run.pansrec").decisions_sha256 != first
-    parted = json_of(capsys, *words("--out", "a", "--force", "--rotate-mb", "0.3"))
+    parted = pans(*words("--out", "a", "--force", "--rotate-mb", "0.3"))
     assert parted["recording"] == "a/run.pansrec"
     assert sorted(os.listdir("a")) == ["run-0001.pansrec", "run-2notes.pansrec", "summary.md"]
 
@@ -73,37 +71,34 @@ def words(*more: str) -> tuple[str, ...]:
     return (RUN[0], *RUN[1:], *more)
 
 
-def test_a_run_of_its_own_gets_a_folder_with_its_date(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = [json_of(capsys, *words()) for _ in range(2)]
+def test_a_run_of_its_own_gets_a_folder_with_its_date(folder: Path, pans: Pans) -> None:
+    found = [pans(*words()) for _ in range(2)]
     assert found[0]["recording"] != found[1]["recording"]
     assert found[0]["recording"].startswith("pans-runs/20")
     assert Path("pans-runs/latest/run.pansrec").samefile(found[1]["recording"])
     assert all(Path(one[key]).is_file() for one in found for key in ("recording", "report"))
-    recorded = json_of(capsys, *words("--record", "a.pansrec"))
+    recorded = pans(*words("--record", "a.pansrec"))
     assert (recorded["recording"], recorded["report"]) == ("a.pansrec", "a.summary.md")
     assert not [name for name in contents(folder) if "lock" in name or "partial" in name]
 
 
-def test_a_folder_belongs_to_one_run_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_belongs_to_one_run_at_a_time(folder: Path, pans: Pans) -> None:
     Path("a").mkdir()
     with locked(Path("a/.pans-run.lock")):
         assert main([*RUN, "--out", "a"]) == 2
-    assert f"process {os.getpid()}" in capsys.readouterr().err
+    assert f"process {os.getpid()}" in pans.said().err
     assert main([*RUN, "--out", "a"]) == 0
 
 
 @pytest.mark.parametrize("parts", [(), ("--rotate-mb", "0.3")], ids=["one file", "parts"])
-def test_a_device_that_refuses_costs_no_recording(
-    parts: tuple[str, ...], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    json_of(capsys, *words("--out", "a", *parts))
+def test_a_device_that_refuses_costs_no_recording(parts: tuple[str, ...], folder: Path, pans: Pans) -> None:
+    pans(*words("--out", "a", *parts))
     before = contents(Path("a"))
     other = "sim:ideal?pace=fast&scene=fashion200"  # counts other ticks than the profile says
     refused = ["run", "self.pans", "--device", other, "--profile", "oled-qcmos", "--decisions", "5"]
-    assert main([*refused, "--out", "a", "--force", *parts]) == EXIT_DEVICE
-    assert "the device" in capsys.readouterr().err
+    assert "the device" in pans.refuses(*refused, "--out", "a", "--force", *parts, code=EXIT_DEVICE)
     assert contents(Path("a")) == before
-    json_of(capsys, *words("--out", "a", "--force", "--shots", "2", *parts))
+    pans(*words("--out", "a", "--force", "--shots", "2", *parts))
     after = contents(Path("a"))
     assert before.keys() == after.keys()
     assert all(before[name] != after[name] for name in before)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import browser, clipped, console, look, serious, unreachable
-from commands import fixed_run, json_of, words_of
+from commands import Pans, fixed_run, words_of
 
 from pans.runtime.cli import main
 from pans.runtime.compare import compare, mcnemar_exact, read_side
@@ -26,8 +26,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_same_objects_are_paired_and_counted(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = json_of(capsys, "compare", runs / "a", runs / "c")
+def test_the_same_objects_are_paired_and_counted(runs: Path, pans: Pans) -> None:
+    found = pans("compare", runs / "a", runs / "c")
     first, second = (read_recording(runs / name / "run.pansrec").decisions() for name in ("a", "c"))
     right = [dict(zip(rows["object"].tolist(), (rows["label"] == rows["truth"]).tolist())) for rows in (first, second)]
     better = sum(right[0][one] and not right[1][one] for one in right[0])
@@ -46,11 +46,11 @@ def test_the_same_objects_are_paired_and_counted(runs: Path, capsys: pytest.Capt
     assert not any(name.startswith(("bundle", "profile")) for name in changed)
 
 
-def test_a_run_beside_itself_differs_in_nothing(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = json_of(capsys, "compare", runs / "a", runs / "a" / "run.pansrec")
+def test_a_run_beside_itself_differs_in_nothing(runs: Path, pans: Pans) -> None:
+    found = pans("compare", runs / "a", runs / "a" / "run.pansrec")
     assert (found["changes"], found["significant"]) == ([], [])
     assert main(["compare", str(runs / "a"), str(runs / "a")]) == 0
-    words = capsys.readouterr().out
+    words = pans.said().out
     assert "Bundle, profile, options and device are the same." in words
     assert "No difference is larger than chance" in words
     assert words.startswith("SIMULATED")
@@ -75,27 +75,25 @@ def test_samples_where_nothing_says_that_the_objects_are_the_same(runs: Path) ->
     assert re.match(r"\d+ of 80 objects of the same number have another true class", why)
 
 
-def test_summaries_are_compared_without_pairs(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_summaries_are_compared_without_pairs(runs: Path, tmp_path: Path, pans: Pans) -> None:
     for name in ("a", "c"):
         summary = read_recording(runs / name / "run.pansrec").summary
         (tmp_path / f"{name}.json").write_text(json.dumps(dict(summary)))
-    found = json_of(capsys, "compare", tmp_path / "a.json", tmp_path / "c.json")
-    whole = json_of(capsys, "compare", runs / "a", runs / "c", "--objects", "different")
+    found = pans("compare", tmp_path / "a.json", tmp_path / "c.json")
+    whole = pans("compare", runs / "a", runs / "c", "--objects", "different")
     assert not found["paired"]
     for key in ("name", "p", "low", "high", "first", "second"):
         assert found["findings"][0][key] == whole["findings"][0][key]
 
 
-def test_a_difference_is_that_of_the_figures_beside_it(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_difference_is_that_of_the_figures_beside_it(runs: Path, tmp_path: Path, pans: Pans) -> None:
     """Shares of objects that were decided several times are no whole numbers of objects: 78.8 and 75.75 % of 200."""
     summary = dict(read_recording(runs / "a" / "run.pansrec").summary)
     for name, accuracy, abstained in (("a", 0.788, 3), ("b", 0.7575, 0)):
         told = {"accuracy": accuracy, "objects": 200, "decisions": 1000, "trials": 5, "abstained": abstained}
         (tmp_path / f"{name}.json").write_text(json.dumps(summary | told))
     words = ["compare", str(tmp_path / "a.json"), str(tmp_path / "b.json")]
-    for row in json_of(capsys, *words)["findings"]:
+    for row in pans(*words)["findings"]:
         assert row["difference_is"] in ("a - b", "a / b")
         if row["difference_is"] == "a - b" and row["difference"] is not None:
             assert row["difference"] == pytest.approx(row["first"] - row["second"])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import json_of
+from commands import Pans
 from numpy.typing import NDArray
 from plans import parallel, shot_major
 
@@ -375,19 +375,17 @@ factor = 20000.0
         ("mask", 3, True),
     ],
 )
-def test_a_run_says_so_and_a_replay_agrees(
-    policy: str, shots: int, abstains: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_says_so_and_a_replay_agrees(policy: str, shots: int, abstains: bool, tmp_path: Path, pans: Pans) -> None:
     """A table of counts is made anew; where the one detector of all patterns is masked, nothing is left to decide with."""
     (tmp_path / "hot.toml").write_text(SCENE)
     device = f"sim:oled-qcmos?scene={tmp_path}/hot.toml&pace=fast&seed=2"
     words = ("--decisions", 150, "--shots", shots, "--on-dark", policy, "--out", tmp_path)
-    summary = json_of(capsys, "run", SHIPPED / "fashion10.pans", "--device", device, *words, code=1)
+    summary = pans("run", SHIPPED / "fashion10.pans", "--device", device, *words, code=1)
     assert {one["state"] for one in summary["dark"]["findings"]} == {"burst"}
     assert summary["dark"]["policy"] == policy
     assert summary["dark"]["channels"][0]["clicks"] == summary["dark"]["clicks"]
     assert any("times as often as expected" in fault for fault in summary["faults"])
     assert (summary["abstained"] > 50) == abstains
-    replayed = json_of(capsys, "replay", tmp_path / "run.pansrec")
+    replayed = pans("replay", tmp_path / "run.pansrec")
     assert (replayed["identical"], replayed["decisions"]) == (True, 150)
     assert main(["verify", str(tmp_path / "run.pansrec")]) == 0

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Pans
 from numpy.typing import NDArray
 from plans import parallel, shot_major
 from tree import ROOT
 
-from pans.runtime.cli import main
 from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.instrument.channel_health import DeadChannelTest, silence_limit
 from pans.runtime.instrument.cusum import ChannelWatch
@@ -220,14 +219,12 @@ def test_one_detector_is_dead_when_nothing_clicks() -> None:
 # ---- whole runs ----
 
 
-def test_a_run_finds_a_dead_channel_and_a_replay_agrees(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_finds_a_dead_channel_and_a_replay_agrees(tmp_path: Path, pans: Pans) -> None:
     bundle = ROOT / "runtime" / "shipped" / "fashion10.pans"
     device = "sim:oled-qcmos?scene=fashion200&pace=fast&seed=3&changes=dead:at_s=10:channel=0"
     words = ["run", str(bundle), "--device", device, "--decisions", "400", "--on-dark", "mask", "--out", str(tmp_path)]
-    assert main([*words, "--json"]) == 1
-    summary = json.loads(capsys.readouterr().out)
+    summary = pans(*words, code=1)
     assert {one["state"] for one in summary["dark"]["findings"]} == {"dead"}
     assert any("clicked with" in fault for fault in summary["faults"])
     assert summary["abstained"] > 100
-    assert main(["replay", str(tmp_path / "run.pansrec"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["identical"]
+    assert pans("replay", tmp_path / "run.pansrec")["identical"]

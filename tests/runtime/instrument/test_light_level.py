@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Pans
 from tree import ROOT
 
 from pans.runtime.cli import main
@@ -110,30 +110,29 @@ def test_false_alarms_at_the_beginning_are_as_rare_as_stated(monkeypatch: pytest
     assert one * 0.8 < passed / runs < both * 1.2
 
 
-def test_a_run_with_a_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_with_a_calibration(tmp_path: Path, pans: Pans) -> None:
     calibration, device = tmp_path / "cal.json", "sim:oled-qcmos?scene={}&pace=fast&seed={}"
     words = ["calibrate", "--device", device.format("uniform", 5), "-o", str(calibration), "--seconds", "5", "--json"]
     assert main(words) == 0
     run = ["run", str(ROOT / "runtime" / "shipped" / "fashion10.pans"), "--decisions", "50", "--out", str(tmp_path)]
     run += ["--force", "--json", "--calibration", str(calibration), "--device"]
-    capsys.readouterr()
-    assert main([*run, device.format("fashion200", 5)]) == 0
-    summary = json.loads(capsys.readouterr().out)
+    pans.said()
+    summary = pans(*run, device.format("fashion200", 5))
     assert summary["calibration"]["sha256"]
     assert summary["calibration_warnings"] == []
     assert summary["light"]["decisions"] == 50
     assert main([*run, device.format("fashion200", 6)]) == 2  # another serial number
-    assert "SIM-00000005" in capsys.readouterr().err
-    assert main([*run, device.format("fashion200", 5), "--calibration-max-age-h", "1e-9"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["calibration_warnings"]) == 1
+    assert "SIM-00000005" in pans.said().err
+    assert (
+        len(pans(*run, device.format("fashion200", 5), "--calibration-max-age-h", "1e-9")["calibration_warnings"]) == 1
+    )
 
 
-def test_a_run_beside_its_place_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_beside_its_place_says_so(tmp_path: Path, pans: Pans) -> None:
     device = "sim:dmd-spad?scene=fashion200&pace=fast&seed=3&optics=shift={0},{0}"
     for shift, found in ((0, 0), (1, 1)):
         words = ["run", "fashion-adaptive", "--device", device.format(shift), "--decisions", "1650", "--no-realtime"]
-        assert main([*words, "--out", str(tmp_path / str(shift)), "--json"]) == 0
-        light = json.loads(capsys.readouterr().out)["light"]
+        light = pans(*words, "--out", tmp_path / str(shift))["light"]
         assert light["clicks_stated"] == pytest.approx(5.46, abs=0.01)
         assert len(light["found"]) == found
     assert 1.1 < light["found"][0]["ratio"] < 1.35

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import json_of
+from commands import Pans
 from links import served
 
 from pans.firmware_sim.ports.serve import build_instrument, open_sim, parse_sim_url
@@ -37,18 +37,14 @@ from pans.trainer.export.tape_bundle import exact_table, tape_bundle
 PROFILE = load_profile("flow-snspd")
 
 
-def run_command(
-    folder: Path, capsys: pytest.CaptureFixture[str], *more: str | Path, faults: str = "", code: int = 0
-) -> dict[str, Any]:
+def run_command(folder: Path, pans: Pans, *more: str | Path, faults: str = "", code: int = 0) -> dict[str, Any]:
     device = f"sim:flow-snspd?scene={folder / 'cells.toml'}&seed=4&pace=fast&faults={faults}"
     words = (folder / "thirds.pans", "--device", device, "--flow", folder / "flow.toml", "--out", folder / "out")
-    return json_of(capsys, "run --force --seconds 0.1", *words, *more, code=code)
+    return pans("run --force --seconds 0.1", *words, *more, code=code)
 
 
-def test_cells_are_decided_once_gated_on_time_and_replayed(
-    flow_folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    summary = run_command(flow_folder, capsys, "--gate-class", "b,c")
+def test_cells_are_decided_once_gated_on_time_and_replayed(flow_folder: Path, pans: Pans) -> None:
+    summary = run_command(flow_folder, pans, "--gate-class", "b,c")
     counts, gates = summary["passages"], summary["gates"]
     assert counts["marks"] > 150
     assert counts["alone"] > 80
@@ -64,7 +60,7 @@ def test_cells_are_decided_once_gated_on_time_and_replayed(
     assert "yield \\(targets pulsed\\)" in page  # as Markdown
     recording = read_recording(Path(summary["recording"]))
     assert recording.n_decisions == counts["decisions"]
-    replayed = json_of(capsys, "replay", summary["recording"])
+    replayed = pans("replay", summary["recording"])
     assert replayed["identical"] is True
     for key in ("accuracy", "passages", "aborted", "yield", "purity", "missed", "clicks_mean"):
         assert replayed[key] == summary[key]
@@ -85,17 +81,17 @@ def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: 
     assert figures["gates"]["done"] == figures["passages"]["pulses"] == len(pulses)
 
 
-def test_lost_blocks_are_never_decided_over(flow_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    summary = run_command(flow_folder, capsys, faults="loss:0.02", code=4)
+def test_lost_blocks_are_never_decided_over(flow_folder: Path, pans: Pans) -> None:
+    summary = run_command(flow_folder, pans, faults="loss:0.02", code=4)
     assert summary["lost"] > 0
     assert summary["aborted"]["gap"] > 0
     assert summary["accuracy_labelled"] > 0.97
     assert summary["passages"]["in_gaps"] > 0
-    json_of(capsys, "replay", summary["recording"])
+    pans("replay", summary["recording"])
 
 
 def run_tape(
-    folder: Path, capsys: pytest.CaptureFixture[str], *, dark: float, bars_per_s: float, more: str = "", seconds: str
+    folder: Path, pans: Pans, *, dark: float, bars_per_s: float, more: str = "", seconds: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a tape without crosstalk, 50 000 bars per second being said; return the summary and the enumerated figures."""
     text = PROFILE.text.replace("crosstalk_probability = 0.001", "crosstalk_probability = 0.0")
@@ -113,12 +109,12 @@ def run_tape(
     write_bundle(bundle, folder / "tape.pans")
     device = f"sim:{folder / 'tape-profile.toml'}?scene={folder / 'tape.toml'}&seed=9&pace=fast"
     words = (folder / "tape.pans", "--device", device, "--flow", folder / "flow.toml", "--out", folder)
-    return json_of(capsys, f"run --seconds {seconds}", *words), figures
+    return pans(f"run --seconds {seconds}", *words), figures
 
 
-def test_a_tape_is_read_as_well_as_the_exact_optimum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_tape_is_read_as_well_as_the_exact_optimum(tmp_path: Path, pans: Pans) -> None:
     """No crosstalk and a stated dark rate: then nothing but chance may lie between 6000 bars and the enumerated accuracy."""
-    summary, figures = run_tape(tmp_path, capsys, dark=0.01, bars_per_s=50_000.0, seconds="0.12")
+    summary, figures = run_tape(tmp_path, pans, dark=0.01, bars_per_s=50_000.0, seconds="0.12")
     n, exact = summary["passages"]["alone"], figures["exact_accuracy"]
     assert n >= 5_990
     assert (summary["missed"], summary["doubled"]) == (0.0, 0.0)
@@ -128,12 +124,12 @@ def test_a_tape_is_read_as_well_as_the_exact_optimum(tmp_path: Path, capsys: pyt
     assert summary["clicks_mean"] < 5.3
 
 
-def test_a_tape_that_is_faster_than_said_is_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    summary, _ = run_tape(tmp_path, capsys, dark=-1, bars_per_s=50_500.0, more="track = 3\n", seconds="0.03")
+def test_a_tape_that_is_faster_than_said_is_followed(tmp_path: Path, pans: Pans) -> None:
+    summary, _ = run_tape(tmp_path, pans, dark=-1, bars_per_s=50_500.0, more="track = 3\n", seconds="0.03")
     assert summary["passages"]["alone"] > 1400
     assert summary["accuracy"] > 0.995  # not followed it is lost within 50 bars
     assert summary["flow"]["bars_per_s"] == pytest.approx(50_500.0, rel=0.005)
-    assert json_of(capsys, "replay", tmp_path / "run.pansrec")["identical"]
+    assert pans("replay", tmp_path / "run.pansrec")["identical"]
 
 
 def test_the_exact_table_without_dark_counts_and_with_endless_light_is_the_truth() -> None:
@@ -199,8 +195,8 @@ def test_shipped_settings_load_and_survive_a_header(name: str) -> None:
     assert flow_of_header(json.loads(json.dumps(settings.as_header()))) == settings
 
 
-def test_decisions_cannot_be_counted_beforehand(flow_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = run_command(flow_folder, capsys, "--decisions", "5", code=2)
+def test_decisions_cannot_be_counted_beforehand(flow_folder: Path, pans: Pans) -> None:
+    found = run_command(flow_folder, pans, "--decisions", "5", code=2)
     assert "as many decisions as objects pass" in found["error"]["message"]
 
 

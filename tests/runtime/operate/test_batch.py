@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import json_of
+from commands import Pans
 
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
@@ -58,31 +58,27 @@ def test_items_are_inputs_times_values(lab: Path) -> None:
     assert items_of("report", ["b/grid.pans"], ["seed=7"], extra, files=True)[0].key != item.key
 
 
-def test_a_batch_goes_on_where_it_was(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_batch_goes_on_where_it_was(lab: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans) -> None:
     ran = in_this_process(monkeypatch)
     words = ["batch info", "*/grid.pans", "-o", "r.jsonl"]
-    found = json_of(capsys, *words, code=1)
+    found = pans(*words, code=1)
     assert (found["items"], found["run"]) == (3, 3)
     assert [row["item"] for row in found["failed"]] == ["b/grid.pans"]
     lines = Path("r.jsonl").read_text().splitlines()
     Path("r.jsonl").write_text("\n".join([*lines[:2], lines[2][:-5]]))  # cut within the last line
     ran.clear()
     assert main(["batch", "info", "*/grid.pans", "-o", "r.jsonl"]) == 2  # never replaced
-    assert "--resume" in capsys.readouterr().err
-    assert json_of(capsys, *words, "--resume", code=1)["run"] == 1
+    assert "--resume" in pans.said().err
+    assert pans(*words, "--resume", code=1)["run"] == 1
     assert len(ran) == 1
     items = {json.loads(line)["item"] for line in Path("r.jsonl").read_text().splitlines()}
     assert items == {f"{name}/grid.pans" for name in "abc"}
     os.utime("a/grid.pans", (1, 1))  # a changed input is done again
-    assert json_of(capsys, *words, "--resume", code=1)["run"] == 1
-    assert json_of(capsys, *words, "--force", code=1)["run"] == 3
+    assert pans(*words, "--resume", code=1)["run"] == 1
+    assert pans(*words, "--force", code=1)["run"] == 3
 
 
-def test_an_interrupted_batch_keeps_what_is_done(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interrupted_batch_keeps_what_is_done(lab: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans) -> None:
     ran = in_this_process(monkeypatch)
     answer = batch.run_item
 
@@ -92,34 +88,32 @@ def test_an_interrupted_batch_keeps_what_is_done(
         return answer(words, folder)
 
     monkeypatch.setattr(batch, "run_item", interrupted)
-    assert main(["batch", "info", "*/grid.pans", "-o", "r.jsonl"]) == 130
-    assert "--resume" in capsys.readouterr().err
+    assert "--resume" in pans.refuses("batch", "info", "*/grid.pans", "-o", "r.jsonl", code=130)
     assert len(Path("r.jsonl").read_text().splitlines()) == 1
 
 
-def test_results_as_parquet(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_as_parquet(lab: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the parquet extra")
     in_this_process(monkeypatch)
     words = ["batch evaluate", "a/grid.pans", "--vary", "seed=3,4", "-o", "r.parquet"]
     monkeypatch.setattr(batch, "_check_words", lambda command, item: None)
-    json_of(capsys, *words)
+    pans(*words)
     table = parquet.read_table("r.parquet").to_pydict()
     assert table["seed"] == ["3", "4"]
     assert (table["accuracy"], table["latency_us.p50"], table["exit"]) == ([0.5, 0.5], [2.0, 2.0], [0, 0])
     assert table["rows"] == ["[1, 2]", "[1, 2]"]
     assert table["answer.exit"] == [9, 9]
-    assert json_of(capsys, *words, "--resume")["run"] == 0
+    assert pans(*words, "--resume")["run"] == 0
 
 
-def test_foreign_files_are_no_journals(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_foreign_files_are_no_journals(lab: Path, pans: Pans) -> None:
     for text in (
         "precious\n",
         '{"a": 1}\n',
         f'{{"format": "{FORMAT}", "key": "k", "item": "i", "exit": 0}}\nprecious\nmore\n',
     ):
         Path("r.jsonl").write_text(text)
-        assert main(["batch", "info", "a/grid.pans", "-o", "r.jsonl", "--resume"]) == 2
-        assert "not the journal" in capsys.readouterr().err
+        assert "not the journal" in pans.refuses("batch", "info", "a/grid.pans", "-o", "r.jsonl", "--resume")
         assert Path("r.jsonl").read_text() == text
 
 

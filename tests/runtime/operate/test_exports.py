@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import fixed_run, json_of
+from commands import Pans, fixed_run
 
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle
@@ -31,13 +31,11 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run.pansrec"
 
 
-def test_phconvert_accepts_and_loads_the_file(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_phconvert_accepts_and_loads_the_file(recording: Path, tmp_path: Path, pans: Pans) -> None:
     pytest.importorskip("h5py", reason="needs the export extra")
     hdf5 = pytest.importorskip("phconvert.hdf5", reason="needs the dev extra")
     path = tmp_path / "run.h5"
-    found = json_of(capsys, "export", recording, "--format", "photon-hdf5", "-o", path)
+    found = pans("export", recording, "--format", "photon-hdf5", "-o", path)
     source = read_recording(recording)
     hdf5.assert_valid_photon_hdf5(str(path), warnings=False, strict_description=True, require_rootformat=True)
     loaded = hdf5.load_photon_hdf5(str(path))
@@ -54,10 +52,10 @@ def test_phconvert_accepts_and_loads_the_file(
         loaded.close()
 
 
-def test_parquet_holds_every_decision(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_parquet_holds_every_decision(recording: Path, tmp_path: Path, pans: Pans) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the parquet extra")
     path = tmp_path / "decisions.parquet"
-    json_of(capsys, "export", recording, "--format", "parquet", "-o", path)
+    pans("export", recording, "--format", "parquet", "-o", path)
     table = parquet.read_table(path)
     source = read_recording(recording)
     rows, classes = source.decisions(), source.bundle().classes
@@ -82,15 +80,15 @@ def test_rows_of_mixed_kinds_become_columns(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("way", ["npy", "png"])
-def test_a_bundle_comes_back_from_its_exports(way: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bundle_comes_back_from_its_exports(way: str, tmp_path: Path, pans: Pans) -> None:
     out, head = tmp_path / "parts", tmp_path / "head.onnx"
-    facts = json_of(capsys, "export", FASHION, "--format", way, "-o", out)
-    json_of(capsys, "export", FASHION, "--format", "onnx", "-o", head)
+    facts = pans("export", FASHION, "--format", way, "-o", out)
+    pans("export", FASHION, "--format", "onnx", "-o", head)
     classes = ",".join(facts["classes"])
     words = ["--head", head, "--classes", classes, "--levels", facts["levels"], "-o", tmp_path / "b.pans"]
     white = [] if way == "npy" else ["--photons-at-white", facts["photons_at_white"]]
     words += ["--patterns", out / "patterns.npy" if way == "npy" else out, *white]
-    json_of(capsys, "bundle", *words)
+    pans("bundle", *words)
     (before, _), (after, _) = load_bundle(FASHION), load_bundle(tmp_path / "b.pans")
     assert (after.pattern_levels == before.pattern_levels).all()
     assert after.photons_per_level == pytest.approx(before.photons_per_level, rel=1e-12)
@@ -100,14 +98,12 @@ def test_a_bundle_comes_back_from_its_exports(way: str, tmp_path: Path, capsys: 
     assert (after.table == before.table).all()
 
 
-def test_the_exported_head_is_an_onnx_model_that_says_what_it_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_exported_head_is_an_onnx_model_that_says_what_it_is(tmp_path: Path, pans: Pans) -> None:
     onnx = pytest.importorskip("onnx", reason="needs the test extra")
     import onnxruntime
 
     path = tmp_path / "head.onnx"
-    json_of(capsys, "export", FASHION, "--format", "onnx", "-o", path)
+    pans("export", FASHION, "--format", "onnx", "-o", path)
     model = onnx.load(path)
     onnx.checker.check_model(model)
     facts = json.loads({entry.key: entry.value for entry in model.metadata_props}["pans.about"])

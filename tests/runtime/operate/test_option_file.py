@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import Pans
 
 from pans.runtime import SHIPPED
 from pans.runtime.cli import main
@@ -112,20 +113,16 @@ def test_what_a_file_cannot_mean(line: str, wrong: str, tmp_path: Path) -> None:
     assert line != "no_realtime = true" or caught.value.remedy == "did you mean no-realtime?"
 
 
-def test_the_command_writes_reads_and_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_reads_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans) -> None:
     monkeypatch.chdir(tmp_path)
     words = ["run", str(SHIPPED / "fashion10.pans"), "--device", "sim:oled-qcmos?pace=fast&seed=2", "--decisions", "4"]
     assert main([*words, "--write-config", "lab.toml"]) == 0
-    assert "pans run --config lab.toml" in capsys.readouterr().out
+    assert "pans run --config lab.toml" in pans.said().out
     assert [path.name for path in tmp_path.iterdir()] == ["lab.toml"]  # nothing has run
     assert main([*words, "--write-config", "lab.toml"]) == 2
     assert main([*words, "--config", "lab.toml", "--write-config", "lab.toml", "--force"]) == 2  # its own input
-    capsys.readouterr()
+    pans.said()
     assert main(["run", "--config", "lab.toml", "--decisions", "3", "--out", "out", "--json"]) in (0, 1)
-    assert json.loads(capsys.readouterr().out)["decisions"] == 3
-    assert main(["run", "--config", "lab.toml", "--record", "lab.toml", "--force"]) == 2
-    assert "is the input" in capsys.readouterr().err
-    assert main(["run", "--config", "none.toml"]) == 2
-    assert "remedy: " in capsys.readouterr().err
+    assert json.loads(pans.said().out)["decisions"] == 3
+    assert "is the input" in pans.refuses("run", "--config", "lab.toml", "--record", "lab.toml", "--force")
+    assert "remedy: " in pans.refuses("run", "--config", "none.toml")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import json_of
+from commands import Pans
 
 from pans.firmware_sim.testing import small_setup
 from pans.runtime import SHIPPED
@@ -47,12 +47,12 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def service(capsys: pytest.CaptureFixture[str], *words: Any, code: int | None = 0) -> dict[str, Any]:
-    return json_of(capsys, "service", *words, "--unit-dir", "units", code=code)
+def service(pans: Pans, *words: Any, code: int | None = 0) -> dict[str, Any]:
+    return pans("service", *words, "--unit-dir", "units", code=code)
 
 
-def test_a_unit_is_installed_verified_and_removed(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = service(capsys, "install", "--config", "lab.toml", "--run-as", "root")
+def test_a_unit_is_installed_verified_and_removed(lab: Path, pans: Pans) -> None:
+    found = service(pans, "install", "--config", "lab.toml", "--run-as", "root")
     unit = Path("units/pans-lab.service")
     text = unit.read_text()
     wanted = {"Type=notify", "WatchdogSec=20", "Restart=on-failure", "RestartPreventExitStatus=2", "User=root"}
@@ -62,39 +62,37 @@ def test_a_unit_is_installed_verified_and_removed(lab: Path, capsys: pytest.Capt
     if shutil.which("systemd-analyze"):
         assert [one["found"] for one in found["findings"]] == ["no complaints"]
         unit.write_text(text.replace("Restart=on-failure", "Restart=sometimes").replace("UMask=0027", "Umask=9"))
-        findings = service(capsys, "verify", "--name", "lab", code=1)["findings"]
+        findings = service(pans, "verify", "--name", "lab", code=1)["findings"]
         assert "sometimes" in findings[0]["found"]
-        service(capsys, "install", "--config", "lab.toml")  # a unit of ours is written again
-    assert service(capsys, "verify", "--name", "lab")["findings"][-1]["ok"]
-    assert service(capsys, "remove", "--name", "lab")["removed"] == str(unit)
+        service(pans, "install", "--config", "lab.toml")  # a unit of ours is written again
+    assert service(pans, "verify", "--name", "lab")["findings"][-1]["ok"]
+    assert service(pans, "remove", "--name", "lab")["removed"] == str(unit)
     assert not unit.exists()
 
 
-def test_folders_that_the_run_writes_to_are_writable(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_that_the_run_writes_to_are_writable(lab: Path, pans: Pans) -> None:
     text = Path("lab.toml").read_text()
     Path("lab.toml").write_text(text + 'log-file = "/var/tmp/pans-test-logs/l"\nout = "out"\n')
-    shown = service(capsys, "show", "--config", "lab.toml", "--name", "other")["text"]
+    shown = service(pans, "show", "--config", "lab.toml", "--name", "other")["text"]
     paths = re.findall(r'^ReadWritePaths="(.*)"$', shown, re.MULTILINE)
     inside = str(lab).replace("%", "%%")
     assert set(paths) == {inside, f"{inside}/out", "/var/tmp/pans-test-logs"}
     assert not Path("units").exists()
 
 
-def test_foreign_units_stay(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_foreign_units_stay(lab: Path, pans: Pans) -> None:
     unit = Path("units/pans-lab.service")
     unit.parent.mkdir()
     unit.write_text("[Service]\nExecStart=/bin/true\n")
     for words in ("install --config lab.toml", "verify --name lab", "remove --name lab"):
-        service(capsys, *words.split(), code=2)
+        service(pans, *words.split(), code=2)
     assert unit.read_text() == "[Service]\nExecStart=/bin/true\n"
 
 
 @pytest.mark.skipif(not hasattr(socket, "AF_UNIX") or sys.platform == "win32", reason="needs AF_UNIX")
-def test_a_run_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    service(capsys, "install", "--config", "lab.toml")
-    found = service(capsys, "verify", "--name", "lab", "--start", "4", code=None)
+def test_a_run_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(lab: Path, pans: Pans) -> None:
+    service(pans, "install", "--config", "lab.toml")
+    found = service(pans, "verify", "--name", "lab", "--start", "4", code=None)
     said = {one["check"]: one for one in found["findings"]}
     assert all(said[name]["ok"] for name in ("READY", "WATCHDOG", "STOPPING")), said
     assert said["end"]["found"].startswith(("exit code 0", "exit code 4"))  # late, on a busy machine
@@ -120,9 +118,9 @@ def test_silence_is_counted_from_ready_to_the_end() -> None:
     assert ServiceRun(lines, ended_s=9.5).longest_silence_s() == 4.5
 
 
-def test_monitoring_files_are_written_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_monitoring_files_are_written_once(tmp_path: Path, pans: Pans) -> None:
     out = tmp_path / "m"
-    found = json_of(capsys, "service monitoring", "--out", out)
+    found = pans("service monitoring", "--out", out)
     assert [Path(path).name for path in found["files"]] == ["prometheus-alerts.yml", "grafana-dashboard.json"]
     assert all(Path(path).read_bytes() == (SHIPPED / Path(path).name).read_bytes() for path in found["files"])
     assert main(["service", "monitoring", "--out", str(out)]) == 2

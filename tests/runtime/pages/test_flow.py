@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import json_of, page_of, words_of
+from commands import Pans, page_of, words_of
 
 from pans.runtime.cli import main
 from pans.runtime.pages import flow
@@ -99,15 +99,13 @@ def test_late_decisions_are_counted_once_however_many_events_are_held(
         assert {cause: counts.tolist() for cause, counts in _late_rows(told, span).items()} == whole
 
 
-def test_parts_of_a_flow_tell_of_their_passages(
-    flow_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parts_of_a_flow_tell_of_their_passages(flow_folder: Path, tmp_path: Path, pans: Pans) -> None:
     device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast"
     words = ["run", str(flow_folder / "thirds.pans"), "--device", device, "--flow", str(flow_folder / "flow.toml")]
-    summary = json_of(capsys, "", *words, "--seconds", "1.5", "--rotate-mb", "1", "--out", tmp_path)
+    summary = pans(*words, "--seconds", "1.5", "--rotate-mb", "1", "--out", tmp_path)
     parts = sorted(tmp_path.glob("run-*.pansrec"))
     assert len(parts) >= 2
-    rows = json_of(capsys, "replay", tmp_path)["parts"]
+    rows = pans("replay", tmp_path)["parts"]
     marks = sum(row["passages"]["marks"] for row in rows)
     assert 0.98 * summary["passages"]["marks"] <= marks <= summary["passages"]["marks"]
     for row in rows:
@@ -116,6 +114,6 @@ def test_parts_of_a_flow_tell_of_their_passages(
         assert row["passages"]["without_mark"] <= 3
         assert row["missed"] < 0.02
     assert main(["replay", str(parts[1])]) == 0
-    text = capsys.readouterr().out
+    text = pans.said().out
     assert ("passages" in text, "accuracy" in text) == (True, True)
     assert "This is one part of a run" in words_of(page_of(parts[1], tmp_path))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from automata import automaton_bundle, random_automaton
-from commands import json_of
+from commands import Pans
 
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
@@ -23,7 +23,7 @@ from pans.runtime.wire.messages import DARK_PATTERN, MessageType, decode_clicks,
 
 
 @pytest.fixture
-def recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Recording:
+def recording(tmp_path: Path, pans: Pans) -> Recording:
     write_bundle(
         automaton_bundle(random_automaton(4, slots=6, width=5), levels=2, photons_per_level=0.7), tmp_path / "walk.pans"
     )
@@ -32,7 +32,7 @@ def recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Recording:
     np.savez(tmp_path / "tiny.npz", images=images, labels=labels, classes=np.array(["c0", "c1", "c2"]))
     device = f"sim:dmd-spad?scene={tmp_path / 'tiny.npz'}&seed=5&pace=fast"
     words = ("--device", device, "--decisions", 60, "--trials", 2, "--out", tmp_path / "run")
-    json_of(capsys, "", "run", tmp_path / "walk.pans", *words, code=None)
+    pans("run", tmp_path / "walk.pans", *words, code=None)
     return read_recording(tmp_path / "run" / "run.pansrec")
 
 
@@ -82,10 +82,8 @@ def test_reliability_is_that_of_the_decisions() -> None:
     assert bins[1][0] == pytest.approx(0.36)
 
 
-def test_exports_have_states_and_exposures(
-    recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    json_of(capsys, "export", recording.path, "--format", "csv", "-o", tmp_path / "csv")
+def test_exports_have_states_and_exposures(recording: Recording, tmp_path: Path, pans: Pans) -> None:
+    pans("export", recording.path, "--format", "csv", "-o", tmp_path / "csv")
     plan = recorded_plan(recording)
     assert plan.automaton is not None
     with (tmp_path / "csv" / "clicks.csv").open(newline="") as file:

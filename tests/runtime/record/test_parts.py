@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import json_of
+from commands import Pans
 from small_runs import Disk, fails, record_small
 
 from pans.runtime.cli import main
@@ -226,16 +226,14 @@ def test_a_page_reads_each_part_as_often_however_many_there_are(
     assert few[paths[1].name] < 25
 
 
-def test_commands_take_a_folder_or_the_name_of_the_recording(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_take_a_folder_or_the_name_of_the_recording(parts: Path, tmp_path: Path, pans: Pans) -> None:
     for place in (parts, parts / "run.pansrec"):
-        assert json_of(capsys, "verify", place)["ok"]
-        payload = json_of(capsys, "replay", place)
+        assert pans("verify", place)["ok"]
+        payload = pans("replay", place)
         assert payload["identical"]
         assert len(payload["parts"]) == len(parts_in(parts))
-    assert json_of(capsys, "export", place, "--format", "csv", "-o", tmp_path / "csv")["decisions"] > 1000
-    assert json_of(capsys, "info", place)["decisions"] == payload["decisions"]
+    assert pans("export", place, "--format", "csv", "-o", tmp_path / "csv")["decisions"] > 1000
+    assert pans("info", place)["decisions"] == payload["decisions"]
     assert main(["verify", str(tmp_path / "run.pansrec")]) == main(["verify", str(tmp_path / "csv")]) == 2
     with pytest.raises(UsageError, match="0 recordings are here"):
         open_recording(tmp_path)

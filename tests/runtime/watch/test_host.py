@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from commands import json_of
+from commands import Pans
 
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
@@ -96,7 +96,7 @@ def words(tmp_path: Path) -> list[str]:
 
 
 def test_a_run_stops_in_order_before_its_disk_is_full(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans
 ) -> None:
     recorded = tmp_path / "out" / "run.pansrec"
 
@@ -105,7 +105,7 @@ def test_a_run_stops_in_order_before_its_disk_is_full(
 
     monkeypatch.setattr(host.shutil, "disk_usage", usage)
     monkeypatch.setattr(host, "EVERY_S", 0.1)
-    summary = json_of(capsys, "", *words[:-1], "--seconds", "100000", code=1)
+    summary = pans(*words[:-1], "--seconds", "100000", code=1)
     assert (summary["ended"], summary["verdict"]) == (host.DISK_NEARLY_FULL, "FAIL")
     assert host.DISK_NEARLY_FULL in summary["faults"]
     recording = read_recording(recorded)
@@ -115,11 +115,10 @@ def test_a_run_stops_in_order_before_its_disk_is_full(
 
 
 def test_a_run_does_not_begin_on_a_disk_that_is_nearly_full(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans
 ) -> None:
     monkeypatch.setattr(host.shutil, "disk_usage", lambda path: Usage(0, 0, 63 * MIB))
-    assert main([*words, "--decisions", "3"]) == 2
-    said = capsys.readouterr().err
+    said = pans.refuses(*words, "--decisions", "3")
     assert "63.0 MiB are free" in said
     assert "--disk-reserve-mb" in said
     assert not (tmp_path / "out").exists()

@@ -12,6 +12,7 @@ import naive_baselines
 import numpy as np
 import pytest
 import torch
+from commands import Pans
 from trainings import kept_task
 
 from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_USAGE, main
@@ -221,9 +222,9 @@ def task_file(task: Task, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return kept_task(tmp_path_factory.mktemp("task") / "bars.npz", task)
 
 
-def called(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any]]:
+def called(pans: Pans, *words: object) -> tuple[int, dict[str, Any]]:
     code = main(["baseline", *map(str, words), "--json"])
-    answer = capsys.readouterr().out
+    answer = pans.said().out
     return code, json.loads(answer) if answer else {}
 
 
@@ -245,10 +246,8 @@ def called(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dic
         ("hadamard", "--features", 6, "--epochs", 1, "--method", "counts", "--brightness", "object"),
     ],
 )
-def test_every_way_answers_with_the_keys_of_evaluate(
-    words: tuple[object, ...], task_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, answer = called(capsys, *words, "--task", task_file, "--photons", 4, 40, "--illumination", 9, "--trials", 2)
+def test_every_way_answers_with_the_keys_of_evaluate(words: tuple[object, ...], task_file: Path, pans: Pans) -> None:
+    code, answer = called(pans, *words, "--task", task_file, "--photons", 4, 40, "--illumination", 9, "--trials", 2)
     assert code == 0
     rows = answer["rows"]
     assert all(set(row) >= KEYS for row in (answer, *rows, answer["first_200"]))
@@ -276,19 +275,17 @@ def test_every_way_answers_with_the_keys_of_evaluate(
         ("direct", "--dark", -1),
     ],
 )
-def test_what_cannot_be_meant_is_refused(
-    words: tuple[object, ...], task_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_meant_is_refused(words: tuple[object, ...], task_file: Path, pans: Pans) -> None:
     try:
         code: object = main(["baseline", *map(str, words), "--task", str(task_file)])
     except SystemExit as refused:  # by the parser: no number
         code = refused.code
     assert code == EXIT_USAGE
-    assert re.search("allowed|is not a", capsys.readouterr().err)
+    assert re.search("allowed|is not a", pans.said().err)
 
 
 def test_an_interrupt_keeps_the_levels_that_are_done(
-    task_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    task_file: Path, pans: Pans, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = run_trials
 
@@ -298,7 +295,7 @@ def test_an_interrupt_keeps_the_levels_that_are_done(
         return whole(measurement, photons, *rest, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(baseline_rows, "run_trials", interrupted)
-    code, answer = called(capsys, "direct", "--task", task_file, "--photons", 4, 40)
+    code, answer = called(pans, "direct", "--task", task_file, "--photons", 4, 40)
     assert code == EXIT_INTERRUPTED
     assert answer["interrupted"] is True
     assert [row["photons_asked"] for row in answer["rows"]] == [4.0]

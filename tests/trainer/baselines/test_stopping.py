@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from functools import partial
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from trainings import kept_task
 
-from pans.runtime.cli import EXIT_USAGE, main
 from pans.trainer.baselines.common import measure, silent
 from pans.trainer.baselines.exposures import SHORTEST, exposure_net, log_chances
 from pans.trainer.baselines.stopping import (
@@ -163,14 +161,13 @@ def test_the_network_knows_what_the_truth_allows_and_is_calibrated() -> None:
     assert confidence == pytest.approx(found_right.accuracy_mean, abs=4 * found_right.accuracy_se_objects)
 
 
-def test_the_command_stops_when_sure(tmp_path, capsys) -> None:
+def test_the_command_stops_when_sure(tmp_path, pans) -> None:
     rng = np.random.default_rng(8)
     labels = rng.integers(0, 2, 600)
     images = rng.integers(0, 60, (600, 4, 4)) + 190 * (np.arange(4)[None, None] // 2 == labels[:, None, None])
     path = kept_task(tmp_path / "halves.npz", task_of(images[:400], labels[:400], images[400:], labels[400:]))
     words = ["baseline", "direct", "--method", "stopping", "--task", str(path), "--epochs", "2", "--json"]
-    assert main([*words, "--photons", "1.5", "2.5", "--illumination", "6"]) == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
+    rows = pans(*words, "--photons", "1.5", "2.5", "--illumination", "6")["rows"]
     assert [row["photons_asked"] for row in rows] == [1.5, 2.5, None]
     assert [row["illumination_asked"] for row in rows] == [None, None, 6]
     for row in rows:
@@ -181,7 +178,5 @@ def test_the_command_stops_when_sure(tmp_path, capsys) -> None:
         assert row["accuracy_held_back"] == pytest.approx(row["accuracy_mean"], abs=0.15)  # of 80 objects, and of 200
     assert rows[0]["accuracy_mean"] < rows[1]["accuracy_mean"]
     assert rows[0]["confidence"] < rows[1]["confidence"]
-    assert main([*words, "--photons", "1000"]) == EXIT_USAGE
-    assert "none can be reached by stopping" in capsys.readouterr().err
-    assert main([*words, "--photons", "2", "--dark", "0.1"]) == EXIT_USAGE
-    assert "without dark counts" in capsys.readouterr().err
+    assert "none can be reached by stopping" in pans.refuses(*words, "--photons", "1000")
+    assert "without dark counts" in pans.refuses(*words, "--photons", "2", "--dark", "0.1")

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Pans
 
 from pans.firmware_sim.scene.still import load_scene
-from pans.runtime.cli import main
 from pans.trainer.tasks.registry import draw_task
 
 
 @pytest.mark.parametrize("part", ["test", "train"])
-def test_a_drawn_task_becomes_a_scene(part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_drawn_task_becomes_a_scene(part: str, tmp_path: Path, pans: Pans) -> None:
     out = tmp_path / "flow.npz"
-    assert main(["data", "scene", "cells", "-o", str(out), "--objects", "6", "--part", part, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = pans("data", "scene", "cells", "-o", out, "--objects", "6", "--part", part)
     assert (told["objects"], told["height_px"], told["width_px"], told["part"]) == (6, 100, 100, part)
     scene = load_scene(out)
     task = draw_task("cells", 0, 6, 6)
@@ -39,8 +37,7 @@ def test_a_drawn_task_becomes_a_scene(part: str, tmp_path: Path, capsys: pytest.
         ("nonsense -o x.npz", "neither one of"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(words: str, said: str, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_what_cannot_be_meant_is_refused(words: str, said: str, tmp_path: Path, monkeypatch, pans) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["data", "scene", *words.split()]) == 2
-    assert said in capsys.readouterr().err
+    assert said in pans.refuses("data", "scene", *words.split())
     assert not list(tmp_path.iterdir())

@@ -34,21 +34,18 @@ def words(tmp_path, storage):
     return [*shared, "--storage", storage, "--json"]
 
 
-def test_a_study_goes_on_and_refuses_another_question(words, capsys):
-    assert main([*words, "--trials", "2"]) == 0
-    first = json.loads(capsys.readouterr().out)
+def test_a_study_goes_on_and_refuses_another_question(words, pans):
+    first = pans(*words, "--trials", "2")
     assert (first["trials"], set(first["best"])) == (2, {"front_rate", "head_rate", "warm", "batch", "light", "alpha"})
-    assert main([*words, "--trials", "3"]) == 0
-    again = json.loads(capsys.readouterr().out)
+    again = pans(*words, "--trials", "3")
     assert again["trials"] == 3
     assert again["best_loss"] <= first["best_loss"]
     assert main([*words, "--trials", "3"]) == 0  # nothing left to do
-    assert json.loads(capsys.readouterr().out)["trials"] == 3
-    assert main([*words, "--trials", "3", "--clicks", "1"]) == 2
-    assert "clicks None (now 1.0)" in capsys.readouterr().err
+    assert json.loads(pans.said().out)["trials"] == 3
+    assert "clicks None (now 1.0)" in pans.refuses(*words, "--trials", "3", "--clicks", "1")
 
 
-def test_two_workers_share_a_study_and_a_killed_one_costs_its_trial_alone(words, capsys):
+def test_two_workers_share_a_study_and_a_killed_one_costs_its_trial_alone(words, pans):
     command = [
         sys.executable,
         "-P",  # not the working folder: its metadata may be old
@@ -65,8 +62,7 @@ def test_two_workers_share_a_study_and_a_killed_one_costs_its_trial_alone(words,
     killed.wait()
     killed.stderr.close()
     other = subprocess.Popen([*command, "--trials", "6"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    assert main([*words, "--trials", "6"]) == 0
-    mine = json.loads(capsys.readouterr().out)
+    mine = pans(*words, "--trials", "6")
     theirs = json.loads(other.communicate()[0])
     assert other.returncode == 0
     assert mine["trials"] >= 6

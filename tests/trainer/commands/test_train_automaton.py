@@ -1,12 +1,9 @@
 """`pans train --encoder automaton`: from images to a bundle that runs, its answer, and what is refused."""
 
-import json
-
 import pytest
 from trainings import bars_task, kept_task
 
 from pans.runtime.bundle.model import load_bundle
-from pans.runtime.cli import main
 
 SHORT = ["--encoder", "automaton", "--exposures", "4", "--states", "8", "--epochs", "2", "--batch", "64"]
 
@@ -16,10 +13,9 @@ def images(tmp_path):
     return str(kept_task(tmp_path / "bars.npz", bars_task()))
 
 
-def test_trains_exports_and_reports(images, tmp_path, capsys):
+def test_trains_exports_and_reports(images, tmp_path, pans):
     out = tmp_path / "bars.pans"
-    assert main(["train", images, *SHORT, "--photons", "3", "-o", str(out), "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    answer = pans("train", images, *SHORT, "--photons", "3", "-o", out)
     bundle, digest = load_bundle(out)
     assert answer["sha256"] == digest
     assert answer["simulated"] is True
@@ -33,8 +29,7 @@ def test_trains_exports_and_reports(images, tmp_path, capsys):
     for key in ("clicks_mean", "illumination", "exposures_mean", "expected_calibration_error"):
         assert answer[key] == pytest.approx(answer["first_200"][key], rel=0.5, abs=0.2)
     more = ["--encoder", "automaton", "--start", str(out), "--rate", "0.05", "--reroutes", "0", "--epochs", "1"]
-    assert main(["train", images, *more, "--photons", "2.5", "-o", str(tmp_path / "more.pans")]) == 0
-    told = capsys.readouterr().err
+    told = pans.refuses("train", images, *more, "--photons", "2.5", "-o", tmp_path / "more.pans", code=0)
     assert "shown" in told
     assert "grow" not in told
     options = load_bundle(tmp_path / "more.pans")[0].provenance["options"]
@@ -54,7 +49,6 @@ def test_trains_exports_and_reports(images, tmp_path, capsys):
         (["--as-is"], "--features is missing"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(words, told, images, tmp_path, capsys):
-    assert main(["train", images, *words, "-o", str(tmp_path / "x.pans")]) == 2
-    assert told in capsys.readouterr().err
+def test_what_cannot_be_meant_is_refused(words, told, images, tmp_path, pans):
+    assert told in pans.refuses("train", images, *words, "-o", tmp_path / "x.pans")
     assert not list(tmp_path.glob("*.pans*"))

@@ -32,9 +32,9 @@ def letters(tmp_path, monkeypatch):
     return "my letters"
 
 
-def test_a_folder_needs_no_option_and_the_next_commands_work(letters, capsys):
+def test_a_folder_needs_no_option_and_the_next_commands_work(letters, pans):
     assert main(["train", letters, *QUICK, "-o", "letters.pans"]) == 0
-    said = capsys.readouterr()
+    said = pans.said()
     assert "400 training images from 120" in said.err
     assert "an automaton" in said.err
     assert "at which a camera detects 10" in said.err
@@ -54,43 +54,39 @@ def test_a_folder_needs_no_option_and_the_next_commands_work(letters, capsys):
     assert bundle.expected["objects"] == 30
 
 
-def test_as_is_chooses_nothing(letters, capsys):
-    assert main(["train", letters, "--as-is", "-o", "letters.pans"]) == 2
-    assert "--features is missing" in capsys.readouterr().err
+def test_as_is_chooses_nothing(letters, pans):
+    assert "--features is missing" in pans.refuses("train", letters, "--as-is", "-o", "letters.pans")
     words = ["train", letters, "--as-is", "--encoder", "automaton", "--photons", "5", *QUICK, "-o", "letters.pans"]
     assert main(words) == 0
-    said = capsys.readouterr()
+    said = pans.said()
     assert "chosen from the images" not in said.err
     assert "next:" not in said.out
     assert "variation" not in load_bundle("letters.pans")[0].provenance
 
 
-def test_an_option_of_fixed_patterns_asks_for_them(letters, capsys, monkeypatch):
+def test_an_option_of_fixed_patterns_asks_for_them(letters, pans, monkeypatch):
     monkeypatch.setattr(recipe, "FIXED_STEPS", 40)
     monkeypatch.setattr(recipe, "FIXED_EPOCHS", (8, 8))
     words = ["--features", "3", "--hidden", "8", "--estimator", "ste", "--profile", "ideal"]
     assert main(["train", letters, *words, "-o", "letters.pans"]) == 0
-    said = capsys.readouterr()
+    said = pans.said()
     assert "8 epochs in batches of" in said.err
     assert "direct imaging" in said.out
     assert load_bundle("letters.pans")[0].pattern_levels.shape[0] == 3
 
 
-def test_the_course_of_an_automaton_is_written_and_the_answer_holds_direct_imaging(letters, tmp_path, capsys):
+def test_the_course_of_an_automaton_is_written_and_the_answer_holds_direct_imaging(letters, tmp_path, pans):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
     more = ["--photons", "5", "--history", "course", "-o", "letters.pans", "--json"]
-    assert main(["train", letters, *QUICK, *more]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    answer = pans("train", letters, *QUICK, *more)
     assert answer["direct_imaging"]["photons_mean"] == pytest.approx(answer["photons_mean"], rel=1e-3)
     assert 0.1 < answer["direct_imaging"]["accuracy_mean"] < 1
     gentle = answer["direct_imaging_as_illuminated"]
     assert gentle["illumination"] == pytest.approx(answer["illumination"], rel=1e-3)
-    assert main(["evaluate", "letters.pans", "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)  # against the same changed copies, the same readouts
+    again = pans("evaluate", "letters.pans")  # against the same changed copies, the same readouts
     for key in ("direct_imaging", "direct_imaging_as_illuminated"):
         assert again[key] == pytest.approx(answer[key])
-    assert main(["evaluate", "letters.pans", "--json", "--no-compare"]) == 0
-    assert "direct_imaging" not in json.loads(capsys.readouterr().out)
+    assert "direct_imaging" not in pans("evaluate", "letters.pans", "--no-compare")
     course = json.loads((tmp_path / "course/history.json").read_text())
     stages = [step["stage"] for step in course["epochs"]]
     assert stages == ["grow"] * 4 + ["grey"] * 3 + ["shown"]
@@ -98,7 +94,7 @@ def test_the_course_of_an_automaton_is_written_and_the_answer_holds_direct_imagi
     assert main(["train", letters, *QUICK, "--history", "course", "-o", "again.pans"]) == 2  # nothing is replaced
 
 
-def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, monkeypatch, capsys):
+def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, monkeypatch, pans):
     """Squares, bars and few crosses, 298:32:6, and a training too short for any of them but the squares."""
     rng, labels = np.random.default_rng(0), np.repeat([0, 1, 2], [298, 32, 6])
     images = np.zeros((len(labels), 8, 8), np.uint8)
@@ -109,7 +105,7 @@ def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, mon
     np.savez("unequal.npz", images=images, labels=labels, classes=np.array(["square", "bar", "cross"]))
     quick = ["--as-is", "--features", "4", "--encoder", "active", "--epochs", "1"]
     assert main(["train", "unequal.npz", *quick, "-o", "s.pans", "--json"]) == 0
-    said = capsys.readouterr()
+    said = pans.said()
     found = json.loads(said.out)["by_class"]
     held_out = labels[4::5]
     assert found["majority_class"] == "square"
@@ -121,7 +117,7 @@ def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, mon
     assert "class 'cross' has 5 training images" in said.err
     assert "'square' has 239 training images, 'cross' has 5: the sensor prefers the larger class" in said.err
     assert main(["evaluate", "s.pans", "--task", "unequal.npz", "--exact"]) == 0
-    said = capsys.readouterr()
+    said = pans.said()
     assert "not better than always naming the largest class" in said.err
     assert "balanced accuracy       33.33 %; recall bar 0.00 %, cross 0.00 %, square 100.00 %" in said.out
     assert "at equal illumination" in said.out
@@ -134,9 +130,8 @@ def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, mon
         "--exact",
     ]  # all of them held out: a camera has none to learn from
     assert main(others) == 0
-    assert "direct imaging" not in capsys.readouterr().out
-    assert main([*others, "--compare"]) == 2
-    assert "training images are not at hand" in capsys.readouterr().err
+    assert "direct imaging" not in pans.said().out
+    assert "training images are not at hand" in pans.refuses(*others, "--compare")
 
 
 def test_a_curve_is_thinned_and_says_its_ends():

@@ -39,7 +39,7 @@ def own_images(path):
 
 
 @pytest.mark.usefixtures("short_fits")
-def test_a_training_leaves_its_history(tmp_path, capsys):
+def test_a_training_leaves_its_history(tmp_path, pans):
     task = own_images(tmp_path / "own.npz")
     words = ["--features", "2", "--epochs", "6", "--hidden", "8", "-o", str(tmp_path / "own.pans"), "--json"]
     assert main(["train", task, *words, "--history", str(tmp_path / "course")]) == 0
@@ -50,9 +50,8 @@ def test_a_training_leaves_its_history(tmp_path, capsys):
     for name in ("curves.png", "evolution.png"):
         assert (tmp_path / "course" / name).read_bytes().startswith(b"\x89PNG")
     assert not (tmp_path / "own.pans.checkpoint").exists()
-    capsys.readouterr()
+    pans.said()
     words = ["evaluate", str(tmp_path / "own.pans"), "--task", task, "--pictures", str(tmp_path / "seen"), "--json"]
-    assert main(words) == 0
-    drawn = json.loads(capsys.readouterr().out)["pictures"]
+    drawn = pans(*words)["pictures"]
     assert {path.name for path in map(Path, drawn)} == {"patterns.png", "confusion.png"}  # too few objects for a map
     assert all(Path(path).read_bytes().startswith(b"\x89PNG") for path in drawn)

@@ -12,7 +12,7 @@ import naive_automaton as naive
 import numpy as np
 import pytest
 from automata import automaton_bundle, random_automaton
-from commands import json_of
+from commands import Pans
 
 from pans.runtime.bundle import Automaton, Bundle, with_expected, write_bundle
 from pans.runtime.decide import make_decider
@@ -129,29 +129,27 @@ def own_task(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_the_command_gives_all_figures(own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_gives_all_figures(own_task: str, tmp_path: Path, pans: Pans) -> None:
     model = bundle()
     write_bundle(model, tmp_path / "a.pans")
-    found = json_of(capsys, "evaluate", tmp_path / "a.pans", "--task", own_task, "--profile", "ideal")
+    found = pans("evaluate", tmp_path / "a.pans", "--task", own_task, "--profile", "ideal")
     figures = evaluate(model, task=own_task, conditions=Conditions("ideal"))
     assert {name: found[name] for name in asdict(figures)} == asdict(figures)
     assert (found["trials"], found["objects"], found["shots"], found["exposures_longest"]) == (0, 230, 1, 6)
     assert found["first_200"]["objects"] == 200
     assert sum(one["share"] for one in found["calibration"]) == pytest.approx(1.0)
-    few = json_of(capsys, "evaluate", tmp_path / "a.pans", "--task", own_task, "--profile", "ideal", "--objects", "200")
+    few = pans("evaluate", tmp_path / "a.pans", "--task", own_task, "--profile", "ideal", "--objects", "200")
     assert few["first_200"] is None
     for name in ("accuracy_mean", "clicks_mean", "photons_mean", "exposures_mean"):
         assert few[name] == pytest.approx(found["first_200"][name], rel=1e-12)
     more = ("--profile", "ideal", "--confidence", "0.6", "--exact")
-    sure = json_of(capsys, "evaluate", tmp_path / "a.pans", "--task", own_task, *more)
+    sure = pans("evaluate", tmp_path / "a.pans", "--task", own_task, *more)
     assert (sure["confidence"], sure["trials"]) == (0.6, 0)
     assert 0 < sure["abstained"] < 1
     assert sure["exposures_mean"] < found["exposures_mean"]
 
 
-def test_expected_figures_are_held_against_what_is_found(
-    own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_expected_figures_are_held_against_what_is_found(own_task: str, tmp_path: Path, pans: Pans) -> None:
     model = bundle()
     found = evaluate(model, task=own_task, conditions=Conditions("ideal"))
     named = {"profile": "ideal", "task": Path(own_task).stem, "split": "test", "objects": 230}
@@ -161,20 +159,20 @@ def test_expected_figures_are_held_against_what_is_found(
     }
     write_bundle(with_expected(model, named | figures), tmp_path / "true.pans")
     words = ("--task", own_task, "--profile", "ideal")
-    assert json_of(capsys, "evaluate", tmp_path / "true.pans", *words)["expected_differences"] == []
+    assert pans("evaluate", tmp_path / "true.pans", *words)["expected_differences"] == []
     write_bundle(with_expected(model, named | figures | {"accuracy": 0.999}), tmp_path / "false.pans")
-    wrong = json_of(capsys, "evaluate", tmp_path / "false.pans", *words, code=1)
+    wrong = pans("evaluate", tmp_path / "false.pans", *words, code=1)
     assert "expected accuracy is 0.999 in the bundle" in wrong["expected_differences"][0]
     other = ("evaluate", tmp_path / "false.pans", *words, "--dark", "0.1")
-    assert json_of(capsys, *other)["expected_differences"] is None
+    assert pans(*other)["expected_differences"] is None
     assert expected_differences(named | figures, named | figures | {"objects": 3, "accuracy": 0.0}) == []
 
 
-def test_pictures_of_an_automaton(own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pictures_of_an_automaton(own_task: str, tmp_path: Path, pans: Pans) -> None:
     pytest.importorskip("matplotlib")
     write_bundle(bundle(), tmp_path / "a.pans")
     words = ("--task", own_task, "--pictures", tmp_path / "drawn")
-    found = json_of(capsys, "evaluate", tmp_path / "a.pans", *words)
+    found = pans("evaluate", tmp_path / "a.pans", *words)
     assert {Path(path).name for path in found["pictures"]} == {"patterns.png", "reliability.png", "confusion.png"}
     for path in found["pictures"]:
         assert Path(path).read_bytes().startswith(b"\x89PNG")

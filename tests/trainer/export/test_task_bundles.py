@@ -87,16 +87,16 @@ def scene(tmp_path, task):
     return path
 
 
-def ran(tmp_path, capsys, path, device, *more):
+def ran(tmp_path, pans, path, device, *more):
     code = main(["run", str(path), "--device", device, "--profile", "ideal", "--out", str(tmp_path), "--json", *more])
-    return code, json.loads(capsys.readouterr().out)
+    return code, json.loads(pans.said().out)
 
 
 @pytest.mark.parametrize(("name", "changed"), [("tissue", {}), ("mmf-mnist", {"complex_field": True, "head": "conv"})])
-def test_a_passive_bundle_runs_on_an_instrument_with_its_optics(name, changed, tmp_path, capsys):
+def test_a_passive_bundle_runs_on_an_instrument_with_its_optics(name, changed, tmp_path, pans):
     task, _, path, exported = made(tmp_path, name, **changed)
     device = f"sim:ideal?pace=fast&seed=3&scene={scene(tmp_path, task)}"
-    code, found = ran(tmp_path, capsys, path, f"{device}&optics={path}", "--decisions", "64", "--trials", "4")
+    code, found = ran(tmp_path, pans, path, f"{device}&optics={path}", "--decisions", "64", "--trials", "4")
     assert code == 0, found["faults"]
     assert found["decisions"] == 64
     light = light_of(exported.bundle, PROFILE, task.test.images)
@@ -104,27 +104,25 @@ def test_a_passive_bundle_runs_on_an_instrument_with_its_optics(name, changed, t
     clicks = light.probability.sum() / 16
     assert found["clicks_mean"] == pytest.approx(clicks, abs=5 * (3 * 0.25 / 64) ** 0.5)
     assert found["illumination"] == 0
-    assert main(["replay", found["recording"], "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["identical"]
+    assert pans("replay", found["recording"])["identical"]
     assert main(["verify", found["recording"], "--json"]) in (0, 1)
-    assert not json.loads(capsys.readouterr().out)["violations"]
-    assert main(["run", str(path), "--device", device, "--profile", "ideal", "--out", str(tmp_path / "none")]) == 3
-    assert "optics=BUNDLE.pans" in capsys.readouterr().err  # an instrument with a projector, or another's glass
-    assert main(["info", str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["sensor"]["fingerprint"] == exported.bundle.analyser.fingerprint
+    assert not json.loads(pans.said().out)["violations"]
+    assert "optics=BUNDLE.pans" in pans.refuses(
+        "run", path, "--device", device, "--profile", "ideal", "--out", tmp_path / "none", code=3
+    )  # an instrument with a projector, or another's glass
+    assert pans("info", path)["sensor"]["fingerprint"] == exported.bundle.analyser.fingerprint
 
 
-def test_a_picture_bundle_runs_and_its_pictures_are_recomputed(tmp_path, capsys):
+def test_a_picture_bundle_runs_and_its_pictures_are_recomputed(tmp_path, pans):
     task, _, path, exported = made(tmp_path, "mmf-mnist-image")
     where = scene(tmp_path, task)
     device = f"sim:ideal?pace=fast&seed=3&scene={where}&optics={path}"
-    code, found = ran(tmp_path, capsys, path, device, "--decisions", "16")
+    code, found = ran(tmp_path, pans, path, device, "--decisions", "16")
     assert code == 0, found["faults"]
     assert (found["decisions"], found["accuracy"], found["abstained"]) == (16, None, 0)
     out = tmp_path / "pictures.npz"
     words = ["replay", found["recording"], "--json", "--pictures", str(out), "--truth", str(where)]
-    assert main(words) == 0
-    replayed = json.loads(capsys.readouterr().out)
+    replayed = pans(*words)
     assert replayed["identical"]
     with np.load(out, allow_pickle=False) as arrays:
         assert arrays["pictures"].shape == (16, 28, 28)

@@ -100,16 +100,15 @@ def test_a_table_of_pictures_shows_speckle_and_asks_for_the_digit(monkeypatch):
     assert data.shown.numpy() == pytest.approx(wanted, abs=0.51 / 255)
 
 
-def test_the_command_trains_on_another_draw_and_keeps_it_apart(few_cells, tmp_path, capsys):
+def test_the_command_trains_on_another_draw_and_keeps_it_apart(few_cells, tmp_path, pans):
     words = ["reproduce", "cells", "--rows", "3", "--dark", "0", "--cache", str(tmp_path), "--json"]
     assert main([*words, "--data-seed", "7"]) == 0
-    other = capsys.readouterr().out
+    other = pans.said().out
     assert {path.name for path in tmp_path.iterdir()} >= {"cells-3-0-data7.json", "cells-3-0-data7.pans"}
     assert not (tmp_path / "cells-3-0.json").exists()
     assert main(words) == 0
-    assert capsys.readouterr().out != other  # other objects
-    assert main([*words, "--data-seed", "7", "-o", str(tmp_path / "out")]) == 2
-    assert "draw 0" in capsys.readouterr().err
+    assert pans.said().out != other  # other objects
+    assert "draw 0" in pans.refuses(*words, "--data-seed", "7", "-o", tmp_path / "out")
 
 
 def test_direct_imaging_stands_beside_a_cell_at_its_photons():

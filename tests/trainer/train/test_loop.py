@@ -1,6 +1,5 @@
 """Training: a tiny synthetic task end to end, budgets, repeatability, checkpoints, and what is refused."""
 
-import json
 import os
 from dataclasses import replace
 
@@ -10,7 +9,6 @@ import torch
 from bundles import made_bundle
 from trainings import bars_task, short_fits  # noqa: F401 - a fixture
 
-from pans.runtime.cli import main
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.click_law import click_probability, object_transmission
@@ -210,32 +208,28 @@ def test_impossible_options_are_refused(changed, said):
 
 
 @pytest.mark.usefixtures("short_fits")
-def test_train_and_evaluate_commands_agree(tmp_path, capsys):
+def test_train_and_evaluate_commands_agree(tmp_path, pans):
     bars_file(tmp_path / "bars.npz", 400)
     out = str(tmp_path / "bars.pans")
     shape = ["--features", "4", "--epochs", "6", "--hidden", "16"]
-    assert main(["train", str(tmp_path / "bars.npz"), *shape, "-o", out, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = pans("train", tmp_path / "bars.npz", *shape, "-o", out)
     assert {"bundle", "accuracy_mean", "clicks_mean", "photons_mean", "seconds"} <= set(said)
     assert said["score_difference"] <= 1e-5
     assert sorted(os.listdir(tmp_path)) == ["bars.npz", "bars.pans"]  # no checkpoint stays
-    assert main(["evaluate", out, "--task", str(tmp_path / "bars.npz"), "--exact", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = pans("evaluate", out, "--task", tmp_path / "bars.npz", "--exact")
     assert found["objects"] == 80  # trained on this very file: only what was held out
     assert found["accuracy_mean"] == pytest.approx(said["accuracy_mean"])
     keys = "accuracy_mean accuracy_std clicks_mean photons_mean illumination objects trials"
     assert set(keys.split()) <= set(found)
     others = bars_file(tmp_path / "others.npz", 100, seed=1)
-    assert main(["evaluate", out, "--task", others, "--trials", "3", "--shots", "2", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = pans("evaluate", out, "--task", others, "--trials", "3", "--shots", "2")
     assert (found["objects"], found["trials"], found["shots"]) == (100, 3, 2)  # none of these were trained on
 
 
-def test_a_device_that_is_not_there_is_refused_by_name(tmp_path, capsys, monkeypatch):
+def test_a_device_that_is_not_there_is_refused_by_name(tmp_path, pans, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     words = ["train", "barcode", "--features", "4", "-o", str(tmp_path / "x.pans"), "--device", "cuda"]
-    assert main(words) == 2
-    assert "no CUDA device" in capsys.readouterr().err
+    assert "no CUDA device" in pans.refuses(*words)
     assert not (tmp_path / "x.pans").exists()
 
 
