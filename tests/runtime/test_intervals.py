@@ -1,11 +1,24 @@
-"""Beta, chi-square and the Jeffreys interval against 40 digits, and the interval's coverage."""
+"""Beta, chi-square, binomial tails and intervals against 40 digits, and their coverage."""
 
 from __future__ import annotations
+
+from fractions import Fraction
+from math import comb
 
 import mpmath
 import pytest
 
-from pans.runtime.intervals import CHI2_95, beta_cdf, beta_quantile, chi2_quantile, chi2_tail, jeffreys_interval
+from pans.runtime.instrument.channel_health import dark_report
+from pans.runtime.intervals import (
+    CHI2_95,
+    beta_cdf,
+    beta_quantile,
+    binomial_tail,
+    chi2_quantile,
+    chi2_tail,
+    jeffreys_interval,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -53,3 +66,47 @@ def test_jeffreys_interval_covers(exposures: int, mean: float) -> None:
             chance = mpmath.mpf(p) ** clicks * (1 - mpmath.mpf(p)) ** (exposures - clicks)
             covered += float(mpmath.binomial(exposures, clicks) * chance)
     assert 0.92 < covered < 0.985
+
+
+@pytest.mark.parametrize(
+    ("clicks", "exposures", "p"), [(30, 10**9, 1e-9), (3, 10**9, 1e-12), (200, 10**6, 1e-5), (100, 10**6, 1e-5)]
+)
+def test_tail_with_many_exposures_and_tiny_rates(clicks: int, exposures: int, p: float) -> None:
+    mpmath.mp.dps = 40
+    exact = mpmath.betainc(clicks, exposures - clicks + 1, 0, mpmath.mpf(p), regularized=True)
+    assert binomial_tail(clicks, exposures, p) == pytest.approx(float(exact), rel=1e-6)
+
+
+@pytest.mark.parametrize("p", [0.0, 1e-9, 1e-3, 0.3, 0.9, 1.0])
+@pytest.mark.parametrize("n", [1, 20, 150])
+def test_tails_are_exact(p: float, n: int) -> None:
+    """Relative error at most 1e-10 above the mean (at or below it the alarm does not ask)."""
+    exact_p = Fraction(p)
+    for clicks in {0, 1, n // 3, n - 1, n}:
+        exact = sum((comb(n, k) * exact_p**k * (1 - exact_p) ** (n - k) for k in range(clicks, n + 1)), Fraction(0))
+        found = binomial_tail(clicks, n, p)
+        if clicks <= n * p:
+            assert found == 1.0
+        elif exact > Fraction(1, 10**290):
+            assert abs(Fraction(found) - exact) <= exact * Fraction(1, 10**10)
+        else:
+            assert 0 <= found <= 1e-289
+
+
+@pytest.mark.parametrize(
+    ("clicks", "exposures"), [(0, 10), (1, 1000), (500, 1000), (1000, 1000), (3 * 10**9 + 7, 10**12 + 1)]
+)
+def test_wilson_interval_is_the_root_of_its_definition(clicks: int, exposures: int) -> None:
+    with mpmath.workdps(40):
+        z, n, rate = mpmath.mpf("1.959963984540054"), mpmath.mpf(exposures), mpmath.mpf(clicks) / exposures
+        centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * mpmath.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+        for found, exact in zip(wilson_interval(clicks, exposures), (centre - half, centre + half), strict=True):
+            assert abs(found - exact) <= 1e-15 * centre
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+
+
+def test_alarm_only_when_the_profile_is_contradicted() -> None:
+    assert dark_report(1e-4, 10_000, 3).alarm == dark_report(1e-4, 0, 0).alarm == ""
+    assert "30 clicks in 10000 dark exposures" in dark_report(1e-4, 10_000, 30).alarm
+    assert dark_report(0.0, 100, 1).alarm

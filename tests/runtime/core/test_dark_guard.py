@@ -102,14 +102,15 @@ def test_one_detector() -> None:
 
 
 def bayes(
-    light: NDArray[np.float64], dark_rates: NDArray[np.float64]
+    light: NDArray[np.float64], dark_rates: NDArray[np.float64], shots: int = 1
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """P(c | object) of every word, float64 (objects, 2**d), and the log posterior of the classes (two objects each)."""
+    """P(c | object) of all vectors of counts, channel 0 the lowest digit, and the log posterior of the classes (two objects each)."""
+    base, d = shots + 1, light.shape[1]
     p = 1 - np.exp(-light) * (1 - dark_rates)
-    words = np.arange(1 << light.shape[1])
-    bits = (words[:, None] >> np.arange(light.shape[1])) & 1
-    like = np.prod(np.where(bits[None], p[:, None, :], 1 - p[:, None, :]), axis=2)
-    return like, np.log(like.reshape(-1, 2, len(words)).sum(axis=1).T + 1e-300)
+    each = np.stack([math.comb(shots, c) * p**c * (1 - p) ** (shots - c) for c in range(base)], axis=2)
+    digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
+    like = np.prod([each[:, channel, digits[:, channel]] for channel in range(d)], axis=0)
+    return like, np.log(like.reshape(-1, 2, base**d).sum(axis=1).T + 1e-300)
 
 
 def accuracy(labels: NDArray[np.int64], like: NDArray[np.float64]) -> float:
@@ -138,23 +139,6 @@ def test_tables_for_more_dark_counts_are_nearly_those_of_exact_bayes() -> None:
     assert max(kept) < 0.03
 
 
-def test_a_masked_channel_says_nothing_and_costs_what_it_must() -> None:
-    rng = np.random.default_rng(4)
-    light = rng.exponential(0.8, (8, 6))
-    like, scores = bayes(light, np.zeros(6))
-    masked = np.zeros(6, np.bool_)
-    masked[[1, 4]] = True
-    made = adapted_scores(scores.astype(np.float32), like.mean(axis=0), np.zeros(6), masked)
-    bits = (np.arange(64)[:, None] >> np.arange(6)) & 1
-    key = bits[:, ~masked] @ (1 << np.arange(4))
-    for value in range(16):
-        rows = made[key == value]
-        assert np.ptp(rows, axis=0).max() < 1e-5
-    without, _ = bayes(light[:, ~masked], np.zeros(4))
-    exact = np.log(without.reshape(-1, 2, 16).sum(axis=1).T)
-    assert (made.argmax(axis=1) == exact.argmax(axis=1)[key]).all()
-
-
 def test_unchanged_detector_leaves_the_table_as_it_is() -> None:
     rng = np.random.default_rng(5)
     scores = rng.normal(size=(64, 3)).astype(np.float32)
@@ -167,31 +151,15 @@ def test_unchanged_detector_leaves_the_table_as_it_is() -> None:
 # ---- tables of counts, and heads with too many of them ----
 
 
-def binomial(p: NDArray[np.float64], shots: int, count: int) -> NDArray[np.float64]:
-    return math.comb(shots, count) * p**count * (1 - p) ** (shots - count)
-
-
-def counts_bayes(
-    light: NDArray[np.float64], dark_rates: NDArray[np.float64], shots: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As `bayes`, for all vectors of counts, channel 0 the lowest digit."""
-    base, d = shots + 1, light.shape[1]
-    p = 1 - np.exp(-light) * (1 - dark_rates)
-    each = np.stack([binomial(p, shots, count) for count in range(base)], axis=2)  # objects, channels, counts
-    digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
-    like = np.prod([each[:, channel, digits[:, channel]] for channel in range(d)], axis=0)
-    return like, np.log(like.reshape(-1, 2, base**d).sum(axis=1).T + 1e-300)
-
-
 @pytest.mark.parametrize("shots", [1, 2, 3])
 def test_tables_of_counts_are_exact_when_the_prior_is(shots: int) -> None:
     """With the true P(c), new scores are the exact joint probability of the changed detector: loops over everything."""
     rng = np.random.default_rng(50)
     light, d, base = rng.exponential(0.8, (6, 4)), 4, shots + 1
     extra, masked = np.array([0.1, 0.0, 0.3, 0.0]), np.array([False, True, False, False])
-    like, scores = counts_bayes(light, np.zeros(d), shots)
+    like, scores = bayes(light, np.zeros(d), shots)
     made = adapted_scores(scores.astype(np.float32), like.mean(axis=0), extra, masked, base)
-    now, _ = counts_bayes(light[:, ~masked], extra[~masked], shots)
+    now, _ = bayes(light[:, ~masked], extra[~masked], shots)
     digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
     key = digits[:, ~masked] @ base ** np.arange(3)
     wanted = now.reshape(-1, 2, base**3).sum(axis=1).T / len(light)
@@ -226,18 +194,6 @@ def test_what_a_channel_meant_is_bayes() -> None:
     assert meant(seen, 0.0, masked=True) == pytest.approx(np.tile(own, (3, 1)))
 
 
-class Scored:
-    """A head that is a table of scores, behind the interface of a decider."""
-
-    name, n_classes = "scored", 4
-
-    def __init__(self, scores: NDArray[np.float64], base: int) -> None:
-        self.table = TableDecider(scores.astype(np.float32), base - 1, base - 1)
-        self.n_features = self.table.n_features
-        self.decide, self.decide_batch = self.table.decide, self.table.decide_batch
-        self.scores_batch = self.table.scores_batch
-
-
 def test_a_mixed_head_keeps_most_of_what_is_lost_without() -> None:
     """One dead and one hot channel: the head as it is, mixed over both, and exact for the changed detector."""
     rng = np.random.default_rng(52)
@@ -246,12 +202,12 @@ def test_a_mixed_head_keeps_most_of_what_is_lost_without() -> None:
     digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
     for _ in range(6):
         light = rng.exponential(0.8, (8, d)) * (rng.random((8, d)) < 0.6)
-        like, scores = counts_bayes(light, np.zeros(d), shots)
+        like, scores = bayes(light, np.zeros(d), shots)
         after = light.copy()
         after[:, 1] = 0.0
         extra, masked = np.array([0, 0, 0, 0.5, 0]), np.array([False, True, False, False, False])
-        like_now, best = counts_bayes(after, extra, shots)
-        adapter, head = HeadAdapter(d, shots), Scored(scores, base)
+        like_now, best = bayes(after, extra, shots)
+        adapter, head = HeadAdapter(d, shots), TableDecider(scores.astype(np.float32), shots, shots)
         for word in rng.choice(base**d, 3000, p=like.mean(axis=0) / like.mean(axis=0).sum()):
             adapter.count(digits[word])
         mixed = adapter.made(head, extra, masked)

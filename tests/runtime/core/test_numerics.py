@@ -1,12 +1,10 @@
 """The hard numerical cases of the runtime against mpmath and exact rationals, with the worst error that is allowed.
 
-Click probabilities have theirs in instrument/test_click_law.py, rounding of the heads in decide/test_mlp.py.
+Click probabilities have theirs in instrument/test_click_law.py, intervals in test_intervals.py, rounding of the heads in
+decide/test_mlp.py, folding of dead channels in trainer/export/test_writer.py.
 """
 
 from __future__ import annotations
-
-from fractions import Fraction
-from math import comb
 
 import mpmath
 import numpy as np
@@ -19,7 +17,6 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.kernels import winner
 from pans.runtime.decide.verdict import log_evidence, softmax_winner, softmax_winners
-from pans.runtime.intervals import binomial_tail, wilson_interval
 from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder
@@ -60,33 +57,6 @@ def test_scores_that_are_not_finite(scores: list[float], probability: float) -> 
         assert label == 1 or not probability
 
 
-@pytest.mark.parametrize("p", [0.0, 1e-9, 1e-3, 0.3, 0.9, 1.0])
-@pytest.mark.parametrize("n", [1, 20, 150])
-def test_dark_alarm_probabilities_are_exact(p: float, n: int) -> None:
-    """Relative error at most 1e-10 above the mean (at or below it the alarm does not ask)."""
-    exact_p = Fraction(p)
-    for clicks in {0, 1, n // 3, n - 1, n}:
-        exact = sum((comb(n, k) * exact_p**k * (1 - exact_p) ** (n - k) for k in range(clicks, n + 1)), Fraction(0))
-        found = binomial_tail(clicks, n, p)
-        if clicks > n * p and exact > Fraction(1, 10**290):
-            assert abs(Fraction(found) - exact) <= exact * Fraction(1, 10**10)
-        elif clicks > n * p:
-            assert 0 <= found <= 1e-289
-        else:
-            assert found == 1.0
-
-
-def test_dark_rates_after_a_thousand_million_frames() -> None:
-    clicks, exposures = 3 * 10**9 + 7, 10**12 + 1
-    low, high = wilson_interval(clicks, exposures)
-    with mpmath.workdps(40):
-        z, n, rate = mpmath.mpf("1.959963984540054"), mpmath.mpf(exposures), mpmath.mpf(clicks) / exposures
-        centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
-        half = z / (1 + z * z / n) * mpmath.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-        assert abs(low - (centre - half)) <= 1e-15 * centre
-        assert abs(high - (centre + half)) <= 1e-15 * centre
-
-
 def test_counters_and_ticks_far_beyond_32_bits() -> None:
     """Exposures past 2^44, ticks past 2^61, decisions past 2^33: Core and the streaming core write the same rows."""
     plan, n_features = parallel(10, 8), 10
@@ -110,32 +80,6 @@ def test_counters_and_ticks_far_beyond_32_bits() -> None:
     assert int(rows["tick"][-1]) == 2**61 + 8 * 100 + plan.exposure_ticks
     assert streamed.core.windows.tallies.tolist() == core.windows.tallies.tolist()
     assert streamed.core.windows.tallies[0] == 2**40 + n_features
-
-
-def test_folding_of_dead_and_saturated_channels_is_exact() -> None:
-    """Folded weights against rationals: worst relative error 8 units in the last place; dead channels give their constant only."""
-    pytest.importorskip("torch")
-    from pans.trainer.export.onnx_heads import EPSILON, fold_normalisation
-
-    rng = np.random.default_rng(3)
-    mean = np.array([0.0, 1.0, 1e-12, 1 - 1e-12, 1e-3, 0.5, 0.999])
-    weight, bias = rng.normal(size=(4, 7)), rng.normal(size=4)
-    gain, shift = rng.normal(size=7), rng.normal(size=7)
-    folded, constant, dead = fold_normalisation(weight, bias, gain, shift, mean)
-    assert dead == (0, 1, 2, 3)
-    assert (folded[:, :4] == 0).all()
-    with mpmath.workdps(50):
-        for h in range(4):
-            total = mpmath.mpf(float(bias[h]))
-            size = abs(total)
-            for i in range(7):
-                m = mpmath.mpf(float(mean[i]))
-                scale = mpmath.mpf(float(gain[i])) / mpmath.sqrt(m * (1 - m) + mpmath.mpf(EPSILON)) if i >= 4 else 0
-                exact = mpmath.mpf(float(weight[h, i])) * scale
-                assert abs(mpmath.mpf(float(folded[h, i])) - exact) <= 8 * abs(exact) * mpmath.mpf(2) ** -52
-                term = mpmath.mpf(float(weight[h, i])) * (mpmath.mpf(float(shift[i])) - m * scale)
-                total, size = total + term, size + abs(term)
-            assert abs(mpmath.mpf(float(constant[h])) - total) <= 16 * size * mpmath.mpf(2) ** -52
 
 
 def test_log_evidence_against_mpmath() -> None:

@@ -1,13 +1,17 @@
-"""The core: the same frames give the same decisions, and a window with a gap never gives a guess."""
+"""The core: the same frames give the same decisions, a window with a gap never gives a guess; and which marks it remembers."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from plans import parallel, shot_major
 
+from pans.runtime.core import marks
 from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
+from pans.runtime.core.marks import Marks
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DecisionWindows
 from pans.runtime.decide.verdict import Verdict, softmax_winner
@@ -15,6 +19,7 @@ from pans.runtime.instrument.channel_health import DeadChannelTest
 from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock, DeviceState, Frame, FrameDecoder, Mark, StateReason, Status
+from pans.runtime.wire.schema import MARK_DTYPE
 
 N_FEATURES = 3
 PLAN = shot_major(N_FEATURES, 2)  # 4 slots per cycle, 2 cycles per object
@@ -173,14 +178,6 @@ def test_exposures_beyond_the_plan_are_refused() -> None:
     assert decider.asked == []
 
 
-def test_the_same_frames_give_the_same_log() -> None:
-    rng = np.random.default_rng(3)
-    frames = [cycle(seq, seq, rng.integers(0, 2, 4).tolist()) for seq in range(6) if seq != 2]
-    logs = [[d for f in frames for d in core.step(f).decisions] for core in (make()[0], make()[0])]
-    assert logs[0] == logs[1]
-    assert [d.number for d in logs[0]] == list(range(6))
-
-
 def test_damaged_frames_change_nothing() -> None:
     core, _ = make()
     assert core.step(Frame(wire.MessageType.CLICKS, 0, 1, b"xx")).decisions == []
@@ -259,3 +256,37 @@ def test_the_watch_for_dead_channels_sees_only_what_was_measured() -> None:
     core.watch_blocks(np.zeros(20, np.uint16), np.ones(20, np.uint8), 0, rows)
     lit.end_object()
     assert (lit.objects, lit.clicked.tolist()) == (3, [3])
+
+
+def rows_of(some: list[Mark]) -> np.ndarray:
+    columns = ("seq", "object_index", "truth", "exposure_index", "tick", "photons", "half_exposures")
+    rows = np.zeros(len(some), MARK_DTYPE)
+    for name, values in zip(columns, zip(*some)):
+        rows[name] = values
+    return rows
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.one_of(st.integers(0, 9), st.lists(st.integers(0, 9), max_size=12)), max_size=20), st.booleans())
+def test_the_latest_objects_are_remembered(steps: list[int | list[int]], keeps: bool) -> None:
+    """One by one or many rows at once; one that comes again is as young as a new one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(marks, "MAX_MARKS", 4)
+        found, expected, seq = Marks(), dict[int, Mark](), 0
+        for step in steps:
+            some = []
+            for number in [step] if isinstance(step, int) else step:
+                seq += 1
+                some.append(Mark(seq, number, number - 1, 8 * seq, 10**15 + seq, 0.5 * seq, seq % 3))
+                expected.pop(number, None)
+                expected[number] = some[-1]
+                expected = dict(list(expected.items())[-4:])
+            if isinstance(step, int):
+                found.add(some[0])
+            elif some:
+                found.add_rows(rows_of(some))
+            assert [found.get(number) for number in range(10)] == [expected.get(number) for number in range(10)]
+        assert (len(found), found.latest()) == (len(expected), list(expected.values()))
+        if keeps:
+            found.keep(2)
+            assert found.latest() == list(expected.values())[-2:]

@@ -186,6 +186,8 @@ def test_unknown_actuators_are_refused_by_name() -> None:
     assert open_actuator("device", PROFILE) is None
     with pytest.raises(UsageError, match="no actuator 'sorter', known: device"):
         open_actuator("sorter:COM3", PROFILE)
+    with pytest.raises(UsageError, match="real time"):
+        open_actuator("sim:ideal?pace=fast", PROFILE)
 
 
 # -- a second instrument, in real time -----------------------------------------------------------------------------------
@@ -348,11 +350,6 @@ def test_another_instrument_than_the_profile_says_is_refused(serve_one: Callable
     with pytest.raises(DeviceError, match="flow-snspd says parallel"):
         second.connect()
     second.close()
-
-
-def test_virtual_time_is_refused() -> None:
-    with pytest.raises(UsageError, match="real time"):
-        open_actuator("sim:ideal?pace=fast", PULSER)
 
 
 @pytest.mark.parametrize("name", ["ideal", "oled-qcmos", "dmd-spad", "wdm-snspd", "flow-snspd"])

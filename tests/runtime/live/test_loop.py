@@ -1,9 +1,10 @@
-"""The whole way, in virtual time, against the simulated instrument: decisions, losses, recordings, replays, refusals."""
+"""The whole way, in virtual time, against the simulated instrument: decisions, losses, recordings, replays, refusals, dark counts."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -11,17 +12,23 @@ from bundles import made_bundle
 from commands import json_of
 from heads import onnx_chain, random_layers
 from links import Wrapped
+from small_files import small_calibration
 
 from pans.firmware_sim.ports.serve import open_sim
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import Bundle, write_bundle
+from pans.runtime.core.decision import Decision
 from pans.runtime.core.plan import build_plan
 from pans.runtime.core.plan_codec import plan_chunks, plan_from_chunks
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DeviceError, LinkError
+from pans.runtime.instrument.calibration import load_calibration
+from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link
 from pans.runtime.live import RunOptions, RunResult, run_live
+from pans.runtime.live.dark_run import DarkRun
 from pans.runtime.record import read_recording
 
 PROFILE = load_profile("oled-qcmos")
@@ -194,3 +201,29 @@ def test_a_recording_replays_to_the_same_hash_and_another_bundle_does_not(
     write_bundle(other, tmp_path / "other.pans")
     again = json_of(capsys, "replay", summary["recording"], "--bundle", tmp_path / "other.pans", code=1)
     assert again["identical"] is False
+
+
+@pytest.mark.parametrize(
+    ("clicks", "contradicts"), [(0, False), (10, False), (40, False), (70, False), (120, True), (10_000, True)]
+)
+def test_dark_counts_beyond_the_calibration_are_a_fault(clicks: int, contradicts: bool, tmp_path: Path) -> None:
+    small_calibration(tmp_path)  # 0 to 0.004 clicks per exposure of 100 us
+    profile, bundle, plan = small_setup()
+    dark = DarkRun(profile, load_calibration(tmp_path / "calibration.json"), "warn", [])
+    assert dark.guard(plan, bundle, 1) is not None
+    report = DarkReport(10_000, clicks, clicks / 10_000, 0.0, 1.0, 0.001, "")
+    faults = dark.figures(report).faults
+    assert bool(faults) == contradicts
+    assert all("the calibration contradicts the dark counts" in fault for fault in faults)
+    assert DarkRun(profile, None, "warn", []).figures(report).faults == []
+
+
+@pytest.mark.parametrize("present", [[], ["a burst"]])
+def test_a_state_of_the_detector_is_no_change_of_light(present: list[str]) -> None:
+    dark: Any = DarkRun(small_setup()[0], None, "warn", [])
+    dark.light = MagicMock()
+    dark.light.take.return_value = []
+    run, output = MagicMock(), MagicMock(decisions=[Decision(0, 0, 0, 0, 0, 4, 1, 1, 0, 0.9, 0)])
+    run.core.guard.health.present = present
+    dark.look(run, output)
+    assert dark.light.take.called == (not present)

@@ -131,17 +131,13 @@ def wrong_verdicts(folder: Path, sessions: int, monkeypatch: pytest.MonkeyPatch)
     return wrong, kinds
 
 
-def test_no_session_is_judged_wrongly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong, kinds = wrong_verdicts(tmp_path, 6, monkeypatch)
+@pytest.mark.parametrize(("sessions", "each"), [(6, 1), pytest.param(200, 21, marks=pytest.mark.slow)])
+def test_no_session_is_judged_wrongly(
+    sessions: int, each: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong, kinds = wrong_verdicts(tmp_path, sessions, monkeypatch)
     assert wrong == []
-    assert min(kinds[1:]) >= 1
-
-
-@pytest.mark.slow
-def test_no_session_of_many_is_judged_wrongly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong, kinds = wrong_verdicts(tmp_path, 200, monkeypatch)
-    assert wrong == []
-    assert min(kinds[1:]) > 20
+    assert min(kinds[1:]) >= each
 
 
 @pytest.mark.parametrize(("how", "code"), [(EQUAL, 0), (CHANGED_FIRST, 4), (CHANGED_LATER, 4)])

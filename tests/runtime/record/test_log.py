@@ -76,22 +76,10 @@ def logs(draw: st.DrawFn) -> np.ndarray:
         steps = [draw(st.sampled_from([0, 1, 100, 2**32 - 1, 2**32])) for _ in range(2)] + [draw(small)]
         for k in range(draw(st.integers(1, 7))):
             label, probability = draw(small), draw(st.sampled_from([0.5, 0.0, -0.0, float("nan")]))
-            rows.append(
-                (
-                    (index + k) % 2**64,
-                    (tick + k * steps[0]) % 2**64,
-                    (exposure + k * steps[1]) % 2**64,
-                    number,
-                    (shot + k * steps[2]) % 2**32,
-                    label,
-                    label,
-                    truth,
-                    0,
-                    probability,
-                    7 * label,
-                    draw(st.sampled_from([0, 1, 2**32 - 1])) if walks else 0,
-                )
-            )
+            walked = draw(st.sampled_from([0, 1, 2**32 - 1])) if walks else 0
+            when = ((start + k * step) % 2**64 for start, step in ((index, 1), (tick, steps[0]), (exposure, steps[1])))
+            what = (number, (shot + k * steps[2]) % 2**32, label, label, truth, 0, probability, 7 * label, walked)
+            rows.append((*when, *what))
     return np.array(rows, DECISION_DTYPE)
 
 

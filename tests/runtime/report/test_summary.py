@@ -1,13 +1,20 @@
-"""The summary of a seeded run in virtual time, compared key by key with a stored one: scripts read it."""
+"""The summary of a seeded run, compared key by key with a stored one; latencies in words: what the clock cannot resolve is never 0."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import fixed_run, json_of
+from mutated_sessions import Stage
+
+from pans.runtime.report.summary import Summary
+from pans.runtime.report.summary_page import write_markdown
+from pans.runtime.report.words import closing_words
 
 MEASURED = ("armed_after_s", "realtime", "page_faults", "recording", "report")  # of this machine and this run
 
@@ -36,3 +43,55 @@ def test_the_summary_has_the_contracts_keys_order_and_values(
             assert found[key] == wanted[key], key
             if isinstance(wanted[key], dict):
                 assert list(found[key]) == list(wanted[key]), key
+
+
+@pytest.fixture(scope="module")
+def summary(tmp_path_factory: pytest.TempPathFactory) -> Summary:
+    made = Stage("sequential").run(tmp_path_factory.mktemp("run"), 1).summary
+    assert made is not None
+    return made
+
+
+def seen(summary: Summary, p50: float, p99: float, uncertainty_us: float) -> Summary:
+    row = {"p50": p50, "p99": p99, "p999": 3000.0, "max": 3000.0}
+    stages = summary.stage_latency_us | {"link": row, "decode": {**row, "p50": 0.0}}
+    return replace(summary, latency_us=row, stage_latency_us=stages, clock={"worst_uncertainty_us": uncertainty_us})
+
+
+@pytest.mark.parametrize(
+    ("p50", "p99", "uncertainty_us", "words"),
+    [
+        (120.0, 900.0, 5000.0, "p50 120 us, p99 900 us, p99.9 3000 us, max 3000 us; late"),
+        (0.0, 0.0, 4.2, "p50 0 us, p99 0 us, p99.9 3000 us, max 3000 us; late"),
+        (0.0, 0.0, 2345.0, "p99.9 3000 us, max 3000 us, else not resolved (clock uncertainty 2.3 ms); late"),
+    ],
+)
+def test_closing_words(summary: Summary, p50: float, p99: float, uncertainty_us: float, words: str) -> None:
+    assert f"latency       {words}" in closing_words(seen(summary, p50, p99, uncertainty_us), "r", "s")
+
+
+def test_nothing_resolved(summary: Summary) -> None:
+    row = dict.fromkeys(("p50", "p99", "p999", "max"), 0.0)
+    doubtful = replace(summary, latency_us=row, clock={"worst_uncertainty_us": 1500.0})
+    assert "latency       not resolved (clock uncertainty 1.5 ms); late 0" in closing_words(doubtful, "r", "s")
+
+
+def test_the_page_has_no_zero_that_was_not_measured(summary: Summary, tmp_path: Path) -> None:
+    doubtful = seen(summary, 0.0, 0.0, 2345.0)
+    write_markdown(tmp_path / "s.md", doubtful, {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
+    rows = [line for line in (tmp_path / "s.md").read_text().splitlines() if line.startswith("| ")]
+    assert "| **exposure end to decision** | not resolved | not resolved | 3000 | 3000 |" in rows
+    assert "| link | not resolved | not resolved | 3000 | 3000 |" in rows
+    assert "| decode | 0 | 0 | 3000 | 3000 |" in rows  # of the host's own clock
+
+
+def test_objects_that_come_again_are_no_trials(summary: Summary, tmp_path: Path) -> None:
+    tally = replace(summary.tally, objects=200, trials=5, decisions=1000)
+    said = closing_words(replace(summary, tally=tally), "r", "s")
+    assert "1000 decisions (200 objects × 5 trials)" in said
+    again = replace(summary, tally=replace(tally, trials=1, decisions=88_334))
+    assert "88334 decisions (200 objects, 441.7 decisions on each on average)" in closing_words(again, "r", "s")
+    write_markdown(tmp_path / "s.md", again, {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
+    assert "| objects | 200 objects, 441.7 decisions on each on average |" in (tmp_path / "s.md").read_text()
+    unknown = replace(summary, tally=replace(tally, objects=0, trials=0))
+    assert "1000 decisions (true classes unknown)" in closing_words(unknown, "r", "s")

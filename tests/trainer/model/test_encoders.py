@@ -1,4 +1,4 @@
-"""Active illumination: squared weights inside the limits of the projector, whole levels, gradients through the rounding."""
+"""Encoders: active patterns within the projector's limits, coherent fields and their basis, light through optics and bleaching."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ import torch
 from trainings import random_machine
 
 from pans.runtime.bundle.optics import amplification
+from pans.runtime.imaging import Bleaching, Imaging, bleached, met
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.machine import Aim, Sight, backward, forward
@@ -17,6 +18,8 @@ from pans.trainer.model.encoders import (
     new_encoder,
 )
 from pans.trainer.model.exposure import exposure_us_of, top_limits
+from pans.trainer.model.field_basis import discriminant_basis, in_pixels
+from pans.trainer.model.imaging import bleached_patterns, through
 from pans.trainer.options import Options
 
 
@@ -178,3 +181,91 @@ def test_limits_of_the_top_level_are_those_of_the_exposure_or_of_dark_counts():
         assert low == pytest.approx(profile.exposure.min_us)
         dark = high * 1e-6 * profile.detector.dark_rate_hz
         assert (high, dark) == pytest.approx((profile.exposure.max_us, dark) if most is None else (high, most))
+
+
+def scenes(n=3000, side=8):
+    """A bright background of one shape and any brightness; class 1 has a faint spot of either sign on top."""
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 2, n)
+    shape = np.outer(np.linspace(0.5, 1, side), np.linspace(1, 0.3, side)).ravel()
+    spot = np.zeros((side, side))
+    spot[2:4, 5] = 1
+    signs = rng.choice([-1, 1], n) * labels
+    fields = (
+        rng.uniform(2, 6, (n, 1)) * shape + 0.2 * signs[:, None] * spot.ravel() + 0.02 * rng.normal(size=(n, side**2))
+    )
+    return torch.from_numpy(fields).float(), torch.from_numpy(labels), shape, spot.ravel()
+
+
+def test_the_first_field_sees_the_event_and_not_the_background():
+    fields, labels, shape, spot = scenes()
+    basis = discriminant_basis(fields, labels, (8, 8), 2)
+    assert basis.shape == (64, 4)
+    torch.testing.assert_close((fields @ basis).square().mean(dim=0), torch.ones(4), rtol=1e-3, atol=0)
+    first = basis[:, 3].double().numpy()  # class 1, the largest eigenvalue
+    assert abs(first @ shape) < 0.02 * abs(first @ spot)
+    power = (fields @ basis[:, 3:]).square()[:, 0]
+    assert float(power[labels == 1].mean() / power[labels == 0].mean()) > 50
+
+
+@pytest.mark.parametrize("complex_field", [False, True])
+def test_an_encoder_of_coordinates_is_one_of_pixels(complex_field):
+    rng = torch.Generator().manual_seed(1)
+    x, basis = torch.rand(20, 30, generator=rng), torch.rand(30, 5, generator=rng)
+    encoder = CoherentField(3, 5, rng, complex_field=complex_field)
+    torch.testing.assert_close(in_pixels(encoder, basis)(x), encoder(x @ basis), rtol=1e-4, atol=1e-5)
+
+
+SHAPE = (6, 7)
+FLAT = np.linspace(0.5, 1.5, 42).reshape(SHAPE)
+TABLE = Imaging(0.4, -0.3, 5.0, 1.02, 0.6, black=0.02, gain=1.1, flat=FLAT)
+
+
+def test_the_light_of_patterns_is_that_of_the_runtimes_model():
+    rng = np.random.default_rng(0)
+    objects, patterns = torch.from_numpy(rng.random((5, 42))), torch.from_numpy(rng.random((3, 42)))
+    full = patterns.amax(dim=1, keepdim=True)
+    light = through(TABLE, objects, SHAPE) @ torch.cat([patterns, full], dim=1).T
+    wanted = met(TABLE, patterns.numpy(), SHAPE, full.numpy()) @ objects.numpy().T
+    np.testing.assert_allclose(light.numpy(), wanted.T, rtol=1e-12)
+
+
+@pytest.mark.parametrize("low", [0.01, 1.5])
+def test_an_encoder_lights_dark_pixels_by_its_brightest_level(low):
+    random = torch.Generator().manual_seed(0)
+    encoder = ActiveIllumination(3, 42, (low, 2.0), random)
+    objects = torch.rand((4, 42), generator=random, dtype=torch.float64)
+    for levels in (None, 16):
+        if levels:
+            encoder.start_quantising(levels)
+        patterns = encoder.patterns().detach().double()
+        full = float(max(patterns.max(), low) if levels is None else encoder.top().detach())
+        wanted = objects.numpy() @ met(TABLE, patterns.numpy(), SHAPE, full).T
+        found = encoder(through(TABLE, objects, SHAPE).float()).detach().numpy()
+        np.testing.assert_allclose(found, wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+@pytest.mark.parametrize("dose", [1e-2, 0.7, 1e5])
+def test_patterns_bleach_in_training_as_they_do_elsewhere(dose: float, mixed: bool) -> None:
+    light = torch.from_numpy(np.random.default_rng(3).random((4, 6)) * 2)
+    light[1, 2] = 0.0
+    law = Bleaching(dose, mixed)
+    np.testing.assert_allclose(bleached_patterns(law, light).numpy(), bleached(law, light.numpy()), rtol=1e-9)
+    small = light.float()[:3, :2].double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: bleached_patterns(law, x), (small,), eps=1e-6 * min(1.0, dose), rtol=1e-3)
+
+
+def test_training_can_raise_the_brightest_level_from_its_least():
+    encoder = ActiveIllumination(1, 42, (0.1, 2.0), torch.Generator().manual_seed(2))
+    encoder.start_quantising(1 << 16)
+    encoder.pulled = True
+    one = torch.zeros(1, 43)
+    one[0, 7], one[0, 42] = 1.0, 0.002  # an object of one pixel, and what dark pixels leak on it
+    optimiser = torch.optim.Adam(encoder.parameters(), lr=0.02)
+    for _ in range(150):
+        optimiser.zero_grad()
+        (encoder(one) - 0.7).square().sum().backward()
+        optimiser.step()
+        encoder.dim_to_top()
+    assert float(encoder(one).detach()) == pytest.approx(0.7, rel=0.05)

@@ -1,4 +1,6 @@
-"""Gradient estimators: exact against finite differences, the unbiased ones against exact, the flips against plain passes."""
+"""Gradient estimators against finite differences and exact ones, heads and their flips against plain passes, SSIM against an oracle."""
+
+from __future__ import annotations
 
 import itertools
 import math
@@ -21,7 +23,9 @@ from pans.trainer.model.estimators import (
     similarity_loss,
     squared_error,
 )
-from pans.trainer.model.heads import MlpHead
+from pans.trainer.model.heads import MlpHead, new_head
+from pans.trainer.model.ssim import ssim
+from pans.trainer.options import PICTURE_HEADS, Options
 
 READ_NOISE = ClickLaw(dark_per_exposure=1.8e-5, read_noise_e=0.2, threshold_e=0.84)
 D_F, N, CLASSES = 4, 6, 3
@@ -219,3 +223,47 @@ def test_the_local_gradient_is_unbiased() -> None:
     error = drawn.std(axis=0) / math.sqrt(len(drawn))
     assert (np.abs(drawn.mean(axis=0) - wanted) < 5 * error + 1e-12).all()
     assert np.abs(wanted).max() > 20 * error.max()
+
+
+def head_of(kind, d_f, seed=0):
+    return new_head(Options(features=d_f, hidden=8, head=kind), 5, (9, 6), torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("d_f", [1, 2, 3, 4, 5, 7, 10, 16, 33, 64])
+def test_the_convolutional_head_is_valid_for_every_number_of_patterns(d_f):
+    head = head_of("conv", d_f)
+    assert head(torch.zeros(3, d_f)).shape == (3, 5)
+    out = head(torch.rand(8, d_f, generator=torch.Generator().manual_seed(1)))
+    out.sum().backward()
+    assert all(bool((parameter.grad != 0).any()) for parameter in head.convolutions.parameters())
+
+
+@pytest.mark.parametrize("kind", ["mlp", "deep", "conv", "picture", "decoder"])
+def test_flipped_is_a_pass_of_every_flipped_word(kind):
+    head = head_of(kind, 4).double()
+    assert head(torch.zeros(3, 4).double()).shape == (3, 54 if kind in PICTURE_HEADS else 5)
+    clicks = torch.randint(0, 2, (6, 4), generator=torch.Generator().manual_seed(2)).double()
+    mean = torch.tensor([0.2, 0.5, 0.7, 0.4], dtype=torch.float64)
+    with torch.no_grad():
+        found = head.changed(clicks, mean, 1 - 2 * clicks)
+        for i in range(4):
+            other = clicks.clone()
+            other[:, i] = 1 - other[:, i]
+            assert torch.allclose(found[:, i], head(other, mean), atol=1e-12)
+
+
+def test_the_mean_is_that_of_the_slow_oracle_the_edge_included() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.random((2, 9, 14))
+    wanted = np.mean(naive_ssim.ssim_map(a.tolist(), b.tolist()))
+    assert float(ssim(torch.from_numpy(a), torch.from_numpy(b))) == pytest.approx(wanted, abs=1e-12)
+
+
+def test_the_gradient_is_that_of_the_pixels() -> None:
+    a, b = torch.rand(2, 2, 5, 7, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    for both in (False, True):
+        assert torch.autograd.gradcheck(ssim, (a.requires_grad_(), b.requires_grad_(both)))
+    black = torch.zeros(1, 12, 12, requires_grad=True)
+    ssim(black, torch.zeros(1, 12, 12)).sum().backward()
+    assert black.grad is not None
+    assert not black.grad.any()  # at its best already

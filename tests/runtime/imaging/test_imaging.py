@@ -1,12 +1,31 @@
-"""What the pattern grid meets of an object, held against rendering with 256 points per pixel, Fourier's theorem and numpy.rot90."""
+"""What the pattern grid meets of an object, held against renderings; the spelling of --optics; bleaching, to 60 digits."""
+
+from __future__ import annotations
 
 import math
 
+import mpmath
 import numpy as np
 import pytest
 from naive_imaging import rendered
 
-from pans.runtime.imaging import IDENTITY, Imaging, levelled, met, operator, seen
+from pans.runtime.imaging import (
+    IDENTITY,
+    NO_BLEACHING,
+    Bleaching,
+    Imaging,
+    Tolerance,
+    bleached,
+    bleaching_of,
+    imaging_of,
+    is_spec,
+    levelled,
+    mean_left,
+    met,
+    operator,
+    seen,
+    tolerance_of,
+)
 from pans.runtime.imaging.sampling import _gathered, _tail
 
 SHAPE = (9, 12)
@@ -168,3 +187,148 @@ def test_sizes_that_do_not_fit_are_refused():
         operator(IDENTITY, (65, 64))
     with pytest.raises(ValueError, match="flat field is"):
         met(Imaging(flat=np.ones((2, 2))), np.zeros((1, 108)), SHAPE)
+
+
+def test_one_truth_is_read():
+    found = imaging_of("shift=0.7,-0.3:rotate=1.5:scale=98%:psf=0.7:gain=-5%:black=0.002".replace("98%", "0.98"))
+    assert found.numbers() == {
+        "right_px": 0.7,
+        "down_px": -0.3,
+        "rotation_deg": 1.5,
+        "scale": 0.98,
+        "psf_px": 0.7,
+        "black": 0.002,
+        "gain": 0.95,
+    }
+
+
+def test_a_tolerance_is_read_and_drawn_from():
+    found = tolerance_of("shift=1:rotate=2:scale=3%:psf=0.5..0.8:black=0.002:gain=0.9..1.05")
+    assert found == Tolerance((-1, 1), (-1, 1), (-2, 2), (0.97, 1.03), (0.5, 0.8), (0.002, 0.002), (0.9, 1.05))
+    random = np.random.default_rng(1)
+    draws = [found.draw(random).numbers() for _ in range(2000)]
+    for name, (low, high) in found.as_dict().items():
+        values = np.array([one[name] for one in draws])
+        assert low <= values.min()
+        assert values.max() <= high
+        assert abs(values.mean() - (low + high) / 2) <= 5 * (high - low) / np.sqrt(12 * len(values)) + 1e-12
+        assert values.std() == pytest.approx((high - low) / np.sqrt(12), rel=0.1, abs=1e-12)
+    pairs = np.array([(one["right_px"], one["down_px"]) for one in draws])
+    assert abs(np.corrcoef(pairs.T)[0, 1]) < 5 / np.sqrt(2000)
+
+
+def test_the_edges_are_the_corners_of_shift_and_rotation():
+    edges = tolerance_of("shift=1,0.5:rotate=2:psf=0.5..0.8:black=0.002").edges()
+    assert {(one.right_px, one.down_px, one.rotation_deg) for one in edges} == {
+        (right, down, turn) for right in (-1, 1) for down in (-0.5, 0.5) for turn in (-2, 2)
+    }
+    assert {(one.psf_px, one.black) for one in edges} == {(0.8, 0.002)}
+    assert len(tolerance_of("psf=0.5").edges()) == 1
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "words"),
+    [
+        (imaging_of, "", "0 characters"),
+        (imaging_of, "x" * 500, "500 characters"),
+        (imaging_of, "shift", "KEY=VALUE"),
+        (imaging_of, "tilt=1", "shift, rotate"),
+        (imaging_of, "psf=0.5:psf=0.6", "twice"),
+        (imaging_of, "shift=1", "RIGHT,DOWN"),
+        (imaging_of, "psf=nan", "finite"),
+        (imaging_of, "psf=-1", "psf_px"),
+        (imaging_of, "gain=-100%", "gain"),
+        (tolerance_of, "psf=0.8..0.5", "lower one first"),
+        (tolerance_of, "shift=1,2,3", "RIGHT,DOWN"),
+        (tolerance_of, "rotate=1e9", "rotation_deg"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(read, text, words):
+    with pytest.raises(ValueError, match=words):
+        read(text)
+
+
+def test_a_spec_is_told_from_the_name_of_a_bundle():
+    assert is_spec("shift=1,2")
+    assert not is_spec("folder/shift=1.pans")
+    assert not is_spec("psf")
+
+
+def test_a_tolerance_is_spelled_as_it_is_read():
+    found = tolerance_of("shift=1,0.1:rotate=2:scale=3%:psf=0.5..0.8:black=0.002:gain=0.9..1.05")
+    assert tolerance_of(found.spelled()) == found
+    assert found.words().startswith("right_px -1 to 1, down_px -0.1 to 0.1, rotation_deg -2 to 2, scale 0.97 to 1.03")
+    assert Tolerance().words() == "perfect optics"
+
+
+RNG = np.random.default_rng(11)
+
+
+@pytest.mark.parametrize("dose", [1e-9, 1e-3, 0.7, 40.0, 1e6, 1e15])
+def test_the_law_holds_at_tiny_and_huge_doses(dose: float) -> None:
+    light = np.array([[1e-12, 0.3, 5.0, 1e4], [0.0, 2.0, 1e-6, 20.0], [3.0, 0.1, 9.0, 1e-3]])
+    found = bleached(Bleaching(dose), light)
+    with mpmath.workdps(60):
+        for pixel in range(light.shape[1]):
+            before = mpmath.mpf(0)
+            for row in range(len(light)):
+                shown = mpmath.mpf(light[row, pixel])
+                after = before + shown
+                wanted = mpmath.mpf(dose) * (mpmath.exp(-before / dose) - mpmath.exp(-after / dose))
+                # the exponent itself is known to a few ulp, so that its exponential is to that many times its size
+                size = max(1.0, min(750.0, float(before / dose)))
+                assert abs(found[row, pixel] - wanted) <= 4e-15 * size * wanted + mpmath.mpf(10) ** -300
+                before = after
+
+
+def test_the_mean_over_an_exposure_has_its_limits() -> None:
+    assert mean_left(np.array([0.0, 5e-324, 1e-9])).tolist() == [1.0, 1.0, 1.0 - 0.5e-9]
+    assert mean_left(np.array([1e30]))[0] == pytest.approx(1e-30, rel=1e-15)
+    assert mean_left(np.array([math.log(2)]))[0] == pytest.approx(0.5 / math.log(2), rel=1e-15)
+
+
+def _dying(light: np.ndarray, dose: float, mixed: bool, emitters: int, steps: int) -> np.ndarray:
+    """Emitters that die one by one: in every small step each one glows by its light, then dies with that light's chance."""
+    pixels = light.shape[1]
+    alive = np.ones((pixels, emitters), bool)
+    glow = np.zeros(light.shape)
+    for row, shown in enumerate(light):
+        part = shown / steps
+        for _ in range(steps):
+            glow[row] += alive.mean(axis=1) * part
+            received = np.full(pixels, part.mean()) if mixed else part
+            alive &= RNG.random(alive.shape) >= (received / dose)[:, None]
+    return glow
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_emitters_that_die_one_by_one_give_the_law(mixed: bool) -> None:
+    light = np.array([[4.0, 0.0, 1.0], [0.0, 6.0, 2.0], [3.0, 1.0, 0.5]])
+    dose, emitters, steps = 5.0, 20_000, 100
+    found = bleached(Bleaching(dose, mixed), light)
+    simulated = _dying(light, dose, mixed, emitters, steps)
+    # the share alive has at most the variance 1/4 over the emitters; a step of light / steps is off by half of itself over the dose
+    allowed = light * (5 * 0.5 / math.sqrt(emitters) + light.max() / steps / dose)
+    assert (np.abs(found - simulated) <= allowed).all()
+    assert (found[2] < 0.75 * light[2]).all()  # it bleaches by much more than that
+
+
+def test_light_that_stays_is_as_it_was_and_order_matters() -> None:
+    light = RNG.random((4, 9)) * 3
+    np.testing.assert_array_equal(bleached(NO_BLEACHING, light), light)
+    one = bleached(Bleaching(2.0), light)
+    back = bleached(Bleaching(2.0), light[::-1])[::-1]
+    np.testing.assert_allclose(one.sum(axis=0), back.sum(axis=0), rtol=1e-13)  # what a pixel gives in all is the same
+    assert not np.allclose(one, back)
+    np.testing.assert_allclose(bleached(Bleaching(1e14), light), light, rtol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["", "x", "0", "-3", "nan", "inf", "40:", "40:fixed", "1e16", "40:mixed:"])
+def test_what_is_no_law_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="bleaching"):
+        bleaching_of(text)
+
+
+@pytest.mark.parametrize("law", [Bleaching(40.0), Bleaching(0.3, True)])
+def test_a_law_is_read_back_as_it_was_spelled(law: Bleaching) -> None:
+    assert bleaching_of(law.spelled()) == law
