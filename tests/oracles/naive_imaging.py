@@ -15,9 +15,8 @@ FINE, PAD = 16, 7  # points per pixel and axis; pixels around the object
 def rendered(imaging: Imaging, image: NDArray[np.float64]) -> NDArray[np.float64]:
     """The object as constant squares, looked up point by point, blurred on the fine grid by the FFT, averaged per pattern pixel."""
     rows, columns = image.shape
-    fine = (
-        (np.arange((max(rows, columns) + 2 * PAD) * FINE) + 0.5) / FINE - PAD - 0.5
-    )  # pixel k covers k - 0.5 .. k + 0.5
+    # pixel k covers k - 0.5 .. k + 0.5
+    fine = (np.arange((max(rows, columns) + 2 * PAD) * FINE) + 0.5) / FINE - PAD - 0.5
     down, right = np.meshgrid(fine, fine, indexing="ij")
     down, right = down - (rows - 1) / 2 - imaging.down_px, right - (columns - 1) / 2 - imaging.right_px
     up = -down

@@ -75,10 +75,18 @@ def test_all_faults_of_a_folder_are_listed_at_once(tmp_path):
     Image.fromarray(RAMP[:, :3]).save(tmp_path / "dogs/small.png")
     (tmp_path / "dogs/notes.txt").write_text("not a picture")
     (tmp_path / "cats/more").mkdir()
+    (tmp_path / "empty/.DS_Store").write_bytes(b"litter")
     with pytest.raises(UsageError) as caught:
         read_class_folder(tmp_path, 10_000)
     lines = caught.value.message.split("\n")
     assert lines[0] == f"{tmp_path}: 5 faults"
-    for name in ("stray.png", "more", "small.png", "notes.txt", "empty"):
-        assert any(name in line for line in lines[1:]), name
+    faults = {
+        "stray.png": "beside",
+        "more": "within",
+        "small.png": "4 x 3",
+        "notes.txt": "",
+        "empty": "without pictures",
+    }
+    for name, why in faults.items():
+        assert any(name in line and why in line for line in lines[1:]), name
     assert caught.value.remedy

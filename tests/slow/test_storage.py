@@ -152,9 +152,8 @@ def judge(bench: Bench, case: Case, before: dict[str, bytes], ended: Ended, faul
         assert set(case.leaves) <= new, f"exit code {ended.code} without {set(case.leaves) - new}"
     elif ended.code == 2:
         assert "pans: " in ended.said
-        assert fault in (Fault.FAIL_ON, Fault.FAIL_ONCE) or not hidden, (
-            hidden
-        )  # where even removing fails something stays
+        # where even removing fails something stays
+        assert fault in (Fault.FAIL_ON, Fault.FAIL_ONCE) or not hidden, hidden
         if case.words.startswith("run"):
             assert light_is_off(bench.trace)
     for name in new - hidden:

@@ -29,9 +29,8 @@ def test_contradictions_are_a_fault_and_stand_in_the_file(
     lie = Mutation("CLICKS", "object_index", by=17, most=3)
     monkeypatch.setattr(base, "open_link", lambda url: MutatedLink(opened(url), (lie,), Evidence(1 << 40, 2, 10**6)))
     out = tmp_path / "c.json"
-    assert pans("calibrate", "--device", URL, "--seconds", "0.5", "-o", out, code=EXIT_TIMING)["contradictions"] == {
-        "object": 6
-    }  # in each of the two stages
+    found = pans("calibrate", "--device", URL, "--seconds", "0.5", "-o", out, code=EXIT_TIMING)
+    assert found["contradictions"] == {"object": 6}  # in each of the two stages
     (doubt,) = find_warnings(load_calibration(out), now_utc())
     assert "contradicted each other" in doubt
 

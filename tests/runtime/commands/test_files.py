@@ -120,10 +120,8 @@ def test_one_damaged_file_does_not_hide_the_others(tmp_path: Path, pans: Pans) -
         ([decision(0, flags=1 << 20)], "flags that this version does not know"),
         ([decision(0, probability=1.5)], "probability"),
         ([decision(0, probability=float("nan"))], "probability"),
-        (
-            [decision(0, flags=9, label=0xFFFF, probability=0.0)],
-            "cannot be rebuilt",
-        ),  # of the toy; an abstention itself is fine
+        # of the toy; an abstention itself is fine
+        ([decision(0, flags=9, label=0xFFFF, probability=0.0)], "cannot be rebuilt"),
     ],
 )
 def test_decisions_that_cannot_be_true(rows: list[tuple[Any, ...]], reason: str, tmp_path: Path, pans: Pans) -> None:

@@ -28,8 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def contents(folder: Path) -> dict[str, bytes]:
     """Every file of a folder, and every folder in it."""
-    paths = sorted(folder.rglob("*"))
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in paths}
+    return {str(path): path.read_bytes() if path.is_file() else b"" for path in sorted(folder.rglob("*"))}
 
 
 REFUSED = [  # what is asked for, what is there already, and why it is refused
@@ -56,28 +55,24 @@ def test_a_refused_run_touches_nothing(words: str, there: list[str], why: str, f
 
 
 def test_force_replaces_and_only_what_is_written(folder: Path, pans: Pans) -> None:
-    pans(*words("--out", "a"))
+    pans(*RUN, "--out", "a")
     (folder / "a" / "run-2notes.pansrec").write_bytes(b"mine")
     first = read_recording("a/run.pansrec").decisions_sha256
     assert main([*RUN, "--out", "a"]) == 2
-    pans(*words("--out", "a", "--force", "--shots", "2"))
+    pans(*RUN, "--out", "a", "--force", "--shots", "2")
     assert read_recording("a/run.pansrec").decisions_sha256 != first
-    parted = pans(*words("--out", "a", "--force", "--rotate-mb", "0.3"))
+    parted = pans(*RUN, "--out", "a", "--force", "--rotate-mb", "0.3")
     assert parted["recording"] == "a/run.pansrec"
     assert sorted(os.listdir("a")) == ["run-0001.pansrec", "run-2notes.pansrec", "summary.md"]
 
 
-def words(*more: str) -> tuple[str, ...]:
-    return (RUN[0], *RUN[1:], *more)
-
-
 def test_a_run_of_its_own_gets_a_folder_with_its_date(folder: Path, pans: Pans) -> None:
-    found = [pans(*words()) for _ in range(2)]
+    found = [pans(*RUN) for _ in range(2)]
     assert found[0]["recording"] != found[1]["recording"]
     assert found[0]["recording"].startswith("pans-runs/20")
     assert Path("pans-runs/latest/run.pansrec").samefile(found[1]["recording"])
     assert all(Path(one[key]).is_file() for one in found for key in ("recording", "report"))
-    recorded = pans(*words("--record", "a.pansrec"))
+    recorded = pans(*RUN, "--record", "a.pansrec")
     assert (recorded["recording"], recorded["report"]) == ("a.pansrec", "a.summary.md")
     assert not [name for name in contents(folder) if "lock" in name or "partial" in name]
 
@@ -92,13 +87,13 @@ def test_a_folder_belongs_to_one_run_at_a_time(folder: Path, pans: Pans) -> None
 
 @pytest.mark.parametrize("parts", [(), ("--rotate-mb", "0.3")], ids=["one file", "parts"])
 def test_a_device_that_refuses_costs_no_recording(parts: tuple[str, ...], folder: Path, pans: Pans) -> None:
-    pans(*words("--out", "a", *parts))
+    pans(*RUN, "--out", "a", *parts)
     before = contents(Path("a"))
     other = "sim:ideal?pace=fast&scene=fashion200"  # counts other ticks than the profile says
     refused = ["run", "self.pans", "--device", other, "--profile", "oled-qcmos", "--decisions", "5"]
     assert "the device" in pans.refuses(*refused, "--out", "a", "--force", *parts, code=EXIT_DEVICE)
     assert contents(Path("a")) == before
-    pans(*words("--out", "a", "--force", "--shots", "2", *parts))
+    pans(*RUN, "--out", "a", "--force", "--shots", "2", *parts)
     after = contents(Path("a"))
     assert before.keys() == after.keys()
     assert all(before[name] != after[name] for name in before)

@@ -46,9 +46,8 @@ def test_newcombe_s_published_example() -> None:
 def test_poisson_counts_of_equal_exposure_are_a_fair_coin() -> None:
     assert statistics.poisson_rates(9, 50, 1, 50) == pytest.approx(22 / 1024)
     assert statistics.poisson_rates(0, 50, 0, 70) == 1.0
-    assert statistics.poisson_rates(3, 10, 1, 30) == pytest.approx(
-        26 / 256
-    )  # 3 or 4 of 4 clicks in a quarter of the exposures, twice
+    # 3 or 4 of 4 clicks in a quarter of the exposures, twice
+    assert statistics.poisson_rates(3, 10, 1, 30) == pytest.approx(26 / 256)
 
 
 def test_the_test_of_rates_alarms_no_more_often_than_it_says() -> None:

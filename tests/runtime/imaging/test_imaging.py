@@ -42,10 +42,8 @@ def picture(seed=0, shape=SHAPE):
         (Imaging(1.0625, 0.375, psf_px=0.6), 1e-3),
         (Imaging(-0.5, 0.25, scale=1.25, psf_px=0.5), 5e-3),
         (Imaging(0.25, 0.5, rotation_deg=2.0, psf_px=0.6), 5e-3),
-        (
-            Imaging(0.25, 0.5, rotation_deg=-3.0, scale=0.97),
-            2e-2,
-        ),  # no blur: the corners of turned squares, and the points' own error
+        # no blur: the corners of turned squares, and the points' own error
+        (Imaging(0.25, 0.5, rotation_deg=-3.0, scale=0.97), 2e-2),
         (Imaging(rotation_deg=30.0, psf_px=0.7), 5e-3),
     ],
 )

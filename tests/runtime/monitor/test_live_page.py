@@ -39,11 +39,8 @@ def a_history(pictures: int = 30) -> History:
                 "photons": 160.0 * k,
             },
             **{"walk_light": 7e3 * k, "exposures": 600 * k, "late": k // 10, "trouble": NASTY},
-            **{
-                "latency": [[300_000 + 10_000 * (k % 5), 18], [900_000, 2]],
-                "latency_max_us": 1500.0,
-                "recording": "run.pansrec",
-            },
+            **{"latency": [[300_000 + 10_000 * (k % 5), 18], [900_000, 2]], "latency_max_us": 1500.0},
+            "recording": "run.pansrec",
             **{"dark_exposures": 50 * k, "dark_clicks": k, "dark_expected": 0.015, "dark_high": 0.02, "dark_words": ""},
             **{"clock_drift_ppm": -20 + k % 3, "clock_uncertainty_us": 70.0, "disk_free_bytes": 1 << 36},
             **{"recording_bytes": 1 << 22, "class_decided": list(range(10)), "class_truth": [10] * 10},

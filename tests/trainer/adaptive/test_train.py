@@ -86,15 +86,23 @@ def test_the_same_seed_gives_the_same_automaton_and_another_seed_another(task, t
     assert other.held_back != trained.held_back
 
 
-@pytest.mark.parametrize("stop_at", [7, 8, 11])
-def test_an_interrupted_training_ends_at_the_same_automaton(task, trained, tmp_path, stop_at):
-    path = tmp_path / "bars.checkpoint"
-    interrupted(stop_at, task, IDEAL, SMALL, checkpoint=path)
-    resumed = path.is_file()
-    went_on = train_automaton(task, IDEAL, SMALL, checkpoint=path, resume=resumed)
-    assert resumed == (stop_at > 7)  # the first state is kept after the first whole epoch of tuning
-    np.testing.assert_array_equal(went_on.shown.pattern_levels, trained.shown.pattern_levels)
-    np.testing.assert_array_equal(went_on.automaton.posteriors, trained.automaton.posteriors)
+@pytest.mark.parametrize(
+    ("changes", "name", "at"),
+    [
+        *(({}, "ideal", at) for at in (7, 8, 11)),
+        *(({"photons": None, "dose_cap": 12.0, "bleach": "0.2:mixed", "epochs": 3}, "ideal", at) for at in (8, 11)),
+        ({"patterns": 5}, "dmd-spad", 12),
+    ],
+)
+def test_an_interrupted_training_ends_at_the_same_automaton(task, trained, tmp_path, changes, name, at):
+    options, profile, path = replace(SMALL, **changes), load_profile(name), tmp_path / "bars.checkpoint"
+    interrupted(at, task, profile, options, checkpoint=path)
+    assert path.is_file() == (at > 7)  # the first state is kept after the first whole epoch of tuning
+    went_on = train_automaton(task, profile, options, checkpoint=path, resume=path.is_file())
+    whole = train_automaton(task, profile, options) if changes else trained
+    np.testing.assert_array_equal(went_on.shown.pattern_levels, whole.shown.pattern_levels)
+    for array in ("dwell", "posteriors"):
+        np.testing.assert_array_equal(getattr(went_on.automaton, array), getattr(whole.automaton, array))
 
 
 def test_a_checkpoint_from_before_an_option_existed_means_its_default(task, trained, tmp_path):
@@ -195,18 +203,6 @@ def test_no_walk_passes_the_cap_and_all_come_near(task, name):
         demand_within(bundle, 11.0)
 
 
-@pytest.mark.parametrize("at", [8, 11])
-def test_a_training_under_a_cap_that_is_resumed_ends_at_the_same_automaton(task, at, tmp_path):
-    options, path = replace(CAPPED, bleach="0.2:mixed", epochs=3), tmp_path / "capped.checkpoint"
-    interrupted(at, task, IDEAL, options, checkpoint=path)
-    resumed, whole = (
-        train_automaton(task, IDEAL, options, checkpoint=path, resume=True),
-        train_automaton(task, IDEAL, options),
-    )
-    np.testing.assert_array_equal(resumed.shown.pattern_levels, whole.shown.pattern_levels)
-    np.testing.assert_array_equal(resumed.automaton.dwell, whole.automaton.dwell)
-
-
 def free_bundle(task, profile):
     """An automaton that sends as much on average, some walks more."""
     done = train_automaton(task, profile, replace(CAPPED, dose_cap=None, illumination=12.0))
@@ -277,17 +273,13 @@ def test_tasks_that_no_automaton_solves(task, changes, words):
         check_automaton_options(SMALL, replace(task, **changes), IDEAL)
 
 
-def test_states_share_few_patterns_and_a_resumed_training_still_does(task, tmp_path):
-    options, path, profile = replace(SMALL, patterns=5), tmp_path / "few.checkpoint", load_profile("dmd-spad")
-    whole = train_automaton(task, profile, options)
+def test_states_share_few_patterns(task):
+    profile = load_profile("dmd-spad")
+    whole = train_automaton(task, profile, replace(SMALL, patterns=5))
     assert len(whole.shown.pattern_levels) <= 5
     assert len(whole.automaton.pattern) > 20
     compare_walks(export_bundle(whole, task, profile), whole, task, profile)
     assert whole.held_back.accuracy > 0.6
-    interrupted(12, task, profile, options, checkpoint=path)
-    resumed = train_automaton(task, profile, options, checkpoint=path, resume=True)
-    np.testing.assert_array_equal(resumed.shown.pattern_levels, whole.shown.pattern_levels)
-    np.testing.assert_array_equal(resumed.automaton.dwell, whole.automaton.dwell)
 
 
 def test_one_bright_state_does_not_set_the_exposure(task):

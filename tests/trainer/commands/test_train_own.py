@@ -122,13 +122,7 @@ def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, mon
     assert "balanced accuracy       33.33 %; recall bar 0.00 %, cross 0.00 %, square 100.00 %" in said.out
     assert "at equal illumination" in said.out
     np.savez("others.npz", images=images[::-1], labels=labels[::-1], classes=np.array(["square", "bar", "cross"]))
-    others = [
-        "evaluate",
-        "s.pans",
-        "--task",
-        "others.npz",
-        "--exact",
-    ]  # all of them held out: a camera has none to learn from
+    others = ["evaluate", "s.pans", "--task", "others.npz", "--exact"]  # all held out: a camera has none to learn from
     assert main(others) == 0
     assert "direct imaging" not in pans.said().out
     assert "training images are not at hand" in pans.refuses(*others, "--compare")

@@ -24,20 +24,6 @@ LABELS = RNG.integers(0, 3, 60)
 IMAGES = RNG.integers(0, 256, (60, 4, 5), dtype=np.uint8)
 
 
-def bundle(d_f=4, seed=0):
-    rng = np.random.default_rng(seed)
-    return made_bundle(
-        name="small",
-        task="own",
-        classes=("a", "b", "c"),
-        image_shape=(4, 5),
-        levels=124,
-        pattern_levels=rng.integers(0, 124, (d_f, 20)),
-        photons_per_level=1e-3,
-        table=rng.normal(size=(1 << d_f, 3)),
-    )
-
-
 def head_bundle():
     torch = pytest.importorskip("torch", reason="needs the train extra")
     from pans.trainer.export.onnx_heads import head_onnx
@@ -78,15 +64,17 @@ def test_sampled_agrees_with_exact(shots):
     assert abs(sampled.accuracy_mean - exact.accuracy_mean) < 5 * exact.accuracy_std / math.sqrt(400)
     click_sigma = math.sqrt(shots * (light.probability * (1 - light.probability)).sum() / 60 / (60 * 400))
     assert abs(sampled.clicks_mean - exact.clicks_mean) < 5 * click_sigma
-    assert sampled.bits == pytest.approx(
-        exact.bits, abs=5 * 1.5 / math.sqrt(60 * 400)
-    )  # a decision's bits vary by about one
+    assert sampled.bits == pytest.approx(exact.bits, abs=5 * 1.5 / math.sqrt(60 * 400))  # one's bits vary by about one
     assert sampled.photons_mean == exact.photons_mean
     assert sampled.accuracy_std == pytest.approx(exact.accuracy_std, rel=5 / math.sqrt(2 * 400))
 
 
 def test_light_is_pattern_times_transmission_and_follows_its_options():
-    model, floor = bundle(), PROFILE.min_transmission
+    shape = {"image_shape": (4, 5), "levels": 124, "pattern_levels": RNG.integers(0, 124, (4, 20))}
+    model, floor = (
+        made_bundle(4, 3, photons_per_level=1e-3, table=RNG.normal(size=(16, 3)), **shape),
+        PROFILE.min_transmission,
+    )
     shown = floor + (1 - floor) * IMAGES.reshape(60, -1) / 255
     assert light_of(model, PROFILE, IMAGES).photoelectrons == pytest.approx(shown @ model.patterns().T, rel=1e-10)
     plain, double = light_of(model, PROFILE, IMAGES), light_of(model, PROFILE, IMAGES, eta=2.0)

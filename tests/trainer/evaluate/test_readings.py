@@ -130,8 +130,6 @@ def test_a_calibration_takes_the_clicks_of_all_neighbours_back() -> None:
     for channel, counts in enumerate(counts_of(core, design, profile)):
         lit = counts.drive > 0
         share = counts.clicks[lit][0] / counts.exposures[lit][0]
-        found = (
-            -math.log1p(-share) + counts.log_other[lit][0]
-        )  # the light that is left when its neighbours are taken away
+        found = -math.log1p(-share) + counts.log_other[lit][0]  # what is left when its neighbours are taken away
         wanted = design.drives[channel] * level
         assert found == pytest.approx(wanted, abs=5 * math.sqrt(math.expm1(2.2) / n))

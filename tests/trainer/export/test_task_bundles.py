@@ -107,9 +107,8 @@ def test_a_passive_bundle_runs_on_an_instrument_with_its_optics(name, changed, t
     assert pans("replay", found["recording"])["identical"]
     assert main(["verify", found["recording"], "--json"]) in (0, 1)
     assert not json.loads(pans.said().out)["violations"]
-    assert "optics=BUNDLE.pans" in pans.refuses(
-        "run", path, "--device", device, "--profile", "ideal", "--out", tmp_path / "none", code=3
-    )  # an instrument with a projector, or another's glass
+    words = ("run", path, "--device", device, "--profile", "ideal", "--out", tmp_path / "none")
+    assert "optics=BUNDLE.pans" in pans.refuses(*words, code=3)  # an instrument with a projector, or another's glass
     assert pans("info", path)["sensor"]["fingerprint"] == exported.bundle.analyser.fingerprint
 
 

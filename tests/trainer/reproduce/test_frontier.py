@@ -89,12 +89,8 @@ def test_margins_are_over_the_best_direct_imaging_at_the_same_light():
     assert "ahead" not in found["automaton", 40]
     assert not {"ahead", "light_ahead"} & set(found[EXACT, 4])
     better = [row | {"value": 70.0} if row["way"] == STOPPING else row for row in rows]
-    ahead = [
-        row["ahead"]
-        for row in curves.beside_direct(curves.by_point(better))
-        if (row["way"], row["level"]) == ("automaton", 8)
-    ]
-    assert ahead == pytest.approx([5])
+    found = {(row["way"], row["level"]): row for row in curves.beside_direct(curves.by_point(better))}
+    assert found["automaton", 8]["ahead"] == pytest.approx(5)
 
 
 def test_a_point_is_on_the_front_where_none_is_as_right_with_no_more_light_of_either_kind():
