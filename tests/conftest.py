@@ -1,7 +1,5 @@
 """What all tests share: fixtures, markers, and what is skipped here and why."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

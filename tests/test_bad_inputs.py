@@ -1,7 +1,5 @@
 """Bad inputs of every command, drawn from its parser or named here: no traceback, no file lost or new, the right exit code, a remedy."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import itertools

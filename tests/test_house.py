@@ -1,7 +1,5 @@
 """Rules for the whole tree: what the lean runtime never loads, that nothing pickles, and that the wheel holds the tree."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import shutil

@@ -1,7 +1,5 @@
 """The order of the packages, as pyproject.toml states it: who may import whom, no circle, and what importing a package loads."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import re

@@ -1,7 +1,5 @@
 """Without any of the extras: every command that needs one says which, with the pip command, and touches nothing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Every command that writes: it replaces nothing, never writes into an input, and refuses before it does anything."""
 
-from __future__ import annotations
-
 import shutil
 from importlib.metadata import entry_points
 from pathlib import Path

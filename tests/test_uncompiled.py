@@ -1,7 +1,5 @@
 """Kernels give the same results as plain Python: the tests marked `uncompiled` run once more without the compiler."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

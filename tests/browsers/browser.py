@@ -4,8 +4,6 @@ axe-core is the one that axe-core-python (extra `browser`) brings; `AXE_CORE` na
 Without both, accessibility is not checked, with a warning.
 """
 
-from __future__ import annotations
-
 import base64
 import os
 import shutil

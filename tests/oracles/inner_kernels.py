@@ -1,7 +1,5 @@
 """Kernels that kernels alone call, made ready to be compared with their oracles."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numba import njit

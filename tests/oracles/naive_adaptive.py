@@ -1,7 +1,5 @@
 """A slow oracle for automata that are trained: merging that recomputes every cost."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Slow oracles for automata, from the definition: one walk, and sums over all click words in exact or mpmath numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 from typing import Any, NamedTuple

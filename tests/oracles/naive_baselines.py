@@ -1,7 +1,5 @@
 """Slow oracle for the posterior over training objects: plain loops over Python numbers, in float64."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ Owns the events and nothing of the law: photons arrive one by one at a steady ra
 holds at least one detection. Times are in exposures. Compiled because 0.0005 of a share takes a million exposures.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

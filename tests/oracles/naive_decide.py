@@ -1,7 +1,5 @@
 """Slow oracles for the decision back ends: plain loops over Python numbers, one object at a time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

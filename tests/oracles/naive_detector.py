@@ -1,7 +1,5 @@
 """The detector as plain loops over single exposures and channels: the oracle of firmware_sim/detector.py."""
 
-from __future__ import annotations
-
 MASK = (1 << 64) - 1
 GOLDEN = 0x9E3779B97F4A7C15
 

@@ -1,7 +1,5 @@
 """Onsets and releases in plain loops over the whole history: what flow_kernels.scan must find, however the frames are cut into blocks."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 

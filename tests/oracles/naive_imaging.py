@@ -1,7 +1,5 @@
 """What a pattern grid meets of an object, from a rendering with 256 points per pixel: it shares nothing with runtime/imaging."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

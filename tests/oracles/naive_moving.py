@@ -1,7 +1,5 @@
 """Slow oracles for moving scenes: the field drawn as an image at many moments of an exposure, pixel by pixel, in plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -1,7 +1,5 @@
 """Slow oracle for structural similarity: one window at a time, plain loops over Python numbers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Walks of an automaton as plain loops over exposures, from the definition: the oracle of firmware_sim/device/walking.py."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

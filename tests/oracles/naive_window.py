@@ -1,7 +1,5 @@
 """Slow oracles for the window kernels, in plain loops over Python numbers: the meaning, not the speed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pans.runtime.core.plan import ADAPTIVE_PATTERN, Plan
@@ -39,7 +37,6 @@ def follow_walk(plan: Plan, cycle: int, exposures: dict[int, tuple[int, int]]) -
     in the dark, and `strange` how many exposures that should have been dark, or another state, were not; `late` of them stayed dark.
     """
     automaton = plan.automaton
-    assert automaton is not None
     clicks = [0] * int((plan.slot_pattern == ADAPTIVE_PATTERN).sum())
     found: dict[str, Any] = {"fate": "", "clicks": clicks, "states": [], "last": 0, "dark": [], "strange": 0, "late": 0}
     node, step = 0, 0

@@ -1,7 +1,5 @@
 """Single events that are seen at another time, and a pixel that jumps. Shares no code with the package."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -4,8 +4,6 @@ Times are in exposures: exposure k lasts from k * (1 + pause) to k * (1 + pause)
 traps. Compiled, since an error of 0.0003 takes a million rounds.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

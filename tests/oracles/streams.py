@@ -1,7 +1,5 @@
 """The kernel and the core alone over the same bytes, and the faults that a link may add to them."""
 
-from __future__ import annotations
-
 import socket
 from dataclasses import asdict
 from typing import Any

@@ -1,7 +1,5 @@
 """A PostgreSQL server for one test: in a folder of its own, on a Unix socket alone, run by a user who is not root."""
 
-from __future__ import annotations
-
 import os
 import pwd
 import shutil

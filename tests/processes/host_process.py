@@ -4,8 +4,6 @@ Owns the child, the stages of a run at which it can be met, and the instrument's
 stage it says so on a pipe and waits to be let go, so that a signal meets it there.
 """
 
-from __future__ import annotations
-
 import ctypes
 import faulthandler
 import importlib

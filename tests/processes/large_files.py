@@ -1,7 +1,5 @@
 """The largest files that are accepted, of every kind of content that can make one large."""
 
-from __future__ import annotations
-
 import json
 from itertools import pairwise
 from pathlib import Path

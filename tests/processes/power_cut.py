@@ -6,8 +6,6 @@ which names and lengths reach the disk before the data (a file is cut to what wa
 zeros.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field

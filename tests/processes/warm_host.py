@@ -1,7 +1,5 @@
 """What a host loads before its loop turns, loaded once in the server from which the process simulator starts its hosts."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

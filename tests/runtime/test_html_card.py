@@ -1,7 +1,5 @@
 """What a notebook shows of bundles, profiles, recordings and runs: small, and nothing but a table with pictures; see test_safe_text.py."""
 
-from __future__ import annotations
-
 import base64
 import re
 from pathlib import Path

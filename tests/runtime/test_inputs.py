@@ -1,7 +1,5 @@
 """Numbers of options, sizes of arrays and kinds of files: what makes no sense is refused with what is allowed, in no time."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Beta, chi-square, binomial tails and intervals against 40 digits, and their coverage."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from math import comb
 

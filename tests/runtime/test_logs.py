@@ -1,7 +1,5 @@
 """Logs: lines of both forms, rotation, foreign files left alone, limits, priorities for the journal; and a run's events in them."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

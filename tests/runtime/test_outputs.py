@@ -1,7 +1,5 @@
 """No output ever destroys a file: checks before a command begins, exclusive creation, whole files or none."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One list of nasty texts, every kind of output: shown, never obeyed; JSON stays exact."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -5,8 +5,6 @@ with it and judges what must hold of any: no errors but the package's own, bound
 decisions, and no PASS where the evidence contradicts what was said.
 """
 
-from __future__ import annotations
-
 import struct
 import time
 import traceback

@@ -5,8 +5,6 @@ reader (tests/independent) makes of the recorded messages; no command is execute
 refusal reported, none late; all that came is on record; a replay gives the same decisions.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path

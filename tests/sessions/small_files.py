@@ -5,8 +5,6 @@
 take a recording apart and put it together with right checksums.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Whole runs under every fault, alone and together, in every mode: exposures exactly once, decisions, gates and all books."""
 
-from __future__ import annotations
-
 import pytest
 from fault_grid import CASES, MODES, OFTEN, run_case
 

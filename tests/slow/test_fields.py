@@ -1,7 +1,5 @@
 """Any field of any message holds another value, in whole sessions of every mode; hypothesis chooses which, and what."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

@@ -3,8 +3,6 @@
 Hypothesis chooses what is changed: a value of JSON, a line of TOML, numbers of an array, a block of a recording.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import resource

@@ -3,8 +3,6 @@
 Each command runs in a process of its own. The long form (`-m slow`) takes all kinds of files (large_files.py).
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -5,8 +5,6 @@ a late decision counts here only if the gaps that they saw do not explain it. Co
 prints the rest. The rates need a quiet machine with two cores and the right to real-time priority.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -68,7 +66,6 @@ def process(words: list[str], core: int, log: Path) -> Iterator[subprocess.Popen
 
 
 def first_line(child: subprocess.Popen[str]) -> str:
-    assert child.stdout is not None
     return child.stdout.readline().strip()
 
 

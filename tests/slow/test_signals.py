@@ -3,8 +3,6 @@
 A host that is killed at any moment has on record what it acted upon.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import random

@@ -3,8 +3,6 @@
 `PANS_SOAK_MINUTES` says how long (2 unless it is set).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

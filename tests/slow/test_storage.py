@@ -4,8 +4,6 @@ The commands that write are run on a storage with faults (storage.py) at every c
 (power_cut.py).
 """
 
-from __future__ import annotations
-
 import errno
 import itertools
 import json

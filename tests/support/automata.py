@@ -1,7 +1,5 @@
 """Small automata for tests: written by hand, drawn at random, and in a bundle."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bundles for tests from flat facts: what a test does not name is a toy."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct

@@ -1,7 +1,5 @@
 """A command as a test calls it: words in, the JSON object that it printed out; and the report page of a file, and its words."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

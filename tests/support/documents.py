@@ -1,7 +1,5 @@
 """The pages of README.md and docs/: their code blocks, the commands in them, and their sentences."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from dataclasses import dataclass

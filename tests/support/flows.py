@@ -1,7 +1,5 @@
 """Flows for tests: a plan, a decider by channel, cells as frames, cores that are ready, streams of messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

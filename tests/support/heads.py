@@ -1,7 +1,5 @@
 """Heads and bundles for tests, made by hand: chains of layers as ONNX without a trainer."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

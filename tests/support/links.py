@@ -1,7 +1,5 @@
 """Links for tests: an instrument in a thread behind a real port, and a link around another one."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """ONNX models for tests: hostile ones, each with the reason for its refusal, and random ones from the allowed operators."""
 
-from __future__ import annotations
-
 import random
 from typing import Any
 

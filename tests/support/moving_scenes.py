@@ -1,7 +1,5 @@
 """Small scenes that move, and a program that looks at them: for tests of scenes and of the device."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Texts that a device, a bundle, a file name or a calibration may hold, and that no output may obey."""
 
-from __future__ import annotations
-
 NASTY = (
     "",
     "plain",

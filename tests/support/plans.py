@@ -1,7 +1,5 @@
 """Small plans for tests, made by hand so that they do not depend on a profile."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -69,7 +67,6 @@ def walk_plan(automaton: Automaton, walks: int, dark: int = 1, drive: str = "dev
 def walked(plan: Plan, n_cycles: int, rng: np.random.Generator) -> list[tuple[int, int]]:
     """(stamp, click) of every exposure of `n_cycles` cycles, as a device without a fault reports them."""
     automaton = plan.automaton
-    assert automaton is not None
     found = []
     for _ in range(n_cycles):
         node = 0

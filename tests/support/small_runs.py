@@ -1,7 +1,5 @@
 """Recordings of small runs in virtual time, through the live loop, in one file or in parts."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ The faults are made between the process and the kernel (storage_faults.c, by LD_
 everything imported is forked for each command, so that hundreds of them take a minute. As a program it is that process.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import json
@@ -80,7 +78,6 @@ class FaultyStorage:
 
     def _ask(self, asked: dict[str, Any]) -> dict[str, Any]:
         assert self._process.stdin is not None
-        assert self._process.stdout is not None
         print(json.dumps(asked), file=self._process.stdin, flush=True)
         answer = self._process.stdout.readline()
         assert answer, f"the process of the commands ended: {self._errors.read_text()[-2000:]}"

@@ -1,7 +1,5 @@
 """Cells of three classes in flow, and a bundle that tells them apart."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

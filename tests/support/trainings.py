@@ -1,7 +1,5 @@
 """Small trainings that several test files share: a task, machines with random patterns, short fits."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
@@ -95,8 +93,6 @@ SCRIPT = ROOT / "docs/tutorial/practice_images.py"
 def practice_images() -> ModuleType:
     """Return the script as a module; it needs Pillow."""
     spec = importlib.util.spec_from_file_location("practice_images", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -1,7 +1,5 @@
 """Where the checkout is: tests that read documents or shipped files start here."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]

@@ -1,7 +1,5 @@
 """Benchmarks measure the right things: their inputs, their checks and their report; never a speed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Automata: what is impossible is refused, walks are those of the definition, stopped and capped ones too."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Bundles of automata: every byte comes back, every lie about an automaton is named, small files stay small in memory."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct
@@ -50,8 +48,6 @@ def put_together(header: dict[str, Any], arrays: dict[str, np.ndarray], version:
 
 
 def same(one: Bundle, other: Bundle) -> None:
-    assert one.automaton is not None
-    assert other.automaton is not None
     for owners, names in (
         ((one.automaton, other.automaton), ("pattern", "dwell", "successors", "posteriors", "depth")),
         ((one, other), ("pattern_levels", "golden_means", "golden_scores", "golden_walks")),
@@ -108,7 +104,6 @@ def test_photon_numbers_and_channels_come_back(automaton: Automaton, facts: dict
     assert struct.unpack_from("<I", data, 8)[0] == 1
     assert taken_apart(data)[0]["automaton"] == facts
     read = parse_bundle(data, "here")
-    assert read.automaton is not None
     assert read.automaton.counts == automaton.counts
     assert (read.n_channels, read.largest) == (facts.get("channels", 1), largest)
     assert read.automaton.rows.tolist() == automaton.rows.tolist()

@@ -1,7 +1,5 @@
 """Bundles: every byte counts, every inconsistency is named, the golden vectors bind table and head together."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -241,7 +239,6 @@ def test_units_of_patterns_and_bit_i_of_a_word_is_pattern_i() -> None:
 def test_the_table_is_built_from_the_head() -> None:
     head, weights, bias = random_head(5, 3)
     made = small_bundle(d_f=5, table=None, head_onnx=head, classes=("a", "b", "c"))
-    assert made.table is not None
     for word in range(32):
         means = [float(word >> i & 1) for i in range(5)]
         np.testing.assert_allclose(made.table[word], np.array(means) @ weights + bias, atol=1e-5)

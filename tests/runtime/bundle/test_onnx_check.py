@@ -1,7 +1,5 @@
 """No head runs away: what is refused before a session is made, and what is let through costs what it says."""
 
-from __future__ import annotations
-
 import random
 import secrets
 import subprocess

@@ -1,7 +1,5 @@
 """Bundles of fixed patterns that take photon numbers: the table in base `outcomes`, and what is refused."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any
 

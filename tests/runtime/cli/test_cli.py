@@ -1,7 +1,5 @@
 """The command line's contract: exit codes, where output goes, errors without a traceback."""
 
-from __future__ import annotations
-
 import argparse
 import errno
 import json

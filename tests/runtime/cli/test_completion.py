@@ -1,7 +1,5 @@
 """Completion scripts: bash itself completes with ours; zsh and fish get every command and option."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

@@ -1,7 +1,5 @@
 """Options from a dataclass: what a field becomes in a parser, and back; values outside their range are refused in both ways."""
 
-from __future__ import annotations
-
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The bar over long files: on a terminal alone, one pass at a time, and gone when the pass is over."""
 
-from __future__ import annotations
-
 import io
 import sys
 from pathlib import Path

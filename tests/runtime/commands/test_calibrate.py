@@ -1,7 +1,5 @@
 """`pans calibrate` on instruments whose messages contradict each other, and on several detectors, one of them hot or silent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`pans devices`, `pans doctor` and traces: every finding has its remedy, and nothing is opened to find out."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`pans run --dose-cap`: which walk each object is left, and what is refused with the numbers."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +25,7 @@ CAPPED = RunOptions(dose_cap=3.0)
 
 def test_no_walk_of_a_run_passes_the_cap_of_its_object() -> None:
     bundle = automaton_bundle()
-    assert bundle.automaton is not None
     dose = dose_of(RunOptions(dose_cap=6.0, trials=2), bundle, IDEAL)
-    assert dose is not None
     assert dose.most == 3.0
     decider = make_decider(bundle, dose=dose)
     automaton = decider.automaton  # type: ignore[attr-defined]
@@ -46,7 +42,6 @@ def test_no_walk_of_a_run_passes_the_cap_of_its_object() -> None:
     assert 2.0 < most <= 3.0
     config = {"drive": "device", "confidence": 0.0, "walk_dose": {"most": dose.most, "states": dose.states}}
     again = automaton_of(config, bundle)
-    assert again is not None
     np.testing.assert_array_equal(again.successors, automaton.successors)
     np.testing.assert_array_equal(again.posteriors, automaton.posteriors)
 

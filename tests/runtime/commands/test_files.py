@@ -1,7 +1,5 @@
 """`pans verify`, `pans info`, `pans bundle`: exit codes, JSON keys, and reasons a person can act on."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Commands warn where the laws of a profile's detector do not hold as stated, and say nothing of a shipped profile."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """`pans run` and what was there before it: nothing is replaced, nothing stays of a run that was refused."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

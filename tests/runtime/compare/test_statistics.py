@@ -1,7 +1,5 @@
 """The tests behind `pans compare`: against published examples, and against the draws that they speak of."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """Detector states told apart, tables for a changed detector against exact Bayes, and the policies in live runs and replays."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Click probabilities have theirs in instrument/test_click_law.py, intervals in te
 decide/test_mlp.py, folding of dead channels in trainer/export/test_writer.py.
 """
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The core: the same frames give the same decisions, a window with a gap never gives a guess; and which marks it remembers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Streams through the kernel against the core alone: the same rows, counts and events, whatever happens to them."""
 
-from __future__ import annotations
-
 import zlib
 from typing import Any
 

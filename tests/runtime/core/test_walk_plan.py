@@ -1,7 +1,5 @@
 """Plans of automata: one adaptive slot for each step of the longest walk, who drives, and refusals with numbers; to the device and back."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

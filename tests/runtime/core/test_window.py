@@ -1,7 +1,5 @@
 """Windows and walks against the plain-loop oracle: any plan, any losses and wrong stamps, any block cutting; compiled and not."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

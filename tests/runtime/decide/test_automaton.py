@@ -1,7 +1,5 @@
 """The automaton as a back end: every walk as the oracle, exact expectations as sums over all words, abstention where nothing is sure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 
@@ -78,7 +76,6 @@ def test_what_cannot_answer_is_refused() -> None:
 
 def test_golden_walks_bind_the_back_end() -> None:
     bundle = automaton_bundle()
-    assert bundle.golden_walks is not None
     wrong = bundle.golden_walks.copy()
     wrong[3, -1] += 1 if wrong[3, -1] < 7 else -1
     with pytest.raises(DamagedFileError, match="golden walk 3"):

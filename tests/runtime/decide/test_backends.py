@@ -1,7 +1,5 @@
 """Decisions: table and head answer alike, as the slow oracles do, and refuse what they cannot answer."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

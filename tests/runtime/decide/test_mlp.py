@@ -1,7 +1,5 @@
 """The head's own kernels against plain loops, against float64, one by one and in a batch; what rounding the patterns costs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

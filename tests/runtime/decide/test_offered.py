@@ -1,7 +1,5 @@
 """Back ends of other packages: found by entry point, checked, and given the calls that they need not have."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from pathlib import Path

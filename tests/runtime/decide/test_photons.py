@@ -1,7 +1,5 @@
 """Photon numbers through every back end: as the head in plain numpy, and refused beyond the largest."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from itertools import product
@@ -114,7 +112,6 @@ def test_numbers_in_the_library_and_what_takes_clicks_alone(counted: Bundle) -> 
 
 
 def test_verify_compares_table_and_head_on_all_numbers(counted: Bundle) -> None:
-    assert counted.table is not None
     wrong = counted.table.copy()
     wrong[17] += 1.0  # a word that is no golden one, perhaps: the comparison goes through all
     for bundle, is_wrong in ((counted, False), (replace(counted, table=wrong), True)):

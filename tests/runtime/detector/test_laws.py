@@ -1,7 +1,5 @@
 """The laws of the detector against single events: unequal light, dark exposures, all effects that a profile may state (fixed seeds)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Objects in flow: the same frames give the same passages however they are cut; a gap is never decided over; one decision each."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The decisions of the kernel on a flow: over any stream those of the core that takes its messages one by one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Decisions matched with the truth afterwards: missed, doubled, in coincidence, in a gap; pulses on target; bounded memory."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What the pattern grid meets of an object, held against renderings; the spelling of --optics; bleaching, to 60 digits."""
 
-from __future__ import annotations
-
 import math
 
 import mpmath

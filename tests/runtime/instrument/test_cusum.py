@@ -1,7 +1,5 @@
 """The dark-count watch against loops over exposures, its run lengths against exact linear algebra and against the definition."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

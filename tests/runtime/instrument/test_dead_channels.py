@@ -1,7 +1,5 @@
 """Dead channels found in the light: stated false alarms, what is soon and what is sure, other scenes, whole runs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -149,7 +147,6 @@ def test_many_windows_at_once_are_found_dead_as_one_by_one() -> None:
         for first in range(0, 3000, at_once):
             guard.take_objects(rows[first : first + at_once], numbers[first : first + at_once])
         lit = guard.lit
-        assert lit is not None
         state = (lit.objects, lit.clicked.tolist(), lit._quiet.tolist(), lit._due.tolist(), lit._then.tolist())
         findings.append(([(one.channels, one.words) for one in guard.news()], state))
     assert findings[0][0][0][0] == (1,)

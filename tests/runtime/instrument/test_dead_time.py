@@ -1,7 +1,5 @@
 """Dead time: the law against a detector simulated photon by photon, its table, and the same numbers in torch (fixed seeds)."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The estimate against 40 digits and against fine grids; the file, its checks, and the command through the ordinary session."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """The light watch: silent while nothing changes, finds a change in the stated time, and a run tells of its calibration."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -367,7 +367,6 @@ gain_tolerance = 0.05
 def test_a_profile_states_its_optics_and_how_far_they_may_be_off() -> None:
     text = load_profile("dmd-spad").text
     profile = parse_profile(text.replace("\n[detector]", OPTICS + "\n[detector]", 1), "lab.toml")
-    assert profile.optics is not None
     spans = profile.optics.tolerance().as_dict()
     assert spans == {
         "right_px": [-0.75, 1.25],

@@ -3,8 +3,6 @@
 Streams with faults go through it in tests/runtime/core (tests/oracles/streams.py), whole runs with faults in the fault grid.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

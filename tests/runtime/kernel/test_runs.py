@@ -1,7 +1,5 @@
 """Whole runs through the kernel: at real pace over every kind of link, under faults, and as the core alone would make them."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

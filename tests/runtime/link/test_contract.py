@@ -2,8 +2,6 @@
 
 The instrument behind each is the simulator, reached through real pyserial and real pyusb. Waits are bounded; nothing sleeps."""
 
-from __future__ import annotations
-
 import os
 import select
 import sys

@@ -1,7 +1,5 @@
 """An upload: what the device then holds, with and without the extension; devices and scenes that do not fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Runs with objects in flow, in virtual time and over a descriptor: figures, pulses, recording, replay; refusals."""
 
-from __future__ import annotations
-
 import json
 import math
 import random

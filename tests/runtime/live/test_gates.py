@@ -1,7 +1,5 @@
 """Pulses: on time or not at all, every fate counted and told; also from a second instrument, whose clock is another."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -258,7 +256,6 @@ class Lab:
     def close(self) -> None:
         self.queue.finish(self.connection.session)
         self.connection.close()
-        assert self.queue.second is not None
         self.queue.second.close()
 
 

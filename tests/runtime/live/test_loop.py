@@ -1,7 +1,5 @@
 """The whole way, in virtual time, against the simulated instrument: decisions, losses, recordings, replays, refusals, dark counts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock

@@ -1,7 +1,5 @@
 """Runs of fixed patterns that take photon numbers: counted by hand from the recording, replayed, refitted, refused where nothing counts."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

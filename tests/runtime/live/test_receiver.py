@@ -1,7 +1,5 @@
 """What has arrived is decided and recorded to the last message, also when the link breaks while acting on the first."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

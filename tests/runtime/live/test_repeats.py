@@ -1,7 +1,5 @@
 """Messages that come twice: equal ones change nothing, another content under the same number is a contradiction, whichever came first."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 from types import SimpleNamespace

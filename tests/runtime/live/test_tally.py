@@ -1,7 +1,5 @@
 """What decisions add up to, with both spreads kept apart."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Runs of automata in virtual time, by the device and by the host, of one detector and of several: the same walks, and no guesses."""
 
-from __future__ import annotations
-
 import csv
 import math
 import struct
@@ -241,7 +239,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("drive", ["device", "host"])
 def test_a_run_is_its_walks_and_replays(runs: Path, drive: str, pans: Pans) -> None:
     automaton = bundle().automaton
-    assert automaton is not None
     recording = read_recording(runs / drive / "run.pansrec")
     assert recording.header["config"]["channels_at_once"] == CHANNELS
     stamps, words = sent(recording, 2**CHANNELS - 1, automaton.n_slots + 1)
@@ -267,7 +264,6 @@ def test_device_and_host_lead_the_same_walks(runs: Path) -> None:
 
 def test_a_run_is_within_its_exact_expectation(runs: Path) -> None:
     made = bundle()
-    assert made.automaton is not None
     plan = build_plan(PROFILE, made)
     seen = object_transmission(PROFILE, IMAGES.reshape(N_OBJECTS, -1))
     law = click_law(PROFILE, plan.exposure_us)
@@ -285,7 +281,6 @@ def test_a_run_is_within_its_exact_expectation(runs: Path) -> None:
 
 def test_clicks_are_exported_by_channel_and_reported(runs: Path, tmp_path: Path, pans: Pans) -> None:
     path, automaton = runs / "host" / "run.pansrec", bundle().automaton
-    assert automaton is not None
     recording = read_recording(path)
     plan = recorded_plan(recording)
     clicks = click_list(recording, plan)

@@ -1,7 +1,5 @@
 """The live page: what the server sends and refuses, and the page in a real browser at both widths, in light and dark."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

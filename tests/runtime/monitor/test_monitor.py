@@ -1,7 +1,5 @@
 """The live view beside a run: pictures of it, their history in bounded memory, the terminal's panel and the plain lines."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os
@@ -246,7 +244,6 @@ def test_a_panel_is_drawn_on_a_terminal_and_removed(tmp_path: Path) -> None:
     child = subprocess.Popen(
         words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=theirs, text=True, env=environment
     )
-    assert child.stdin is not None
     sums = {"decisions": 4, "known": 4, "right": 3, "objects": 4, "clicks": 8, "latest": [[3, 7, 0, 0.9, 2, 0, 0]]}
     classes = {"class_decided": [3, 1], "class_truth": [2, 2], "class_right": [2, 1]}
     begin = {"kind": "begin", "title": "a bundle on a device", "classes": ["shoe", "bag"], "deadline_us": 100.0}
@@ -273,7 +270,6 @@ def _rest(handle: int) -> bytes:
 def test_a_drawing_process_that_dies_ends_no_run(capfd: pytest.CaptureFixture[str]) -> None:
     shown = Monitor(panel=False, address="127.0.0.1:0", lines=False)
     with shown:
-        assert shown._child is not None
         with urllib.request.urlopen(shown.url, timeout=10) as answer:
             assert b"EventSource" in answer.read()
         shown._child.kill()

@@ -1,7 +1,5 @@
 """`pans batch`: items and their words, a journal that goes on where it was, and two Dask workers of which one is killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

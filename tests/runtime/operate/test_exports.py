@@ -1,7 +1,5 @@
 """Exports: every click and decision of a run from CSV, Photon-HDF5 and Parquet; a bundle comes back from ONNX, arrays and PNG."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

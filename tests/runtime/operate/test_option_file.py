@@ -1,7 +1,5 @@
 """Options in a file: every option of `pans run` there and back, the command line above the file, and what a file cannot mean."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import tomllib

@@ -1,7 +1,5 @@
 """`pans runs`: what lies in a folder, and what prune may delete: nothing foreign, nothing that is going on, nothing without --yes."""
 
-from __future__ import annotations
-
 import shutil
 from argparse import ArgumentTypeError
 from datetime import UTC, datetime, timedelta

@@ -1,7 +1,5 @@
 """`pans service`: units that systemd accepts, the protocol run on a real socket, and nobody else's unit touched."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """`pans doctor --warm`: the commands that it runs end well, and one that fails or hangs is reported."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Report pages and replays of runs in which objects passed by: whole, cut, and in parts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Report pages: self-contained, escaped, and every figure on them that of the recording."""
 
-from __future__ import annotations
-
 import io
 import re
 from pathlib import Path
@@ -125,8 +123,6 @@ def test_a_curve_of_many_points_keeps_its_outliers() -> None:
     y[[7, 12_345]] = 50.0, -30.0
     y[:5] = np.nan
     x, found, low, _ = _thinned(Curve(np.arange(20_000), y, low=y - 1))
-    assert x is not None
-    assert found is not None
     assert low is not None
     assert len(found) <= POINTS_MAX
     assert (np.nanmax(found), np.nanmin(found)) == (50.0, -30.0)

@@ -1,7 +1,5 @@
 """The page and the exports of a run with an automaton: its tree, walks and states are those of the recorded messages."""
 
-from __future__ import annotations
-
 import csv
 from collections import Counter
 from pathlib import Path
@@ -49,7 +47,6 @@ def shown_states(recording: Recording) -> list[tuple[int, int]]:
 
 def test_the_tree_tells_what_was_shown_and_what_clicked(recording: Recording) -> None:
     plan = recorded_plan(recording)
-    assert plan.automaton is not None
     states = shown_states(recording)
     times, clicks = Counter(state for state, _ in states), Counter(state for state, bit in states if bit)
     nodes = _first_states(plan.automaton)
@@ -85,7 +82,6 @@ def test_reliability_is_that_of_the_decisions() -> None:
 def test_exports_have_states_and_exposures(recording: Recording, tmp_path: Path, pans: Pans) -> None:
     pans("export", recording.path, "--format", "csv", "-o", tmp_path / "csv")
     plan = recorded_plan(recording)
-    assert plan.automaton is not None
     with (tmp_path / "csv" / "clicks.csv").open(newline="") as file:
         clicks = [row for row in csv.DictReader(file) if row["dark_slot"] == "0"]
     assert [int(row["state"]) for row in clicks] == [state for state, bit in shown_states(recording) if bit]

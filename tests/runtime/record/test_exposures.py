@@ -1,7 +1,5 @@
 """Exposures of a recording in arrays: as the messages give them one by one, whatever a link did to them, in memory of fixed size."""
 
-from __future__ import annotations
-
 import random
 import tracemalloc
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The compact decision log: the rows come back bit for bit, its hash is one of the rows alone."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 import zlib

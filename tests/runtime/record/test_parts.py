@@ -1,7 +1,5 @@
 """Recordings in parts: each part replayed and verified by itself, the chain, the cap, the disk, and all parts as one recording."""
 
-from __future__ import annotations
-
 import errno
 import shutil
 from collections import Counter
@@ -85,8 +83,6 @@ def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> No
     result = record_small(tmp_path / "run.pansrec", 3000, limits=PartLimits(48 * KIB, 192 * KIB))
     paths = parts_in(tmp_path)
     first, last = part_of(read_recording(paths[0])), part_of(read_recording(paths[-1]))
-    assert first is not None
-    assert last is not None
     assert first["number"] > 1
     assert sum(path.stat().st_size for path in paths) <= 192 * KIB + 48 * KIB
     assert last["deleted"]["parts"] + len(paths) == last["number"]
@@ -104,7 +100,6 @@ def test_a_disk_that_is_nearly_full_keeps_the_last_closed_part(tmp_path: Path, m
     closed, last = parts_in(tmp_path)
     assert closed.stat().st_size >= SMALL.rotate_bytes
     found = part_of(read_recording(last))
-    assert found is not None
     assert found["deleted"]["parts"] == found["number"] - 2 > 0
 
 
@@ -177,7 +172,6 @@ def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="No space left on device"):
         record_small(tmp_path / "run.pansrec", 3000, limits=PartLimits(1 << 30), prepared=prepared)
     status = runs[0].connection.session.status
-    assert status is not None
     assert status.state == 0  # IDLE: it was told to stop
     assert not read_recording(parts_in(tmp_path)[0]).complete
 

@@ -1,7 +1,5 @@
 """Recordings: every byte is covered, a cut file reads up to its last whole block, and what went in comes out."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import itertools

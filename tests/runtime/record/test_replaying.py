@@ -1,7 +1,5 @@
 """Recordings decided again: whole, cut off at any byte, refused, or with blocks that say something else than the run."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from pathlib import Path

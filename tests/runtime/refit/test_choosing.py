@@ -98,7 +98,6 @@ def shown(count: int, times: int, shots: int = 1, seed: int = 0):
 def test_eigentasks_put_signal_before_noise(times: int, shots: int) -> None:
     evidence, chances = shown(2000, times, shots)
     tasks = eigentasks(evidence)
-    assert tasks is not None
     noise = np.diag((chances * (1 - chances)).mean(axis=0)) / shots
     total = noise + np.cov(chances.T)
     share = np.diag(tasks.T @ noise @ tasks) / np.diag(tasks.T @ total @ tasks)
@@ -116,7 +115,6 @@ def test_eigentasks_are_taken_where_there_is_no_head_and_alone_forget_the_old_sc
     evidence, _ = shown(150, 4)
     assert choose(evidence, kinds_for(evidence, rows=False)).name.startswith("2 eigentasks")
     found = fitted(evidence, Kind(("bias", "clicks"), tasks=2, alone=True), np.ones(150, bool)).correction
-    assert found is not None
     old, clicks = np.random.default_rng(3).normal(size=(50, CLASSES)), np.random.default_rng(4).random((50, 6))
     new = found.apply(old - old.mean(axis=1, keepdims=True), clicks)
     assert new == pytest.approx(found.apply(np.zeros_like(old), clicks))

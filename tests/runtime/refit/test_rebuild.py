@@ -1,7 +1,5 @@
 """New bundles out of corrections: table, head or posteriors of the old one are wrong, the new ones nearly the best that there can be."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product
@@ -107,7 +105,6 @@ COUNTED = automaton_bundle(random_automaton(5, slots=3, width=3, classes=2, outc
 
 def drawn(bundle: Bundle, seed: int) -> np.ndarray:
     """Chances of the outcomes of each slot, by class."""
-    assert bundle.automaton is not None
     rng = np.random.default_rng(seed)
     return rng.dirichlet(np.ones(bundle.automaton.n_outcomes), (bundle.n_classes, bundle.automaton.n_slots))
 
@@ -115,7 +112,6 @@ def drawn(bundle: Bundle, seed: int) -> np.ndarray:
 @pytest.mark.parametrize(("bundle", "seed"), [(BINARY, 1), (COUNTED, 6)], ids=["clicks", "numbers"])
 def test_leaves_and_states_come_near_the_exact_posteriors(bundle: Bundle, seed: int) -> None:
     old, chances = bundle.automaton, drawn(bundle, seed)
-    assert old is not None
     clicks = labelled(chances, 4000)
     rows = rows_of(bundle, clicks)
     reached = walk_nodes(old, clicks.counts)[:, -1]
@@ -125,7 +121,6 @@ def test_leaves_and_states_come_near_the_exact_posteriors(bundle: Bundle, seed: 
     found = choose(rows.evidence, kinds_for(rows.evidence, rows=rows.own_posteriors))
     made = rebuilt(bundle, rows, found, clicks, {"objects": 4000})
     new, exact = made.bundle.automaton, exact_posteriors(old, chances)
-    assert new is not None
     often = exact.any(axis=1)
     assert np.abs(new.posteriors - exact)[often].mean() < 0.04 < np.abs(old.posteriors - exact)[often].mean()
     assert (new.counts, new.n_outcomes) == (old.counts, old.n_outcomes)
@@ -146,5 +141,4 @@ def test_an_automaton_that_is_right_stays_as_it_is() -> None:
     found = choose(rows.evidence, kinds_for(rows.evidence, rows=True))
     assert found.correction is None
     new = rebuilt(right, rows, found, clicks, {}).bundle.automaton
-    assert new is not None
     assert np.array_equal(new.posteriors, right.automaton.posteriors)  # type: ignore[union-attr]

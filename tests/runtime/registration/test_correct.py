@@ -1,7 +1,5 @@
 """Patterns corrected for a measured table: exact where levels allow it, whole levels within range, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimate of where a target stands: its model against a rendering of its own, its slopes, and truths that it must find."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The registration file: what it keeps and refuses, `info` and `verify` on it, and a run with it, whose replay is the same."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from datetime import timedelta
@@ -53,7 +51,6 @@ def test_what_is_written_is_read_back(tmp_path: Path, pans: Pans) -> None:
     assert found.sha256 == sha256
     assert found.imaging().numbers() == pytest.approx(TABLE.numbers())
     flat = found.imaging().flat
-    assert flat is not None
     assert flat[0, 27] == pytest.approx(1.1)
     assert flat[:, 0] == pytest.approx(0.9)
     check_usable(found, PROFILE, (28, 28), now_utc())

@@ -1,7 +1,5 @@
 """The summary of a seeded run, compared key by key with a stored one; latencies in words: what the clock cannot resolve is never 0."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

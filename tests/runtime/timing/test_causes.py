@@ -1,7 +1,5 @@
 """Why work was late: every cause from evidence made by hand, and evidence from real collections, waits and threads."""
 
-from __future__ import annotations
-
 import gc
 import os
 import re
@@ -171,7 +169,6 @@ def test_an_incident_is_judged_once_from_its_worst_decision() -> None:
         incidents.late(LateWork(number, begin * MS, begin * MS + 1000, 151 * MS))
     assert incidents.verdict(152 * MS) is None  # not quiet yet
     event = verdict_of(incidents, 151 * MS + QUIET_NS)
-    assert event is not None
     assert (event["cause"], event["decisions"], event["first_decision"], event["last_decision"]) == ("disk", 3, 0, 2)
     assert event["worst_us"] == 50_000
     assert incidents.causes == {"disk": 3}

@@ -1,7 +1,5 @@
 """Histograms against sorted samples; lateness and blame."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

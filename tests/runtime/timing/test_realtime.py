@@ -1,7 +1,5 @@
 """What a process asks of its machine: held while it lasts, undone afterwards, refused with a reason; what the kernel counts."""
 
-from __future__ import annotations
-
 import gc
 import mmap
 import os

@@ -1,7 +1,5 @@
 """What is tried for real time: every condition is put back, and cores are chosen by what was measured."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

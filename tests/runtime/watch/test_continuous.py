@@ -1,7 +1,5 @@
 """Running for days: the state file, metrics over HTTP, signals that end a run, and the command with all of them."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """The computer around a run: how long a disk lasts, clocks that are set, and a run that stops before its disk is full."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The server under clients that mean no good: few connections and threads, and scrapes still answered."""
 
-from __future__ import annotations
-
 import socket
 import threading
 import time

@@ -1,7 +1,5 @@
 """The shipped dashboard and alert rules: each metric that they name is served by a real run; promtool accepts the rules."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """A run that hangs: it says so within two seconds, its light goes off, and SIGTERM ends it within five, with a word about where it was."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -88,7 +86,6 @@ def test_systemd_hears_of_the_loop_alone(tmp_path: Path, monkeypatch: pytest.Mon
         monkeypatch.setenv("NOTIFY_SOCKET", str(address))
         monkeypatch.setenv("WATCHDOG_USEC", "30000")
         notifier = Notifier.of_environment()
-        assert notifier is not None
         run: Any = SimpleNamespace(turned_s=time.monotonic(), outage_ns=None, ended="")
         notifier.begin(run)
         assert [manager.recv(99) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1", b"WATCHDOG=1"]

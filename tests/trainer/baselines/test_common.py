@@ -1,7 +1,5 @@
 """The alternatives to PANS: equal photons, exact posteriors against loops and closed forms, networks that learn, the command."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

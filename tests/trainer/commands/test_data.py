@@ -1,7 +1,5 @@
 """`pans data scene`: a task's objects as a scene that the simulator opens."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

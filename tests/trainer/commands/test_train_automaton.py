@@ -1,7 +1,5 @@
 """`pans train --encoder automaton`: from images to a bundle that runs, what is refused; a training that is terminated, and goes on."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 from typing import Any

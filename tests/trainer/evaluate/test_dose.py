@@ -1,7 +1,5 @@
 """Accuracy against dose: held against words and walks that are gone through one by one."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path
@@ -70,7 +68,6 @@ def test_walks_before_samples_that_bleach_are_those_of_all_words(mixed: bool) ->
     law = Bleaching(2.0, mixed)
     bundle = automaton_bundle(six_states(), photons=1.5)
     automaton, trials = bundle.automaton, 1500
-    assert automaton is not None
     wanted, photons = np.zeros((len(IMAGES), automaton.n_leaves)), np.zeros(len(IMAGES))
     for row, object_ in enumerate(transmission()):
         for word in itertools.product((0, 1), repeat=automaton.n_slots):
@@ -105,10 +102,8 @@ def test_walks_before_samples_that_bleach_are_those_of_all_words(mixed: bool) ->
 
 def test_a_table_of_the_first_patterns_sums_over_the_others() -> None:
     bundle = fixed()
-    assert bundle.table is not None
     readings = training_readings(bundle, IDEAL, TASK.train)
     clicks, found = readings[:, :, 1], of_first(bundle, 2, readings)
-    assert found.table is not None
     assert found.n_features == 2
     for seen in range(4):
         joint = np.zeros(3)

@@ -1,7 +1,5 @@
 """Mutual information, Bayes errors and Fisher ratios against closed forms."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

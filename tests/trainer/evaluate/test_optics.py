@@ -1,7 +1,5 @@
 """Accuracy where the table is not perfect: held against images that were moved by hand, and over several tables."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The map of clicks, and the pictures of a training and of a bundle."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

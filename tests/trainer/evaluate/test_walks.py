@@ -1,7 +1,5 @@
 """Evaluation of automata: exact against a sum over all words and against trials, calibration, and what the command says."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, replace
 from itertools import product
@@ -199,7 +197,6 @@ def test_photon_numbers_are_summed_over_all_words() -> None:
     """Every word of readings, chances by the law of one exposure, the decider's own answers."""
     model = counting_bundle()
     automaton = model.automaton
-    assert automaton is not None
     decider: Any = make_decider(model)
     law = CountLaw(0.02, 0.2, (0.84, 1.5, 2.5))
     images, labels = IMAGES[:6], LABELS[:6]

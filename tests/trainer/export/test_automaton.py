@@ -1,7 +1,5 @@
 """The comparison of the back end that will decide with the leaves of a written automaton."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -154,11 +154,9 @@ def row_of(word: np.ndarray) -> int:
 
 def test_what_is_left_of_numbers_sums_over_the_others() -> None:
     bundle = bundle_of_numbers()
-    assert bundle.table is not None
     readings = training_readings(bundle, COUNTING, OBJECTS)
     found = of_first(bundle, 2, readings)
     assert (found.n_features, found.outcomes) == (2, OUTCOMES)
-    assert found.table is not None
     for seen in itertools.product(range(OUTCOMES), repeat=2):
         joint = np.zeros(3)
         for last in range(OUTCOMES):

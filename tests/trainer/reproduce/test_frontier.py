@@ -1,7 +1,5 @@
 """The frontier: points of its recipes, means and margins against figures by hand, rows of every kind measured once."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -120,10 +118,8 @@ def test_click_budgets_take_the_automaton_that_spends_most_within_them_and_not_t
 def test_an_automaton_is_trained_once_and_trained_on_from_the_one_in_the_cache(asked, monkeypatch):
     on = Point("mnist", "automaton, trained on", 2.0, "automaton", (("photons", 1.5), ("epochs", 2)), start=GROWN)
     first, second = ways.point_row(asked, GROWN, 0), ways.point_row(asked, on, 0)
-    assert first is not None
     assert first["value"] > 60
     assert first["exposures"] <= 4
-    assert second is not None
     assert second["photons"] == pytest.approx(1.5, rel=0.1)
     start, digest = load_bundle(asked.cache / f"{GROWN.stem}-seed0.pans")
     assert start.provenance["command"] == "pans reproduce frontier"
@@ -140,7 +136,6 @@ def test_an_automaton_is_trained_once_and_trained_on_from_the_one_in_the_cache(a
     monkeypatch.setattr(adaptive_train, "train_automaton", never)
     (asked.cache / f"{on.stem}-seed0.json").unlink()
     again = ways.point_row(asked, on, 0)  # measured again, from its bundle
-    assert again is not None
     assert again["value"] == pytest.approx(second["value"], rel=1e-12)
     with pytest.raises(AssertionError, match="trained again"):
         ways.point_row(asked, GROWN, 1)
