@@ -83,7 +83,7 @@ def test_all_faults_of_a_folder_are_listed_at_once(tmp_path):
     faults = {
         "stray.png": "beside",
         "more": "within",
-        "small.png": "4 x 3",
+        "small.png": f"3 x {len(RAMP)}",
         "notes.txt": "",
         "empty": "without pictures",
     }
