@@ -21,12 +21,7 @@ from pans.runtime.bundle.model import Bundle, bundle_bytes
 from pans.runtime.live import RunResult
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.replaying import replay
-from pans.runtime.wire.messages import (
-    STREAM_DECODERS,
-    Frame,
-    Mark,
-    unpack_body,
-)
+from pans.runtime.wire.messages import STREAM_DECODERS, Frame, Mark, unpack_body
 from pans.runtime.wire.session import STREAM_TYPES
 
 MAX_VIOLATIONS = 20

@@ -8,14 +8,7 @@ import pytest
 from automata import EXPECTED, automaton_bundle, diamond, early_leaf, random_automaton
 
 from pans.runtime.bundle import Automaton, reachable_automaton, stopped, with_expected
-from pans.runtime.bundle.automaton import (
-    SLOTS_MAX,
-    capped,
-    golden_nodes,
-    greatest_light,
-    walk_nodes,
-    words_to,
-)
+from pans.runtime.bundle.automaton import SLOTS_MAX, capped, golden_nodes, greatest_light, walk_nodes, words_to
 from pans.runtime.errors import UsageError
 
 HALF = [0.5, 0.5]

@@ -140,9 +140,7 @@ def test_many_windows_at_once_are_found_dead_as_one_by_one() -> None:
     numbers = np.where(rng.random(3000) < 0.1, NO_OBJECT, np.arange(3000) // 3)
     for at_once in (1, 7, 640, 3000):
         guard = DarkGuard(
-            parallel(N, 1),
-            ChannelWatch(N, np.full(N, 1e-4)),
-            lit=DeadChannelTest(np.full(N, 1e-4), 1e9, 1e4),
+            parallel(N, 1), ChannelWatch(N, np.full(N, 1e-4)), lit=DeadChannelTest(np.full(N, 1e-4), 1e9, 1e4)
         )
         for first in range(0, 3000, at_once):
             guard.take_objects(rows[first : first + at_once], numbers[first : first + at_once])

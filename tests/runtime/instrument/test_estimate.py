@@ -13,12 +13,7 @@ import pytest
 
 from pans.runtime.commands.calibrate import CALIBRATE
 from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
-from pans.runtime.instrument.calibration import (
-    find_warnings,
-    load_calibration,
-    now_utc,
-    save_calibration,
-)
+from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc, save_calibration
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
 from pans.runtime.instrument.dead_time import DeadTime
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light, fit_spread, log_likelihood

@@ -20,12 +20,7 @@ from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import read_recording
 from pans.runtime.registration.correct import corrected
 from pans.runtime.registration.estimate import Estimate
-from pans.runtime.registration.file import (
-    check_usable,
-    load_registration,
-    registration_values,
-    save_registration,
-)
+from pans.runtime.registration.file import check_usable, load_registration, registration_values, save_registration
 from pans.runtime.registration.parameters import DARK, vector_of
 
 PROFILE = load_profile("dmd-spad")
