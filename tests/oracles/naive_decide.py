@@ -48,11 +48,6 @@ def mlp_scores(
     return values
 
 
-def integer_sums(steps: Sequence[int], weights: Sequence[Sequence[int]]) -> list[int]:
-    """The sums of one int8 layer in unbounded integers."""
-    return [sum(steps[i] * weights[i][k] for i in range(len(steps))) for k in range(len(weights[0]))]
-
-
 def int8_reference(head: Int8Head, counts: np.ndarray, shots: int) -> np.ndarray:
     """Return the scores (n, classes) of click counts (n, d_f): integer sums, and float32 between them as the kernel has it."""
     steps = counts.astype(np.int64)

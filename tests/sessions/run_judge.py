@@ -73,8 +73,6 @@ class Judge:
         if (again.decisions, again.sha256) != (recording.n_decisions, recording.decisions_sha256):
             self.fail(f"a replay gives {again.decisions} decisions of {recording.n_decisions}, or other ones")
 
-    # -- wire, host and recording --------------------------------------------------------------------------------------
-
     def _wire(self, wire: ObservedLink, result: RunResult, recording: Recording) -> None:
         there, host = wire.decoded(DECODED), {name: result.decoder.get(name, 0) for name in DECODED}
         if host != there:
@@ -102,8 +100,6 @@ class Judge:
             self.fail(f"{on_record} stream messages are recorded, the host counted {counted}")
         if result.tally.decisions != recording.n_decisions:
             self.fail(f"{result.tally.decisions} decisions were made, {recording.n_decisions} are recorded")
-
-    # -- commands and pulses -------------------------------------------------------------------------------------------
 
     def _commands(self, log: DeviceLog) -> None:
         last: dict[tuple[int, int], int] = {}
@@ -156,8 +152,6 @@ class Judge:
             elif asked and (not no_answer or (asked[-1][0], wire.gates[asked[-1]]) not in executed):
                 refused |= {number for of, number in asked if of == last}
         return refused
-
-    # -- the exposures -------------------------------------------------------------------------------------------------
 
     def _streams(self, log: DeviceLog, wire: ObservedLink, result: RunResult, recording: Recording) -> None:
         """Match the gaps that the host reported with what each session's messages left out; both in their order."""

@@ -120,8 +120,6 @@ def test_signals_at_any_stage_many_times(tmp_path: Path) -> None:
     check_all(tmp_path, rounds=12, longest_s=0.3)
 
 
-# -- what was acted upon -------------------------------------------------------------------------------------------------
-
 KILLS = 40
 ACT_EVERY = 5  # decisions
 ACTED = struct.Struct("<Q")

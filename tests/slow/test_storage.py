@@ -218,8 +218,6 @@ def test_every_call_of_every_command(name: str, bench: Bench) -> None:
     assert not wrong, f"{name}, {len(wrong)} runs:\n" + "\n".join(wrong)
 
 
-# ---- a power cut: what was not synced is lost ----
-
 CUT = [name for name in CASES if name not in ("export hdf5", "train")]  # which write without `write`
 
 

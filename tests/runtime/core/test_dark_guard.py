@@ -96,9 +96,6 @@ def test_one_detector() -> None:
     assert "the detector clicks" in found[0].words
 
 
-# ---- tables ----
-
-
 def bayes(
     light: NDArray[np.float64], dark_rates: NDArray[np.float64], shots: int = 1
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -144,9 +141,6 @@ def test_unchanged_detector_leaves_the_table_as_it_is() -> None:
     assert (made.argmax(axis=1) == scores.argmax(axis=1)).all()
     table = TableDecider(made, 1)
     assert table.decide(np.array([1, 0, 1, 0, 0, 1]), 1).label == int(scores[0b100101].argmax())
-
-
-# ---- tables of counts, and heads with too many of them ----
 
 
 @pytest.mark.parametrize("shots", [1, 2, 3])
@@ -238,9 +232,6 @@ def test_the_adapter_fits_the_bundle() -> None:
         make_adapter(replace(bundle, head_onnx=None), 2)
 
 
-# ---- what the guard takes in ----
-
-
 def test_an_afterpulse_is_no_dark_count() -> None:
     plan = shot_major(3, 1)  # a dark slot before three patterns: right behind the last of them
     rng = np.random.default_rng(6)
@@ -306,8 +297,6 @@ def test_tables_and_masks_need_a_bundle() -> None:
     with pytest.raises(UsageError, match="allowed: warn"):
         DarkGuard(shot_major(3, 1), watch, "panic")
 
-
-# ---- whole runs ----
 
 SCENE = """kind = "still"
 images = "fashion200"

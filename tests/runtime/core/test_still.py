@@ -194,21 +194,6 @@ def test_a_block_that_ends_early_differs_from_the_plan_as_one_that_ends_late(off
     assert core.jitter_ticks == abs(off)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_random_losses_never_reach_the_decider(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    core, decider = make(n_cycles=200)
-    log = []
-    for seq in range(200):
-        if rng.random() > 0.2:
-            log += core.step(cycle(seq, seq, rng.integers(0, 2, 4).tolist())).decisions
-    log += core.step(completed(800)).decisions + core.step(completed(800, tick=10**6 + 1)).decisions
-    assert len(log) == 200
-    flagged = [d for d in log if d.flags & DecisionFlag.GAP]
-    assert len(flagged) + len(decider.asked) == 200
-    assert core.tracker.counters.lost_exposures == 4 * len(flagged)
-
-
 @pytest.mark.parametrize("score", [float("nan"), float("inf")])
 def test_scores_that_are_not_finite_give_no_label(score: float) -> None:
     core, decider = make()

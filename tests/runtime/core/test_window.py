@@ -95,13 +95,6 @@ def test_a_window_is_settled_with_its_last_exposure_not_later() -> None:
     assert [w.first_shot for w in rest] == [1, 2]
 
 
-def test_whole_visits_that_were_lost_are_reported_one_by_one() -> None:
-    plan = shot_major(2, 2)
-    windows = DecisionWindows(plan, 2, 1)
-    lost = windows.skip_to(5 * windows.visit_exposures)
-    assert [(w.missing, w.counts.sum()) for w in lost] == [(2, 0)] * 10
-
-
 @pytest.mark.uncompiled
 @pytest.mark.parametrize("n_features", [1, 8, 10, 64, 70])
 def test_parallel_frames(n_features: int) -> None:
@@ -125,9 +118,6 @@ def test_shots_that_do_not_divide_are_refused_with_the_numbers() -> None:
 def test_a_visit_that_does_not_fit_in_memory_is_refused() -> None:
     with pytest.raises(PlanError, match="exposures, allowed"):
         DecisionWindows(shot_major(1000, 1 << 20), 1000, 1)
-
-
-# -- walks ---------------------------------------------------------------------------------------------------------------
 
 
 @st.composite

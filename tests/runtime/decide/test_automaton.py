@@ -14,7 +14,6 @@ from pans.runtime.bundle import Automaton
 from pans.runtime.decide import make_decider
 from pans.runtime.decide.automaton import AutomatonDecider, walk_words
 from pans.runtime.decide.expectation import ExpectedWalk, expected_walk
-from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.instrument.click_law import ClickLaw, CountLaw, click_probability
@@ -82,26 +81,6 @@ def test_golden_walks_bind_the_back_end() -> None:
         make_decider(replace(bundle, golden_walks=wrong))
     with pytest.raises(DamagedFileError, match="contradicts the golden vectors"):
         make_decider(replace(bundle, golden_scores=bundle.golden_scores[::-1]))
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_below_the_confidence_nothing_is_decided(seed: int) -> None:
-    automaton = random_automaton(seed, slots=8)
-    decider = make_decider(automaton_bundle(automaton), confidence=0.8)
-    assert isinstance(decider, AutomatonDecider)
-    words = np.random.default_rng(seed).integers(0, 2, (400, decider.n_features))
-    labels, probabilities = decider.verdicts(words, 1)
-    whole = make_decider(automaton_bundle(automaton))
-    abstained = labels == NO_LABEL
-    assert 0 < abstained.sum() < len(words)
-    assert ((probabilities < np.float32(0.8)) == abstained).all()
-    _, exposures = decider.leaves(words)
-    longer = np.zeros((len(words), whole.n_features), np.int64)
-    longer[:, : words.shape[1]] = words
-    for i in np.flatnonzero(~abstained):
-        states = naive.walk(automaton, longer[i].tolist()).states
-        sure = [s for s in states[1:] if automaton.posteriors[s].max() >= np.float32(0.8)]
-        assert exposures[i] == (automaton.depth[sure[0]] if sure else len(states))
 
 
 def of_objects(automaton: Automaton, seed: int = 3, n: int = 4) -> tuple[np.ndarray, np.ndarray]:

@@ -19,8 +19,6 @@ from pans.runtime.wire.messages import NO_OBJECT, DeviceState, FrameBlock, State
 
 F64 = NDArray[np.float64]
 
-# -- the kernels ---------------------------------------------------------------------------------------------------------
-
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
@@ -75,9 +73,6 @@ def test_two_maxima_are_told_from_one_with_noise() -> None:
 
     assert found(one) <= 4
     assert found(two) >= 396
-
-
-# -- cells ---------------------------------------------------------------------------------------------------------------
 
 
 def test_every_cell_is_decided_once_in_its_middle() -> None:
@@ -224,9 +219,6 @@ def test_a_core_that_goes_on_from_a_part_gives_the_same_rows(kind: str, track: i
     assert before.decisions + after.decisions == whole.decisions
 
 
-# -- tape ----------------------------------------------------------------------------------------------------------------
-
-
 def test_bars_are_decided_where_the_speed_says() -> None:
     """A bar every 25 frames, position 0 at 31 us: frame 15 is the one around it."""
     words = np.zeros(500, np.uint16)
@@ -330,9 +322,6 @@ def test_nothing_is_learnt_over_a_gap() -> None:
     off = beside - np.arange(len(beside))
     assert np.abs(off[300:]).max() < 0.1
     assert any(row.flags & DecisionFlag.GAP for row in output.decisions)
-
-
-# -- what cannot be ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -40,9 +40,6 @@ def watched(
     return watch, found
 
 
-# ---- the tests ----
-
-
 def test_a_silence_is_as_long_as_its_false_alarms_ask_for() -> None:
     for rate, n, arl in ((1e-4, 8, 1e9), (0.3, 10, 1e7), (0.01, 1, 1e6)):
         limit = silence_limit(rate, n, arl)
@@ -170,9 +167,6 @@ def test_a_channel_that_returns_is_alive() -> None:
     assert watch.returned() == []
 
 
-# ---- the guard ----
-
-
 def test_the_guard_names_it_and_says_when_it_is_over() -> None:
     plan = parallel(N, 3)  # a dark frame, then three shots
     lit = DeadChannelTest(np.full(N, 1e-4), 1e9, 1e6)
@@ -209,9 +203,6 @@ def test_one_detector_is_dead_when_nothing_clicks() -> None:
         guard.take_object(bits[1:].astype(np.int64), NO_OBJECT)
     assert [(event["state"], event["level"]) for event in events] == [("dead", "alarm")]
     assert "no light at all" in events[0]["words"]
-
-
-# ---- whole runs ----
 
 
 def test_a_run_finds_a_dead_channel_and_a_replay_agrees(tmp_path: Path, pans: Pans) -> None:

@@ -174,9 +174,6 @@ def test_a_device_that_stays_away_ends_the_run_loudly() -> None:
     assert result.ended == "the link was lost: it is not there (5 attempts in 5 s)"
 
 
-# -- opening -----------------------------------------------------------------------------------------------------------
-
-
 def test_none_busy_and_no_permission_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     import serial
 
@@ -267,9 +264,6 @@ def test_an_ftdi_adapters_latency_is_read(tmp_path: Any) -> None:
     assert latency_timer_ms("/dev/ttyACM0", tmp_path) is None
 
 
-# -- the reader --------------------------------------------------------------------------------------------------------
-
-
 def wait_for(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not condition() and time.monotonic() < deadline:
@@ -356,9 +350,6 @@ def test_a_link_that_breaks_while_the_loop_is_busy_ends_every_further_wait() -> 
             while True:
                 reader.wait(0.01)
     reader.stop()
-
-
-# -- a driver of one's own ---------------------------------------------------------------------------------------------
 
 
 class FifoPort:

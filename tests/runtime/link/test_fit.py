@@ -98,8 +98,6 @@ def test_a_device_without_states_can_be_driven_by_the_host() -> None:
     check_automaton(announcement(Extension(0, 4)), build_plan(PROFILE, BUNDLE, drive="host"))
 
 
-# ---- scenes ----
-
 FASHION = load_bundle(SHIPPED / "fashion10.pans")[0]
 
 

@@ -138,9 +138,6 @@ def test_the_exact_table_without_dark_counts_and_with_endless_light_is_the_truth
     assert table[word].argmax() == 1
 
 
-# -- plans and settings --------------------------------------------------------------------------------------------------
-
-
 def thirds(flow_folder: Path) -> Bundle:
     return load_bundle(flow_folder / "thirds.pans")[0]
 
@@ -197,8 +194,6 @@ def test_decisions_cannot_be_counted_beforehand(flow_folder: Path, pans: Pans) -
     found = run_command(flow_folder, pans, "--decisions", "5", code=2)
     assert "as many decisions as objects pass" in found["error"]["message"]
 
-
-# -- with the kernel and without -----------------------------------------------------------------------------------------
 
 SETTINGS = FlowSettings("cells", fields_per_s=20_000.0, onset_frames=4, gate_classes=("a", "b"))
 

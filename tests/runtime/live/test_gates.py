@@ -188,8 +188,6 @@ def test_unknown_actuators_are_refused_by_name() -> None:
         open_actuator("sim:ideal?pace=fast", PROFILE)
 
 
-# -- a second instrument, in real time -----------------------------------------------------------------------------------
-
 PATIENCE_S = 10.0
 PULSER = load_profile("ideal")
 TCP = "tcp:127.0.0.1:0"

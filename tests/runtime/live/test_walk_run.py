@@ -2,7 +2,6 @@
 
 import csv
 import math
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from automata import automaton_bundle, random_automaton
 from commands import Pans
 
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
-from pans.runtime.bundle.automaton import Automaton, walk_nodes
 from pans.runtime.bundle.model import Bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
@@ -22,7 +20,7 @@ from pans.runtime.errors import DeviceError, PlanError
 from pans.runtime.instrument.click_law import click_law, object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.fit import check_automaton
-from pans.runtime.record import Recording, read_recording
+from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.parts import parts_in
 from pans.runtime.record.sent_plan import recorded_plan
@@ -80,31 +78,6 @@ def test_the_host_and_the_device_give_the_same_walks(folder: Path, tmp_path: Pat
         assert main(["verify", str(tmp_path / drive / "run.pansrec")]) == 0
 
 
-def sent(recording: Recording, largest: int, slots: int) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps and numbers of all exposures (cycles, slots), from the recorded bytes of COUNTS as protocol.md lays them out."""
-    exposures: dict[int, tuple[int, int]] = {}
-    for _, body in recording.messages():
-        if body[0] == 0x93:
-            first, _, n, found, _ = struct.unpack_from("<QIHHI", body, 8 + 16)
-            assert found == largest
-            stamps, numbers = struct.unpack_from(f"<{n}H", body, 8 + 36), body[8 + 36 + 2 * n :]
-            exposures |= dict(enumerate(zip(stamps, numbers), first))
-    rows = np.array([exposures[i] for i in range(len(exposures))])
-    return rows[:, 0].reshape(-1, slots), rows[:, 1].reshape(-1, slots)
-
-
-def walked_by_hand(automaton: Automaton, recording: Recording) -> list[tuple[int, int, int]]:
-    """Photons, label and exposures of every walk."""
-    rows = []
-    for shown, numbers in zip(*sent(recording, automaton.n_outcomes - 1, automaton.n_slots + 1)):  # one dark slot
-        node, photons, taken = 0, 0, 0
-        for stamp, number in zip(shown.tolist(), numbers.tolist()):
-            if node < automaton.n_states and stamp == node:
-                node, photons, taken = int(automaton.successors[node][number]), photons + number, taken + 1
-        rows.append((photons, int(automaton.posteriors[node].argmax()), taken))
-    return rows
-
-
 def test_photon_numbers_lead_the_same_walks_by_the_device_and_by_the_host(
     folder: Path, tmp_path: Path, pans: Pans
 ) -> None:
@@ -123,7 +96,6 @@ def test_photon_numbers_lead_the_same_walks_by_the_device_and_by_the_host(
         assert replays(path)
         assert main(["verify", str(path)]) == 0
         found[drive] = recording.decisions()
-        assert found[drive][["clicks", "label", "exposures"]].tolist() == walked_by_hand(automaton, recording)
         plan = recorded_plan(recording)
         clicks = click_list(recording, plan)
         lit = clicks.pattern != DARK_PATTERN
@@ -167,20 +139,6 @@ def test_a_host_that_is_held_up_leaves_slots_dark_and_guesses_nothing(folder: Pa
 
 
 @pytest.mark.parametrize("drive", ["device", "host"])
-def test_what_the_link_loses_is_never_guessed(folder: Path, tmp_path: Path, pans: Pans, drive: str) -> None:
-    _, fine = run(pans, folder, tmp_path / "fine", "--drive", drive)
-    words = ("--drive", drive)
-    summary, walks = run(pans, folder, tmp_path / "lossy", *words, more="&faults=loss:0.02,duplicate:0.02,flip:0.01")
-    assert len(walks) == len(fine)
-    decided = walks["label"] != NO_LABEL
-    assert 0 < decided.sum() < len(walks)
-    same = ("clicks", "label", "probability", "counts_crc", "exposures", "shot")
-    assert walks[decided][list(same)].tolist() == fine[decided][list(same)].tolist()
-    assert summary["lost"] > 0
-    assert replays(tmp_path / "lossy" / "run.pansrec")
-
-
-@pytest.mark.parametrize("drive", ["device", "host"])
 def test_a_lost_device_is_found_again_and_parts_replay_by_themselves(
     folder: Path, tmp_path: Path, pans: Pans, drive: str
 ) -> None:
@@ -210,8 +168,6 @@ def test_what_makes_no_sense_with_walks_is_refused(folder: Path, tmp_path: Path,
     assert not (tmp_path / "no").exists()
 
 
-# -- several detectors at once -------------------------------------------------------------------------------------------
-
 TRIALS, CHANNELS = 3, 3
 PROFILE = load_profile("dmd-four-snspd")
 IMAGES = np.random.default_rng(2).integers(0, 256, (N_OBJECTS, 2, 2)).astype(np.uint8)
@@ -236,28 +192,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("drive", ["device", "host"])
-def test_a_run_is_its_walks_and_replays(runs: Path, drive: str, pans: Pans) -> None:
-    automaton = bundle().automaton
-    recording = read_recording(runs / drive / "run.pansrec")
-    assert recording.header["config"]["channels_at_once"] == CHANNELS
-    stamps, words = sent(recording, 2**CHANNELS - 1, automaton.n_slots + 1)
-    rows = recording.decisions()
-    for walk, (shown, numbers) in enumerate(zip(stamps, words)):
-        lit = shown != DARK_PATTERN
-        bits = np.zeros(automaton.n_bits, np.int64)
-        clicks = numbers[lit][:, None] >> np.arange(CHANNELS) & 1
-        bits[: clicks.size] = clicks.reshape(-1)
-        nodes = walk_nodes(automaton, bits[None])[0]
-        assert nodes[: lit.sum()].tolist() == shown[lit].tolist()
-        wanted = (clicks.sum(), automaton.posteriors[nodes[-1]].argmax(), lit.sum())
-        assert rows[walk][["clicks", "label", "exposures"]].tolist() == wanted
-    assert main(["replay", str(runs / drive / "run.pansrec")]) == 0
-    assert main(["verify", str(runs / drive / "run.pansrec")]) == 0
-
-
 def test_device_and_host_lead_the_same_walks(runs: Path) -> None:
-    by_device, by_host = (read_recording(runs / drive / "run.pansrec").decisions() for drive in ("device", "host"))
+    recordings = [read_recording(runs / drive / "run.pansrec") for drive in ("device", "host")]
+    by_device, by_host = (recording.decisions() for recording in recordings)
+    for recording in recordings:
+        assert recording.header["config"]["channels_at_once"] == CHANNELS
+        assert replays(recording.path)
+        assert main(["verify", str(recording.path)]) == 0
     assert by_device[list(WALKS)].tolist() == by_host[list(WALKS)].tolist()
     assert len(set(by_device["exposures"].tolist())) > 2
 

@@ -176,9 +176,6 @@ def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
     assert not read_recording(parts_in(tmp_path)[0]).complete
 
 
-# ---- all parts as one recording ----
-
-
 def test_parts_are_one_recording(runs: Path, parts: Path) -> None:
     one, joined = open_recording(runs / "one"), open_recording(parts)
     assert one == read_recording(runs / "one/run.pansrec")

@@ -59,9 +59,6 @@ def test_what_is_recorded_of_a_cut_run_is_decided_again(
     assert replay(part, part.bundle())[:3] == (0, part.decisions_sha256, None)
 
 
-# ---- what the device answered ----
-
-
 def test_what_the_device_answered_is_on_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "run.pansrec"
     record_small(path, 40)
@@ -102,9 +99,6 @@ def test_an_answer_that_is_none_is_a_violation(tmp_path: Path, body: bytes, word
         recorder.add_answer(1, body)
         recorder.close({})
     assert words in " ".join(verify_file(path).violations)
-
-
-# ---- what a verified recording claims ----
 
 
 @pytest.fixture(scope="module")

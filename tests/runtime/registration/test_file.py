@@ -111,8 +111,6 @@ def test_a_run_refuses_what_is_of_another_table(tmp_path: Path) -> None:
         check_usable(found, PROFILE, (28, 28), now - timedelta(hours=1))
 
 
-# ---- in a run ----
-
 URL = "sim:oled-qcmos?pace=fast&seed=3&optics=shift=1,1"
 
 

@@ -114,9 +114,6 @@ def test_the_facts_of_a_machine_are_read(tmp_path: Path) -> None:
     assert steal_ms(tmp_path / "nothing") is None
 
 
-# ---- the set-up of a run ----
-
-
 @pytest.mark.parametrize("wanted", [False, True])
 def test_the_realtime_set_up_is_undone(wanted: bool) -> None:
     interval = sys.getswitchinterval()
@@ -193,9 +190,6 @@ def test_a_held_heap_has_been_touched_before() -> None:
         pytest.skip(" ".join(answer))
     assert int(as_it_comes) > (4 << 20) // mmap.PAGESIZE
     assert int(held) < 32
-
-
-# ---- what the kernel counts for a thread ----
 
 
 def touch(pages: int) -> None:

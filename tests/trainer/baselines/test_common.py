@@ -76,9 +76,6 @@ def test_a_decision_that_claims_too_much_conveys_what_its_readouts_know() -> Non
     assert found.bits_per_illumination == pytest.approx(found.bits / 1.2)
 
 
-# ---- light ----
-
-
 @pytest.mark.parametrize("brightness", baselines.BRIGHTNESS)
 @pytest.mark.parametrize("features", [None, 6])
 def test_one_source_gives_bright_objects_more_photons_and_one_that_follows_them_all_the_same(
@@ -104,9 +101,6 @@ def test_detectors_have_the_mean_and_variance_of_their_law() -> None:
     p = 1 - math.exp(-1.0)
     assert set(np.unique(clicks)) == {0.0, 1.0}
     assert clicks.mean() == pytest.approx(p, abs=5 * math.sqrt(p * (1 - p) / n))
-
-
-# ---- the exact posterior ----
 
 
 @pytest.mark.parametrize("detector", baselines.DETECTORS)
@@ -144,9 +138,6 @@ def test_bayes_reaches_the_closed_form_of_two_objects() -> None:
     assert abs(trials.right.mean() - exact) < 5 * math.sqrt(exact * (1 - exact) / trials.right.size)
 
 
-# ---- the score ----
-
-
 def test_spreads_over_trials_and_over_objects_are_kept_apart() -> None:
     right = np.zeros((4, 300), bool)
     right[:, :150] = True  # the same objects every time: no spread over trials, much over objects
@@ -160,9 +151,6 @@ def test_spreads_over_trials_and_over_objects_are_kept_apart() -> None:
     assert (first.objects, first.accuracy_mean, first.clicks_mean) == (200, 0.75, 99.5)
 
 
-# ---- fixed patterns ----
-
-
 def test_hadamard_patterns_are_two_dimensional_walsh_functions() -> None:
     functions = walsh(8)
     assert (np.diff(functions, axis=1) != 0).sum(axis=1).tolist() == list(range(8))
@@ -174,9 +162,6 @@ def test_hadamard_patterns_are_two_dimensional_walsh_functions() -> None:
     assert patterns("hadamard", 10, (28, 28), 0).shape == (10, 784)
     with pytest.raises(ValueError, match="allowed on 8 x 8 pixels: 64"):
         patterns("hadamard", 65, (8, 8), 0)
-
-
-# ---- networks ----
 
 
 def test_networks_that_know_the_noise_beat_those_that_do_not(task: Task) -> None:
@@ -209,8 +194,6 @@ def test_conventional_end_to_end_works_in_bright_light_only(task: Task, bits: in
     binary = run_trials(measurement, 3.0, "binary", at(3.0, "binary"), trials=3, seed=0).measured()
     assert binary.clicks_mean <= 6
 
-
-# ---- the command ----
 
 KEYS = {"accuracy_mean", "accuracy_std", "clicks_mean", "photons_mean", "illumination", "objects", "trials"}
 

@@ -57,9 +57,6 @@ def test_held_out_objects_are_judged_by_the_table_of_the_training_objects() -> N
     assert swapped.heldout_bits < 0 < fair.heldout_bits <= fair.bits + 1e-9
 
 
-# ---- what decisions convey ----
-
-
 def test_bits_of_light_and_their_errors_are_those_of_objects_drawn_again() -> None:
     rng = np.random.default_rng(8)
     labels, photons = rng.integers(0, 3, 400), rng.gamma(2.0, 4.0, 400)
@@ -74,9 +71,6 @@ def test_bits_of_light_and_their_errors_are_those_of_objects_drawn_again() -> No
     fair = [conveyed(np.zeros(60), rng.integers(0, 3, 60), np.ones(60), 1.0)["bits"] for _ in range(4000)]
     assert math.log2(3) - np.mean(fair) == pytest.approx(2 / (2 * 60 * math.log(2)), rel=0.1)
     assert "bits_per_photon" not in conveyed(np.zeros(4), np.arange(4) % 2, np.zeros(4), 0.0)
-
-
-# ---- frames: one pixel, two objects, exact sums ----
 
 
 def poisson_two(low: float, high: float) -> tuple[float, np.ndarray]:
@@ -101,9 +95,6 @@ def test_sampled_bounds_meet_the_exact_information_and_an_overconfident_posterio
     else:  # it believes too much
         assert found.believed_bits > exact + 50 * found.lower_bits_se
     assert found.temperature == pytest.approx(confidence, rel=0.25)
-
-
-# ---- Fisher ----
 
 
 def test_fisher_of_two_classes_in_one_dimension() -> None:

@@ -34,9 +34,6 @@ def write(folder, name, made):
     assert all((folder / f"{name}{ending}.png").stat().st_size > 3000 for ending in page_of(name).drawn(made).pictures)
 
 
-# ---- alternatives over photons ----
-
-
 def row(way, photons, value, features=10):
     light = {"level": photons, "clicks": photons / 2, "photons": photons, "illumination": 3 * photons}
     return {"table": "curves", "way": way, "features": features, "value": value, "error_objects": 0.4} | light
@@ -93,9 +90,6 @@ def test_pages_of_curves_are_put_together_from_what_is_finished(task, asked, tmp
     write(tmp_path, "fig-2e", collected)
 
 
-# ---- compressive sensing ----
-
-
 def test_compressive_sensing_learns_on_clean_light_and_fails_on_little(task, asked, tmp_path, monkeypatch):
     monkeypatch.setattr(curves, "load_task", lambda *_: task)
     wanted = (("binary", False, 30, 4), ("binary", False, 30, 16), ("gaussian", True, 10, 16))
@@ -113,9 +107,6 @@ def test_compressive_sensing_learns_on_clean_light_and_fails_on_little(task, ask
     partly = curves.compressive_page(dataclasses.replace(page, collect=True))
     assert {one["family"] for one in of_table(partly.rows, "epochs") if one["features"] == 16} == {"gaussian"}
     assert "page: compressive-binary-16 is not measured yet" in said
-
-
-# ---- readouts ----
 
 
 def test_frames_are_drawn_mapped_and_judged(task, asked, tmp_path, monkeypatch):
@@ -175,9 +166,6 @@ def test_readouts_of_the_shipped_patterns_stand_beside_frames(asked, tmp_path, m
     assert ["verdict" in row for row in maps.rows] == [False, True, False, True]
     assert readouts.maps_page(dataclasses.replace(page, collect=True)).rows == maps.rows
     write(tmp_path, "fig-2f", maps)
-
-
-# ---- trainings that are followed ----
 
 
 SMALL = Options(features=3, estimator="ste", alpha=1e-3, epochs=6, hidden=8, batch=25, front_rate=5e-2, head_rate=2e-2)
