@@ -28,25 +28,16 @@ from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.replaying import replay
 from pans.runtime.report.summary import Summary, summarise
+from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import Frame, FrameDecoder, encode_frame
-from pans.runtime.wire.messages import (
-    BLOCK_HEADER_BYTES,
-    DECODERS,
-    NO_OBJECT,
-    STRUCTS,
-    DeviceState,
-    MalformedMessage,
-    MessageType,
-    Opcode,
-)
 from pans.runtime.wire.schema import ALL_MESSAGES, AUTOMATON_MESSAGES, Field, wrong_facts
 
 COMMANDS = ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE", "READ_COUNTS", "LOAD_COUNT_STATES")
 BODIES = {  # of commands: which of them holds the layout, and where in the payload it begins; of rows, the first
-    **{name: (name, STRUCTS["COMMAND"].size) for name in (*COMMANDS, *AUTOMATON_MESSAGES)},
-    "PLAN_SLOT": ("LOAD_PLAN", STRUCTS["COMMAND"].size + STRUCTS["LOAD_PLAN"].size),
-    "STATE": ("LOAD_STATES", STRUCTS["COMMAND"].size + STRUCTS["LOAD_STATES"].size),
-    "COUNT_STATE": ("LOAD_COUNT_STATES", STRUCTS["COMMAND"].size + STRUCTS["LOAD_COUNT_STATES"].size),
+    **{name: (name, wire.STRUCTS["COMMAND"].size) for name in (*COMMANDS, *AUTOMATON_MESSAGES)},
+    "PLAN_SLOT": ("LOAD_PLAN", wire.STRUCTS["COMMAND"].size + wire.STRUCTS["LOAD_PLAN"].size),
+    "STATE": ("LOAD_STATES", wire.STRUCTS["COMMAND"].size + wire.STRUCTS["LOAD_STATES"].size),
+    "COUNT_STATE": ("LOAD_COUNT_STATES", wire.STRUCTS["COMMAND"].size + wire.STRUCTS["LOAD_COUNT_STATES"].size),
 }
 STAMP = "STAMP"  # not a message: the first pattern or state that is stamped in a block of clicks or of photon numbers
 LAYOUTS = {**ALL_MESSAGES, STAMP: (Field("pattern", "H"),)}
@@ -76,16 +67,18 @@ class Mutation(NamedTuple):
 def is_of(frame: Frame, message: str) -> bool:
     """Whether a frame is of the kind whose fields stand under `message` in LAYOUTS."""
     if message in BODIES:
-        return frame.type == MessageType.COMMAND and frame.payload[4] == Opcode[BODIES[message][0]]
-    return frame.type in ((MessageType.CLICKS, MessageType.COUNTS) if message == STAMP else (MessageType[message],))
+        return frame.type == wire.MessageType.COMMAND and frame.payload[4] == wire.Opcode[BODIES[message][0]]
+    return frame.type in (
+        (wire.MessageType.CLICKS, wire.MessageType.COUNTS) if message == STAMP else (wire.MessageType[message],)
+    )
 
 
 def _layout(mutation: Mutation) -> tuple[struct.Struct, int, int]:
     """The layout of the fields that `mutation` changes, where it begins in the payload, and the place of the field in it."""
     place = [one.name for one in LAYOUTS[mutation.message]].index(mutation.name)
     if mutation.message == STAMP:
-        return struct.Struct("<H"), BLOCK_HEADER_BYTES, place
-    return STRUCTS[mutation.message], BODIES.get(mutation.message, ("", 0))[1], place
+        return struct.Struct("<H"), wire.BLOCK_HEADER_BYTES, place
+    return wire.STRUCTS[mutation.message], BODIES.get(mutation.message, ("", 0))[1], place
 
 
 def field_of(payload: bytes, mutation: Mutation) -> Any:
@@ -97,7 +90,7 @@ def field_of(payload: bytes, mutation: Mutation) -> Any:
 def mutate(payload: bytes, mutation: Mutation) -> bytes:
     """Return `payload` with one field changed; whatever does not fit the field's bits is cut to them."""
     if mutation.name.startswith("map."):
-        head, facts = payload[: STRUCTS["WELCOME"].size], msgpack.unpackb(payload[STRUCTS["WELCOME"].size :])
+        head, facts = payload[: wire.STRUCTS["WELCOME"].size], msgpack.unpackb(payload[wire.STRUCTS["WELCOME"].size :])
         key = mutation.name[4:]
         value = mutation.changed(facts.get(key))
         if value is MISSING:
@@ -140,9 +133,9 @@ class Evidence(NamedTuple):
             ("STATUS", "next_exposure"): new > self.exposures,
             ("STATUS", "drops"): new > self.exposures,
             ("MARK", "truth"): new >= self.n_classes,
-            ("MARK", "object_index"): new != NO_OBJECT,
+            ("MARK", "object_index"): new != wire.NO_OBJECT,
             ("ACK", "last_id"): new > self.exposures,
-            ("BLOCK", "object_index"): new != NO_OBJECT,
+            ("BLOCK", "object_index"): new != wire.NO_OBJECT,
             ("BLOCK", "tick"): abs(new - old) > self.tick_hz,
         }
         always = {
@@ -188,7 +181,7 @@ class MutatedLink:
             if mutation.first <= number < mutation.first + mutation.most:
                 changed = mutate(payload, mutation)
                 self.changed += changed != payload
-                sent_back = changed != payload and frame.type >= MessageType.WELCOME
+                sent_back = changed != payload and frame.type >= wire.MessageType.WELCOME
                 if sent_back and self._excludes(mutation, frame.type, payload, changed):
                     self.impossible.append(mutation)
                 payload = changed
@@ -197,14 +190,14 @@ class MutatedLink:
     def _excludes(self, mutation: Mutation, kind: int, old: bytes, new: bytes) -> bool:
         """Whether the changed message of that type makes no sense, or cannot be true."""
         try:
-            decoded = DECODERS[kind](new)
-        except MalformedMessage:
+            decoded = wire.DECODERS[kind](new)
+        except wire.MalformedMessage:
             return True
         if mutation.message == "WELCOME":
             return bool(wrong_facts(decoded.facts))
         if len(self._mutations) > 1:
             return False  # the other one may make it a message that is dropped: of another probe, or of an earlier run
-        if mutation.message == "STATUS" and (not self._armed or decoded.state == DeviceState.ARMED):
+        if mutation.message == "STATUS" and (not self._armed or decoded.state == wire.DeviceState.ARMED):
             return False  # of no run, or of one that has not begun
         values = [field_of(payload, mutation) for payload in (old, new)]
         return self._evidence.excludes(mutation.message, mutation.name, *values)

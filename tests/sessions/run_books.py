@@ -16,23 +16,11 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
 from pans.firmware_sim.ports.virtual import VirtualLink
 from pans.runtime.link.base import Link
+from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Gate, unpack_command
-from pans.runtime.wire.messages import (
-    ClickBlock,
-    DeviceState,
-    FrameDecoder,
-    Mark,
-    MessageType,
-    Opcode,
-    Status,
-    decode_ack,
-    decode_command,
-    decode_status,
-    pack_body,
-)
 from pans.runtime.wire.session import ANSWER_TYPES, STREAM_TYPES
 
-RECORDED = STREAM_TYPES | {MessageType.STATUS, MessageType.EXPOSED}
+RECORDED = STREAM_TYPES | {wire.MessageType.STATUS, wire.MessageType.EXPOSED}
 WAITS_NS = (0, 300_000, 3_000_000, 16_000_000)  # USB's frame is 1 ms, a serial adapter's latency timer up to 16 ms
 
 
@@ -47,7 +35,7 @@ class Emitted(NamedTuple):
 
 def read_of(block: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return what is stamped on the exposures of a block, nothing on frames, and what was read in them."""
-    return (block.patterns, block.bits) if isinstance(block, ClickBlock) else (np.zeros(0), block.words)
+    return (block.patterns, block.bits) if isinstance(block, wire.ClickBlock) else (np.zeros(0), block.words)
 
 
 @dataclass(slots=True)
@@ -72,7 +60,7 @@ class _LoggedStream(StreamBuffer):
     def put(self, message: Any, session: int) -> list[bytes]:
         dropped = len(self._held) >= self.capacity
         self.log.messages += not dropped
-        if not isinstance(message, Mark):
+        if not isinstance(message, wire.Mark):
             stamps, readings = (part.copy() for part in read_of(message))
             block = Emitted(message.exposure_index, stamps, readings, dropped)
             self.log.blocks.setdefault(session, []).append(block)
@@ -125,7 +113,7 @@ class Heard:
 
     messages: int = 0
     digest: Any = field(default_factory=hashlib.sha256)
-    last_status: Status | None = None
+    last_status: wire.Status | None = None
 
     def add(self, body: bytes) -> None:
         """Count the header and payload of one message."""
@@ -147,11 +135,11 @@ class ObservedLink:
         self.answers = Heard()  # WELCOME, ACK and PONG
         self.gates: dict[tuple[int, int], Gate] = {}  # by session and command
         self.acknowledged: dict[int, int] = {}  # the last command, by session
-        self.decoders: list[FrameDecoder] = []  # of what came, one for each opening
+        self.decoders: list[wire.FrameDecoder] = []  # of what came, one for each opening
         self._open()
 
     def _open(self) -> None:
-        self._from_device, self._from_host = FrameDecoder(), FrameDecoder()
+        self._from_device, self._from_host = wire.FrameDecoder(), wire.FrameDecoder()
         self.decoders.append(self._from_device)
         self._session, self._armed = 0, False
 
@@ -160,30 +148,30 @@ class ObservedLink:
         data: bytes = self._link.read(timeout_s)
         for frame in self._from_device.feed(data):
             if frame.type in ANSWER_TYPES:
-                self.answers.add(pack_body(frame))
+                self.answers.add(wire.pack_body(frame))
             if frame.session != self._session:
                 continue
-            if frame.type == MessageType.ACK:
-                self.acknowledged[self._session] = decode_ack(frame.payload).last_id
+            if frame.type == wire.MessageType.ACK:
+                self.acknowledged[self._session] = wire.decode_ack(frame.payload).last_id
             if self._armed and frame.type in RECORDED:
                 heard = self.heard[self._session]
-                heard.add(pack_body(frame))
-                if frame.type == MessageType.STATUS:
-                    heard.last_status = decode_status(frame.payload)
+                heard.add(wire.pack_body(frame))
+                if frame.type == wire.MessageType.STATUS:
+                    heard.last_status = wire.decode_status(frame.payload)
         return data
 
     def write(self, data: bytes) -> None:
         """See `Link.write`."""
         self._link.write(data)
         for frame in self._from_host.feed(data):
-            if frame.type == MessageType.HELLO:
+            if frame.type == wire.MessageType.HELLO:
                 self._session, self._armed = frame.session, False
-            elif frame.type == MessageType.COMMAND:
-                command = decode_command(frame.payload)
-                if command.opcode == Opcode.ARM:
+            elif frame.type == wire.MessageType.COMMAND:
+                command = wire.decode_command(frame.payload)
+                if command.opcode == wire.Opcode.ARM:
                     self._armed = True
                     self.heard.setdefault(self._session, Heard())
-                elif command.opcode == Opcode.GATE:
+                elif command.opcode == wire.Opcode.GATE:
                     self.gates[self._session, command.command_id] = unpack_command(Gate, command.body)
 
     def now_ns(self) -> int:
@@ -209,4 +197,4 @@ class ObservedLink:
         return {name: sum(getattr(one.counters, name) for one in self.decoders) for name in names}
 
 
-STOPPED = (DeviceState.IDLE, DeviceState.SAFE)
+STOPPED = (wire.DeviceState.IDLE, wire.DeviceState.SAFE)

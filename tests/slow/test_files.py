@@ -14,20 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import small_files
 from bundles import resealed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small_files import (
-    blocks_of,
-    passive_bundle,
-    record_automaton,
-    record_flow,
-    record_passive,
-    record_run,
-    sealed,
-    small_calibration,
-    use_file,
-)
 
 from pans.firmware_sim import __file__ as SIMULATOR
 from pans.firmware_sim.testing import small_automaton_bundle, small_setup
@@ -143,7 +133,7 @@ def changed_bundle(draw: st.DrawFn, data: bytes) -> bytes:
 @st.composite
 def changed_recording(draw: st.DrawFn, data: bytes) -> bytes:
     """A recording with one block changed, removed, doubled or moved; chain, index, END and the bundle's digest fit."""
-    blocks = blocks_of(data)
+    blocks = small_files.blocks_of(data)
     place, other = draw(st.integers(0, len(blocks) - 1)), draw(st.integers(0, len(blocks) - 1))
     kind, payload = blocks[place]
     how = draw(st.sampled_from(("payload",) * 6 + ("remove", "double", "swap", "cut")))
@@ -161,7 +151,7 @@ def changed_recording(draw: st.DrawFn, data: bytes) -> bytes:
         blocks[place] = kind, draw(changed_bundle(payload))
     else:
         blocks[place] = kind, draw(changed_bytes(payload))
-    return sealed(blocks)
+    return small_files.sealed(blocks)
 
 
 @st.composite
@@ -181,9 +171,9 @@ def answer(kind: str, path: Path) -> float:
     with np.errstate(over="raise", invalid="raise", divide="raise"):
         if kind in ("scene", "flow"):
             with suppress(PansError):
-                use_file(kind, path)
+                small_files.use_file(kind, path)
         elif not ((verdict := verify_file(path)).violations or verdict.damaged):
-            use_file(kind, path)
+            small_files.use_file(kind, path)
     return time.process_time() - started
 
 
@@ -205,8 +195,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def sound(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
     """Sound files of each kind."""
-    small = [small_setup()[1], passive_bundle(), *(small_automaton_bundle(levels) for levels in (2, 8))]
-    makers = (record_run, record_passive, record_flow, record_automaton)
+    small = [small_setup()[1], small_files.passive_bundle(), *(small_automaton_bundle(levels) for levels in (2, 8))]
+    makers = (small_files.record_run, small_files.record_passive, small_files.record_flow, small_files.record_automaton)
     shipped = {
         "bundle": [SHIPPED / "fashion10.pans"],
         "recording": [make(tmp_path_factory.mktemp("run")) for make in makers],
@@ -216,7 +206,7 @@ def sound(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, l
     }
     files = {kind: [path.read_bytes() for path in paths] for kind, paths in shipped.items()}
     files["bundle"] += map(bundle_bytes, small)
-    return files | {"calibration": [small_calibration(folder)]}
+    return files | {"calibration": [small_files.small_calibration(folder)]}
 
 
 KINDS = {

@@ -6,16 +6,8 @@ from typing import Any
 
 import pytest
 
+from pans.runtime.cli import option_fields
 from pans.runtime.cli.command import CommandParser
-from pans.runtime.cli.option_fields import (
-    add_options,
-    changed_options,
-    check_options,
-    option,
-    options_from,
-    refuse_without,
-    words_of,
-)
 from pans.runtime.errors import UsageError
 from pans.runtime.live.run_options import RunOptions
 from pans.runtime.ranges import Range
@@ -25,21 +17,21 @@ from pans.runtime.ranges import Range
 class Lamp:
     """One field of each kind."""
 
-    place: Path = option(Path(), "where", flag="place")
-    serial: str = option(MISSING, "which")
-    level: int = option(3, "how bright", range=Range(0, 9, whole=True), metavar="N")
-    rate_hz: float = option(2.5, "how often", group="blinking")
-    colour: str = option("red", "of the light", choices=lambda: ("red", "blue"))
-    names: tuple[str, ...] = option((), "of it", flag="--name", action="append")
-    cooled: bool = option(True, "do not cool", flag="--no-cooling")
-    hours: float | None = option(None, "since when", range=Range(0, 1e6), group="blinking")
+    place: Path = option_fields.option(Path(), "where", flag="place")
+    serial: str = option_fields.option(MISSING, "which")
+    level: int = option_fields.option(3, "how bright", range=Range(0, 9, whole=True), metavar="N")
+    rate_hz: float = option_fields.option(2.5, "how often", group="blinking")
+    colour: str = option_fields.option("red", "of the light", choices=lambda: ("red", "blue"))
+    names: tuple[str, ...] = option_fields.option((), "of it", flag="--name", action="append")
+    cooled: bool = option_fields.option(True, "do not cool", flag="--no-cooling")
+    hours: float | None = option_fields.option(None, "since when", range=Range(0, 1e6), group="blinking")
     made: int = 7  # no option
 
 
 def parsed(*words: str, **more: Any) -> Lamp:
     parser = CommandParser(prog="pans lamp")
-    add_options(parser, Lamp, **more)
-    return options_from(parser.parse_args(words), Lamp)
+    option_fields.add_options(parser, Lamp, **more)
+    return option_fields.options_from(parser.parse_args(words), Lamp)
 
 
 def test_defaults_are_those_of_the_fields() -> None:
@@ -51,11 +43,11 @@ def test_each_kind_of_field_comes_back() -> None:
     others = {"rate_hz": 1e3, "colour": "blue", "names": ("a", "b"), "cooled": False, "hours": 2.0}
     wanted = Lamp(place=Path("here"), serial="x", level=9, **others)
     assert parsed(*words.split()) == wanted
-    changed = changed_options(wanted)
+    changed = option_fields.changed_options(wanted)
     assert (changed["place"], changed["names"], changed["hours"]) == ("here", ["a", "b"], 2.0)
     assert "made" not in changed
-    assert changed_options(Lamp(serial="x")) == {"serial": "x"}
-    assert words_of(Lamp(serial="x", level=4)) == ["--serial=x", "--level=4"]
+    assert option_fields.changed_options(Lamp(serial="x")) == {"serial": "x"}
+    assert option_fields.words_of(Lamp(serial="x", level=4)) == ["--serial=x", "--level=4"]
 
 
 REFUSED = [("--level=10", "--level"), ("--level=1.5", "whole number"), ("--rate-hz=nan", "--rate-hz"), ("", "--serial")]
@@ -70,9 +62,9 @@ def test_the_parser_refuses(word: str, said: str, capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize("changes", [{"level": 10}, {"level": True}, {"hours": -1.0}, {"colour": "green"}])
 def test_a_program_s_values_are_checked_alike(changes: dict[str, Any]) -> None:
-    check_options(Lamp(serial="x"))
+    option_fields.check_options(Lamp(serial="x"))
     with pytest.raises(UsageError, match=f"--{next(iter(changes))} is .*allowed: "):
-        check_options(Lamp(serial="x", **changes))
+        option_fields.check_options(Lamp(serial="x", **changes))
 
 
 def test_another_command_may_omit_fields_and_groups_and_have_other_defaults() -> None:
@@ -82,11 +74,11 @@ def test_another_command_may_omit_fields_and_groups_and_have_other_defaults() ->
 
 
 def test_what_has_no_effect_is_refused() -> None:
-    refuse_without(Lamp(serial="x"), "--name", {"level": 3})
+    option_fields.refuse_without(Lamp(serial="x"), "--name", {"level": 3})
     with pytest.raises(UsageError, match="--level has no effect without --name"):
-        refuse_without(Lamp(serial="x", level=4), "--name", {"level": 3})
+        option_fields.refuse_without(Lamp(serial="x", level=4), "--name", {"level": 3})
 
 
 def test_every_default_of_a_run_is_in_its_range_and_every_option_has_a_help() -> None:
-    check_options(RunOptions())
+    option_fields.check_options(RunOptions())
     assert all(one.metadata["help"] for one in fields(RunOptions) if one.metadata)

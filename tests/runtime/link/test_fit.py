@@ -18,15 +18,8 @@ from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.errors import DeviceError, UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.link import fit
 from pans.runtime.link.connection import Connection
-from pans.runtime.link.fit import (
-    TEXT_MAX_BYTES,
-    check_automaton,
-    check_device,
-    check_scene,
-    scene_facts,
-    upload_commands,
-)
 from pans.runtime.wire.commands import Extension, announcement
 from pans.runtime.wire.messages import Opcode
 
@@ -51,20 +44,20 @@ def test_the_device_holds_what_the_bundle_has(levels: int) -> None:
     device = Instrument(profile, load_scene("uniform"), power_on_tick=clock.tick_at(START_NS))
     connection = Connection(VirtualLink(device, clock, "upload"))
     facts = connection.handshake().facts
-    check_device(facts, plan, bundle, profile.clock.tick_hz)
+    fit.check_device(facts, plan, bundle, profile.clock.tick_hz)
     connection.upload(plan, bundle)
     assert np.array_equal(device._patterns.stack(3), bundle.pattern_levels)
     held = device._states.states
     assert np.array_equal(held.successors, six_states().successors)
     assert np.array_equal(held.light, six_states().dwell / 4)
-    opcodes = {opcode for opcode, _ in upload_commands(plan, bundle, facts)}
+    opcodes = {opcode for opcode, _ in fit.upload_commands(plan, bundle, facts)}
     assert (Opcode.LOAD_MASKS in opcodes) is (levels == 2)
 
 
 def test_an_older_device_gets_fixed_patterns_as_before() -> None:
     fixed = made_bundle(photons_per_level=LIGHT, table=np.zeros((4, 2)))
     plan = build_plan(PROFILE, fixed)
-    opcodes = [opcode for opcode, _ in upload_commands(plan, fixed, {})]
+    opcodes = [opcode for opcode, _ in fit.upload_commands(plan, fixed, {})]
     assert opcodes == [Opcode.LOAD_PATTERN, Opcode.LOAD_PATTERN, Opcode.LOAD_PLAN]
 
 
@@ -74,7 +67,7 @@ def test_a_device_that_knows_no_automata_is_refused_before_anything_is_sent() ->
     facts = connection.handshake().facts
     plan = build_plan(PROFILE, BUNDLE)
     with pytest.raises(DeviceError, match="announces no automata, needed 0xd00a27ff") as refused:
-        check_automaton(facts, plan)
+        fit.check_automaton(facts, plan)
     assert "fixed patterns" in refused.value.remedy
     connection.session.submit(Opcode.LOAD_STATES, b"", may_be_refused=True)  # and if one were sent all the same
     connection.wait_acknowledged()
@@ -91,11 +84,11 @@ def test_a_device_that_knows_no_automata_is_refused_before_anything_is_sent() ->
 )
 def test_a_device_that_cannot_run_the_automaton_is_refused_with_the_numbers(facts, drive, words) -> None:
     with pytest.raises(DeviceError, match=words):
-        check_automaton(facts, build_plan(PROFILE, BUNDLE, drive=drive))
+        fit.check_automaton(facts, build_plan(PROFILE, BUNDLE, drive=drive))
 
 
 def test_a_device_without_states_can_be_driven_by_the_host() -> None:
-    check_automaton(announcement(Extension(0, 4)), build_plan(PROFILE, BUNDLE, drive="host"))
+    fit.check_automaton(announcement(Extension(0, 4)), build_plan(PROFILE, BUNDLE, drive="host"))
 
 
 FASHION = load_bundle(SHIPPED / "fashion10.pans")[0]
@@ -104,13 +97,13 @@ FASHION = load_bundle(SHIPPED / "fashion10.pans")[0]
 def test_what_belongs_together_is_taken() -> None:
     for facts in (
         {},
-        scene_facts(None, ()),
-        scene_facts((28, 28), ()),
-        scene_facts(None, FASHION.classes),
-        scene_facts((28, 28), FASHION.classes),
-        scene_facts((28, 28), [str(number) for number in range(10)]),  # as many without names
+        fit.scene_facts(None, ()),
+        fit.scene_facts((28, 28), ()),
+        fit.scene_facts(None, FASHION.classes),
+        fit.scene_facts((28, 28), FASHION.classes),
+        fit.scene_facts((28, 28), [str(number) for number in range(10)]),  # as many without names
     ):
-        check_scene(facts, FASHION)
+        fit.check_scene(facts, FASHION)
 
 
 @pytest.mark.parametrize(
@@ -125,12 +118,12 @@ def test_what_belongs_together_is_taken() -> None:
 )
 def test_what_does_not_is_refused(shape: tuple[int, int], classes: tuple[str, ...], words: str) -> None:
     with pytest.raises(UsageError) as caught:
-        check_scene({"scene": "s", **scene_facts(shape, classes)}, FASHION)
+        fit.check_scene({"scene": "s", **fit.scene_facts(shape, classes)}, FASHION)
     assert words in caught.value.message
     assert "the bundle has 28 x 28 pixels and the classes T-shirt/top, Trouser" in caught.value.message
 
 
 def test_names_of_any_length_fit_into_a_welcome() -> None:
     for classes in (["é" * 300] * 3, [str(i) for i in range(10_000)], ["a\nb", "\ud800"]):
-        assert all(len(str(fact).encode()) <= 256 for fact in scene_facts((1, 2), classes).values())
-    assert TEXT_MAX_BYTES < 256
+        assert all(len(str(fact).encode()) <= 256 for fact in fit.scene_facts((1, 2), classes).values())
+    assert fit.TEXT_MAX_BYTES < 256

@@ -13,16 +13,9 @@ from pans.runtime.errors import UsageError
 from pans.runtime.imaging import IDENTITY, Imaging, imaging_of, tolerance_of
 from pans.runtime.instrument.profile import Optics, load_profile
 from pans.trainer.commands.evaluate import other_answer
+from pans.trainer.evaluate import optics
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.held_out import HeldOut, held_out_of
-from pans.trainer.evaluate.optics import (
-    CURVES,
-    drawn_tables,
-    figures_under,
-    misalignment_curves,
-    over_optics,
-    whole_shifts,
-)
 from pans.trainer.evaluate.walks import measured_walks, walks_of
 from pans.trainer.options import Conditions
 from pans.trainer.tasks.registry import Objects, Task
@@ -67,13 +60,13 @@ def test_an_automaton_walks_as_before_moved_objects(trials: int | None) -> None:
 def test_several_tables_give_their_mean_and_spread() -> None:
     bundle = fixed()
     tables = [IDENTITY, TABLE, imaging_of("psf=0.8")]
-    one_by_one = [figures_under(bundle, HELD_OUT, table, Conditions()).accuracy_mean for table in tables]
-    found = over_optics(bundle, HELD_OUT, tables)
+    one_by_one = [optics.figures_under(bundle, HELD_OUT, table, Conditions()).accuracy_mean for table in tables]
+    found = optics.over_optics(bundle, HELD_OUT, tables)
     assert found.accuracy_mean == pytest.approx(np.mean(one_by_one))
     assert found.accuracy_std_optics == pytest.approx(np.std(one_by_one, ddof=1))
     assert (found.accuracy_worst, found.tables, found.objects) == (min(one_by_one), 3, 30)
     tolerance = tolerance_of("shift=1:psf=0.5..0.8")
-    first, again = drawn_tables(tolerance, 4, 7), drawn_tables(tolerance, 4, 7)
+    first, again = optics.drawn_tables(tolerance, 4, 7), optics.drawn_tables(tolerance, 4, 7)
     assert [one.numbers() for one in first] == [one.numbers() for one in again]
 
 
@@ -83,20 +76,20 @@ def test_all_whole_shifts_are_images_moved_by_hand() -> None:
         for along in (0, 1):
             wide = np.pad(IMAGES, ((0, 0), (1, 1), (1, 1)))[:, 1 - down : 3 - down, 1 - along : 4 - along]
             right.append(measured_walks(walks_of(bundle, IDEAL, wide, LABELS)).accuracy_mean)
-    found = over_optics(bundle, HELD_OUT, whole_shifts(tolerance_of("shift=-0.5..1.9,-1..1")))
+    found = optics.over_optics(bundle, HELD_OUT, optics.whole_shifts(tolerance_of("shift=-0.5..1.9,-1..1")))
     assert (found.tables, found.accuracy_mean) == (6, pytest.approx(np.mean(right), rel=1e-12))
     for wrong in ("shift=1:psf=0.5..0.8", "shift=0.2..0.8", "shift=1000"):
         with pytest.raises(ValueError, match="allowed"):
-            whole_shifts(tolerance_of(wrong))
+            optics.whole_shifts(tolerance_of(wrong))
 
 
 def test_curves_start_from_the_table_that_they_are_about() -> None:
     bundle = fixed()
-    curves = misalignment_curves(bundle, HELD_OUT, TABLE)
-    there = figures_under(bundle, HELD_OUT, TABLE, Conditions()).accuracy_mean
-    assert {name: tuple(point["value"] for point in points) for name, points in curves.items()} == CURVES
+    curves = optics.misalignment_curves(bundle, HELD_OUT, TABLE)
+    there = optics.figures_under(bundle, HELD_OUT, TABLE, Conditions()).accuracy_mean
+    assert {name: tuple(point["value"] for point in points) for name, points in curves.items()} == optics.CURVES
     assert {points[0]["accuracy_mean"] for points in curves.values()} == {there}
-    shifted = figures_under(bundle, HELD_OUT, Imaging(0.0, 2.0), Conditions()).accuracy_mean
+    shifted = optics.figures_under(bundle, HELD_OUT, Imaging(0.0, 2.0), Conditions()).accuracy_mean
     assert curves["shift_px"][4]["accuracy_mean"] == shifted
 
 
@@ -128,7 +121,9 @@ def test_options_that_contradict_each_other_are_refused(wrong: dict[str, Any]) -
 def test_the_shipped_patterns_lose_what_a_misaligned_image_costs() -> None:
     bundle = load_bundle("fashion10")[0]
     held_out = held_out_of(bundle, None, 500, None, Conditions())
-    perfect, moved = (figures_under(bundle, held_out, table, Conditions()) for table in (IDENTITY, Imaging(1.0, 1.0)))
+    perfect, moved = (
+        optics.figures_under(bundle, held_out, table, Conditions()) for table in (IDENTITY, Imaging(1.0, 1.0))
+    )
     assert perfect.accuracy_mean is not None
     assert moved.accuracy_mean is not None
     assert 0.11 < perfect.accuracy_mean - moved.accuracy_mean < 0.21  # about 16 points, of few objects

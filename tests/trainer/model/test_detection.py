@@ -12,13 +12,7 @@ from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.click_law import click_probability as reference_probability
 from pans.trainer.adaptive.machine import Sight, forward
 from pans.trainer.evaluate.readings import Chain
-from pans.trainer.model.detection import (
-    click_probability,
-    click_words,
-    sample_clicks,
-    with_mean_memory,
-    word_probabilities,
-)
+from pans.trainer.model import detection
 
 PLAIN = ClickLaw()
 READ_NOISE = ClickLaw(dark_per_exposure=1.8e-5, read_noise_e=0.2, threshold_e=0.84)
@@ -28,7 +22,7 @@ WIDE = ClickLaw(dark_per_exposure=0.01, read_noise_e=1.5, threshold_e=3.5)
 @pytest.mark.parametrize("law", [PLAIN, READ_NOISE, WIDE], ids=["plain", "read noise", "wide"])
 def test_probability_is_the_law_of_the_runtime(law):
     light = np.concatenate([[0.0, 1e-30, 1e-7], np.geomspace(1e-3, 60, 50), [1e4]])
-    found = click_probability(torch.from_numpy(light), law).numpy()
+    found = detection.click_probability(torch.from_numpy(light), law).numpy()
     assert found == pytest.approx(reference_probability(law, light), rel=1e-8, abs=1e-12)
 
 
@@ -36,7 +30,7 @@ def test_probability_is_the_law_of_the_runtime(law):
 def test_damped_straight_through_gradient_is_the_papers(slope):
     light = torch.tensor([[0.0, 0.1, 0.7, 3.0, 9.0]], dtype=torch.float64, requires_grad=True)
     weights = torch.tensor([1.0, -2.0, 3.0, 0.5, 7.0], dtype=torch.float64)
-    clicks = sample_clicks(click_probability(light, PLAIN, slope), torch.Generator().manual_seed(1))
+    clicks = detection.sample_clicks(detection.click_probability(light, PLAIN, slope), torch.Generator().manual_seed(1))
     (clicks * weights).sum().backward()
     wanted = weights * slope * torch.exp(-slope * light.detach()[0])
     assert light.grad[0].numpy() == pytest.approx(wanted.numpy(), rel=1e-12)
@@ -44,7 +38,7 @@ def test_damped_straight_through_gradient_is_the_papers(slope):
 
 def test_gradient_through_read_noise_is_the_slope_of_the_law():
     light = torch.linspace(0.01, 6, 40, dtype=torch.float64, requires_grad=True)
-    click_probability(light, READ_NOISE).sum().backward()
+    detection.click_probability(light, READ_NOISE).sum().backward()
     at, step = light.detach().numpy(), 1e-5
     slope = (reference_probability(READ_NOISE, at + step) - reference_probability(READ_NOISE, at - step)) / (2 * step)
     assert light.grad.numpy() == pytest.approx(slope, rel=1e-6, abs=1e-9)
@@ -52,7 +46,7 @@ def test_gradient_through_read_noise_is_the_slope_of_the_law():
 
 def test_sampled_clicks_have_the_right_rate_and_are_independent():
     p = torch.tensor([0.0, 1e-3, 0.3, 0.5, 1.0], dtype=torch.float64).expand(200_000, 5)
-    clicks = sample_clicks(p, torch.Generator().manual_seed(2)).numpy()
+    clicks = detection.sample_clicks(p, torch.Generator().manual_seed(2)).numpy()
     assert set(np.unique(clicks)) == {0.0, 1.0}
     sigma = np.sqrt(p[0].numpy() * (1 - p[0].numpy()) / len(clicks))
     assert np.all(np.abs(clicks.mean(axis=0) - p[0].numpy()) <= 5 * sigma)
@@ -62,8 +56,8 @@ def test_sampled_clicks_have_the_right_rate_and_are_independent():
 
 def test_words_are_products_in_the_order_of_the_table():
     p = np.random.default_rng(0).uniform(size=(3, 4))
-    found = word_probabilities(torch.from_numpy(p)).numpy()
-    words = click_words(4).numpy()
+    found = detection.word_probabilities(torch.from_numpy(p)).numpy()
+    words = detection.click_words(4).numpy()
     for word in range(16):
         bits = [(word >> i) & 1 for i in range(4)]
         assert words[word].tolist() == bits
@@ -106,19 +100,21 @@ def test_words_and_their_draws_are_those_of_the_chain(law: Afterpulses) -> None:
 def test_training_has_the_mean_chances_of_the_evaluation_and_their_gradient() -> None:
     first = np.random.default_rng(2).random((4, 6)) * 0.7 + 0.05
     for law, error in ((LAW, 4e-3), (Afterpulses(0.05, 2.0, 0.1), 5e-4)):
-        found = with_mean_memory(torch.tensor(first), law).numpy()
+        found = detection.with_mean_memory(torch.tensor(first), law).numpy()
         assert found == pytest.approx(Chain.of(first, law).mean_chances(), abs=error)
     few = torch.tensor(first[:1], requires_grad=True)
-    with_mean_memory(few, LAW)[0, 5].backward()
+    detection.with_mean_memory(few, LAW)[0, 5].backward()
     assert (few.grad[0, :5] > 0).all()  # more light before means more clicks behind
     step = 1e-6
     for i in (1, 4):  # the memory of the begin stands still in the gradient, and is the same to first order
         up, down = few.detach().clone(), few.detach().clone()
         up[0, i] += step
         down[0, i] -= step
-        slope = float(with_mean_memory(up, LAW)[0, 5] - with_mean_memory(down, LAW)[0, 5]) / (2 * step)
+        slope = float(detection.with_mean_memory(up, LAW)[0, 5] - detection.with_mean_memory(down, LAW)[0, 5]) / (
+            2 * step
+        )
         assert float(few.grad[0, i]) == pytest.approx(slope, rel=0.1)
-    assert with_mean_memory(few, None) is few
+    assert detection.with_mean_memory(few, None) is few
 
 
 def test_a_machine_in_training_clicks_as_its_expectation() -> None:

@@ -10,13 +10,7 @@ from pans.runtime.imaging import Bleaching, Imaging, bleached, met
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.machine import Aim, Sight, backward, forward
-from pans.trainer.model.encoders import (
-    ActiveIllumination,
-    CoherentField,
-    concentration,
-    concentration_slope,
-    new_encoder,
-)
+from pans.trainer.model import encoders
 from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.model.field_basis import discriminant_basis, in_pixels
 from pans.trainer.model.imaging import bleached_patterns, through
@@ -24,7 +18,7 @@ from pans.trainer.options import Options
 
 
 def encoder(limits=(0.1, 2.0), seed=0):
-    return ActiveIllumination(3, 20, limits, torch.Generator().manual_seed(seed))
+    return encoders.ActiveIllumination(3, 20, limits, torch.Generator().manual_seed(seed))
 
 
 def test_photoelectrons_are_squared_weights_times_transmission():
@@ -60,7 +54,7 @@ def rng_field(n=5, pixels=9, seed=0):
 @pytest.mark.parametrize("complex_field", [False, True])
 def test_coherent_light_is_the_squared_modulus_of_the_transformed_field(complex_field):
     options = Options(features=4, encoder="coherent", complex_field=complex_field)
-    encoder = new_encoder(9, load_profile("ideal"), options, torch.Generator().manual_seed(0))
+    encoder = encoders.new_encoder(9, load_profile("ideal"), options, torch.Generator().manual_seed(0))
     field = rng_field()
     found = encoder(field).detach().numpy()
     matrix = encoder.matrix().detach().numpy()
@@ -73,19 +67,19 @@ def test_coherent_light_is_the_squared_modulus_of_the_transformed_field(complex_
 @pytest.mark.parametrize("complex_field", [False, True])
 def test_conserving_coherent_encoder_creates_no_light(complex_field):
     random = torch.Generator().manual_seed(0)
-    encoder = CoherentField(6, 9, random, light=50.0, complex_field=complex_field, conserving=True)
+    encoder = encoders.CoherentField(6, 9, random, light=50.0, complex_field=complex_field, conserving=True)
     assert float(torch.linalg.svdvals(encoder.matrix())[0].detach()) == pytest.approx(1.0, rel=1e-5)
     field = rng_field(50)
     assert bool((encoder(field).sum(dim=1) <= field.abs().square().sum(dim=1) * (1 + 1e-5)).all())
-    free = CoherentField(6, 9, torch.Generator().manual_seed(0), light=50.0, complex_field=complex_field)
+    free = encoders.CoherentField(6, 9, torch.Generator().manual_seed(0), light=50.0, complex_field=complex_field)
     assert bool((free(field).sum(dim=1) > field.abs().square().sum(dim=1)).any())
-    dim = CoherentField(6, 9, torch.Generator().manual_seed(0), light=1e-4, conserving=True)
+    dim = encoders.CoherentField(6, 9, torch.Generator().manual_seed(0), light=1e-4, conserving=True)
     assert torch.equal(dim.matrix(), dim.weight[0])  # below the limit nothing is changed
 
 
 def test_conserving_incoherent_encoder_creates_no_light():
     options = Options(features=6, encoder="incoherent", light=50.0, conserving=True)
-    encoder = new_encoder(9, load_profile("ideal"), options, torch.Generator().manual_seed(0))
+    encoder = encoders.new_encoder(9, load_profile("ideal"), options, torch.Generator().manual_seed(0))
     columns = encoder.matrix().sum(dim=0).detach().numpy()
     assert columns.max() <= 1 + 1e-6
     assert (encoder.matrix() >= 0).all()
@@ -146,13 +140,15 @@ def slope_of(values, at, measure, step=1e-6):
 def test_pixels_that_are_lit_alike_are_counted_and_their_brightness_does_not_matter(lit):
     patterns = torch.zeros(2, 50, dtype=torch.float64)
     patterns[0, :lit], patterns[1, 50 - lit :] = 1e-3, 80.0
-    assert float(concentration(patterns)) == pytest.approx(np.log(50 / lit), rel=1e-12, abs=1e-12)
+    assert float(encoders.concentration(patterns)) == pytest.approx(np.log(50 / lit), rel=1e-12, abs=1e-12)
 
 
 def test_slope_is_that_of_the_stated_measure():
     patterns = np.random.default_rng(0).random((3, 12))
-    found = concentration_slope(torch.from_numpy(patterns)).numpy()
-    assert float(concentration(torch.from_numpy(patterns))) == pytest.approx(np.mean([stated(p) for p in patterns]))
+    found = encoders.concentration_slope(torch.from_numpy(patterns)).numpy()
+    assert float(encoders.concentration(torch.from_numpy(patterns))) == pytest.approx(
+        np.mean([stated(p) for p in patterns])
+    )
     for row, pixel in np.ndindex(*patterns.shape):
         assert found[row, pixel] == pytest.approx(slope_of(patterns[row], pixel, stated), rel=1e-6, abs=1e-7)
 
@@ -212,7 +208,7 @@ def test_the_first_field_sees_the_event_and_not_the_background():
 def test_an_encoder_of_coordinates_is_one_of_pixels(complex_field):
     rng = torch.Generator().manual_seed(1)
     x, basis = torch.rand(20, 30, generator=rng), torch.rand(30, 5, generator=rng)
-    encoder = CoherentField(3, 5, rng, complex_field=complex_field)
+    encoder = encoders.CoherentField(3, 5, rng, complex_field=complex_field)
     torch.testing.assert_close(in_pixels(encoder, basis)(x), encoder(x @ basis), rtol=1e-4, atol=1e-5)
 
 
@@ -233,7 +229,7 @@ def test_the_light_of_patterns_is_that_of_the_runtimes_model():
 @pytest.mark.parametrize("low", [0.01, 1.5])
 def test_an_encoder_lights_dark_pixels_by_its_brightest_level(low):
     random = torch.Generator().manual_seed(0)
-    encoder = ActiveIllumination(3, 42, (low, 2.0), random)
+    encoder = encoders.ActiveIllumination(3, 42, (low, 2.0), random)
     objects = torch.rand((4, 42), generator=random, dtype=torch.float64)
     for levels in (None, 16):
         if levels:
@@ -257,7 +253,7 @@ def test_patterns_bleach_in_training_as_they_do_elsewhere(dose: float, mixed: bo
 
 
 def test_training_can_raise_the_brightest_level_from_its_least():
-    encoder = ActiveIllumination(1, 42, (0.1, 2.0), torch.Generator().manual_seed(2))
+    encoder = encoders.ActiveIllumination(1, 42, (0.1, 2.0), torch.Generator().manual_seed(2))
     encoder.start_quantising(1 << 16)
     encoder.pulled = True
     one = torch.zeros(1, 43)
