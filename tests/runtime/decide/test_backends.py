@@ -118,7 +118,7 @@ def test_the_choice_of_the_back_end() -> None:
         make_decider(both, backend="table", shots=3)
 
 
-@pytest.mark.parametrize("backend", ["table", "onnx"])
+@pytest.mark.parametrize("backend", ["table", "onnx", "sparse", "float64"])
 def test_golden_vectors_are_held_against_the_back_end(backend: str) -> None:
     made, _, _ = affine_bundle(4, 3)
     scores = made.golden_scores.copy()

@@ -106,20 +106,6 @@ def test_virtual_runs_are_the_same_bit_for_bit(bundle: Bundle, scene: Path) -> N
     np.testing.assert_array_equal(first.tally.confusion, second.tally.confusion)
 
 
-def test_bytes_one_at_a_time_change_nothing(bundle: Bundle, scene: Path) -> None:
-    class Drip(Wrapped):
-        """One byte per read; the next one is there at once."""
-
-        held = bytearray()
-
-        def read(self, timeout_s: float) -> bytes:
-            self.held += self.link.read(0.0 if self.held else timeout_s)
-            return bytes([self.held.pop(0)]) if self.held else b""
-
-    dripped = run(bundle, scene, n_objects=2, wrap=Drip)
-    assert dripped.tally.figures() == run(bundle, scene, n_objects=2).tally.figures()
-
-
 def test_a_silent_device_is_a_link_error(bundle: Bundle, scene: Path) -> None:
     with pytest.raises(LinkError, match="no WELCOME"):
         run(bundle, scene, wrap=lambda link: Disturbed(link, lambda data: b""))

@@ -14,7 +14,7 @@ from automata import automaton_bundle
 from bundles import made_bundle
 from small_runs import Disk, fails, log_sha256
 
-from pans.runtime.core.decision import DECISION_DTYPE
+from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
 from pans.runtime.errors import DamagedFileError, PansError, RecordingError, UsageError
 from pans.runtime.record import Recorder, Recording, read_recording
 from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind
@@ -93,6 +93,11 @@ def test_runs_that_ask_for_much_memory_are_refused(tmp_path: Path, counts: list[
         recorder.close({})
     with pytest.raises(DamagedFileError, match="allowed: 1 or more in each, 1048576 at most"):
         read_recording(tmp_path / "a").timings()
+
+
+def test_times_and_flags_are_those_of_the_document() -> None:
+    assert TIMING_RUN_DTYPE.names[1:5] == ("device_end_ns", "arrival_ns", "decided_ns", "recorded_ns")
+    assert [int(flag) for flag in DecisionFlag] == [1, 2, 4, 8, 16, 32, 64, 128, 256]
 
 
 def test_any_flipped_byte_is_detected(tmp_path: Path) -> None:

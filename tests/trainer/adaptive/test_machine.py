@@ -101,6 +101,15 @@ def walked(machine, sight, law, i):
     return leaves, sums
 
 
+def assert_all_words(machine, sight, law, rel, passed, totals):
+    """Leaves and `totals` (photons, clicks and perhaps exposures) are those of all words, object by object."""
+    for i in range(len(GREY)):
+        leaves, sums = walked(machine, sight, law, i)
+        for (number, leaf), chance in leaves.items():
+            assert float(passed.leaves[number][leaf, i]) == pytest.approx(chance, rel=rel, abs=1e-300)
+        np.testing.assert_allclose([float(each[i]) for each in totals], sums[: len(totals)], rtol=rel)
+
+
 @pytest.mark.parametrize("bits", [False, True])
 @pytest.mark.parametrize("law", LAWS, ids=str)
 def test_forward_is_the_sum_over_all_words(law, bits):
@@ -108,12 +117,7 @@ def test_forward_is_the_sum_over_all_words(law, bits):
     passed = forward(machine, sight, GREY)
     exposures = sum(step.alpha.sum(dim=0) for step in passed.steps)
     np.testing.assert_allclose(torch.cat(passed.leaves).sum(dim=0), 1.0, atol=1e-14)
-    for i in range(len(GREY)):
-        leaves, sums = walked(machine, sight, law, i)
-        for (number, leaf), chance in leaves.items():
-            assert float(passed.leaves[number][leaf, i]) == pytest.approx(chance, rel=rel, abs=1e-300)
-        found = [float(each[i]) for each in (passed.photons(), passed.clicks(), exposures)]
-        np.testing.assert_allclose(found, sums, rtol=rel)
+    assert_all_words(machine, sight, law, rel, passed, (passed.photons(), passed.clicks(), exposures))
 
 
 @pytest.mark.parametrize("law", [*CLICKS, *COUNTS], ids=str)
@@ -121,11 +125,7 @@ def test_where_states_send_the_same_light_bleaching_is_that_of_every_walk(law):
     machine, sight = even_machine(law, 1), wide(law, 0.01, fades=0.8)
     passed = forward(machine, sight, GREY)
     rel = 1e-12 if law in CLICKS[:2] else 1e-7
-    for i in range(len(GREY)):
-        leaves, sums = walked(machine, sight, law, i)
-        for (number, leaf), chance in leaves.items():
-            assert float(passed.leaves[number][leaf, i]) == pytest.approx(chance, rel=rel, abs=1e-300)
-        np.testing.assert_allclose([float(passed.photons()[i]), float(passed.clicks()[i])], sums[:2], rtol=rel)
+    assert_all_words(machine, sight, law, rel, passed, (passed.photons(), passed.clicks()))
     for step, level in zip(passed.steps, machine.levels):
         np.testing.assert_allclose(step.sent, float(level.light.log_light.exp()), rtol=1e-12)
 

@@ -21,21 +21,3 @@ def test_a_drawn_task_becomes_a_scene(part: str, tmp_path: Path, pans: Pans) -> 
     assert np.array_equal(scene.images, wanted.images)
     assert scene.labels.tolist() == wanted.labels.tolist()
     assert scene.classes == task.classes
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("-o x.npz", "one task"),
-        ("cells barcode -o x.npz", "one task"),
-        ("cells", "one file"),
-        ("cells -o x.png", "ends in .npz"),
-        ("cells -o x.npz --objects 0", "--objects is 0"),
-        ("cells -o x.npz --data-seed -1", "--data-seed is -1"),
-        ("nonsense -o x.npz", "neither one of"),
-    ],
-)
-def test_what_cannot_be_meant_is_refused(words: str, said: str, tmp_path: Path, monkeypatch, pans) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert said in pans.refuses("data", "scene", *words.split())
-    assert not list(tmp_path.iterdir())
