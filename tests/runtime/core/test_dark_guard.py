@@ -134,13 +134,15 @@ def test_tables_for_more_dark_counts_are_nearly_those_of_exact_bayes() -> None:
     assert max(kept) < 0.03
 
 
-def test_unchanged_detector_leaves_the_table_as_it_is() -> None:
+def test_unchanged_detector_leaves_the_table_as_it_is_and_a_masked_channel_says_nothing() -> None:
     rng = np.random.default_rng(5)
     scores = rng.normal(size=(64, 3)).astype(np.float32)
     made = adapted_scores(scores, word_prior(np.ones(64, np.int64)), np.zeros(6), np.zeros(6, np.bool_))
     assert (made.argmax(axis=1) == scores.argmax(axis=1)).all()
     table = TableDecider(made, 1)
     assert table.decide(np.array([1, 0, 1, 0, 0, 1]), 1).label == int(scores[0b100101].argmax())
+    alone = TableAdapter(scores, 2).made(table, np.zeros(6), np.arange(6) == 2)  # which decides without channel 2
+    assert alone.decide(np.array([1, 0, 1, 0, 0, 1]), 1) == alone.decide(np.array([1, 0, 0, 0, 0, 1]), 1)
 
 
 @pytest.mark.parametrize("shots", [1, 2, 3])

@@ -58,32 +58,6 @@ def completed(next_exposure: int, tick: int = 10**6) -> Frame:
     return frame(wire.encode_status(Status(DeviceState.IDLE, StateReason.COMPLETED, 0, 0, tick, next_exposure), 1))
 
 
-def test_decisions_carry_what_the_log_needs() -> None:
-    core, decider = make()
-    core.step(frame(wire.encode_mark(Mark(0, 0, 2, 0, 1000, 4.5), 1)))
-    output = core.step(cycle(1, 0, [1, 1, 0, 1]))
-    assert output.block_end_tick == 1000 + 300 + 60
-    (decision,) = output.decisions
-    assert decision._replace(counts_crc=0) == (0, 1360, 3, 0, 0, 2, 2, 2, 0, 0.5, 0, 0)
-    assert decider.asked == [[1, 0, 1]]
-    assert np.array([decision], DECISION_DTYPE)["label"][0] == 2
-    assert core.marks.get(0) == Mark(0, 0, 2, 0, 1000, 4.5)
-
-
-def test_a_gap_abstains_and_the_next_window_is_whole_again() -> None:
-    core, decider = make()
-    core.step(cycle(0, 0, [0, 0, 0, 0]))
-    output = core.step(cycle(2, 2, [0, 1, 1, 1]))
-    gap, whole = output.decisions
-    assert [event.event() for event in output.events] == [
-        {"kind": "gap", "first_exposure": 4, "exposures": 4, "messages": 1, "dropped_by_device": 0}
-    ]
-    assert (gap.label, gap.flags) == (NO_LABEL, DecisionFlag.GAP | DecisionFlag.ABSTAINED)
-    assert (whole.label, whole.flags, whole.object) == (3, 0, 1)
-    assert len(decider.asked) == 2
-    assert core.n_abstained == 1
-
-
 def test_a_wrong_pattern_abstains() -> None:
     core, decider = make()
     (decision,) = core.step(cycle(0, 0, [0, 1, 1, 1], [0xFFFF, 0, 2, 1])).decisions
@@ -202,15 +176,6 @@ def test_scores_that_are_not_finite_give_no_label(score: float) -> None:
     assert (decision.label, decision.probability) == (NO_LABEL, 0.0)
     assert decision.flags == DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
     assert core.n_abstained == 1
-
-
-def test_the_tick_is_the_end_of_the_windows_own_last_exposure() -> None:
-    plan = parallel(N_FEATURES, 4)
-    core = Core(plan, CountingDecider(), 2, 0)  # type: ignore[arg-type]
-    block = wire.FrameBlock(0, 0, 1000, 0, 100, 0, np.ones((5, 1), np.uint8))
-    output = core.step(frame(wire.encode_frames(block, 1)))
-    assert [(d.exposure_index, d.tick) for d in output.decisions] == [(2, 1260), (4, 1460)]
-    assert output.block_end_tick == 1460
 
 
 def test_blocks_that_do_not_fit_the_plan_are_counted_not_read() -> None:

@@ -132,11 +132,8 @@ def good(**changes: float) -> Estimate:
     return replace(Estimate(values, np.diag(np.full(DARK + 1, 1e-2) ** 2), 0.0, 100.0, 100, 10_000, 20_000), **changes)  # type: ignore[arg-type]
 
 
-def test_a_good_estimate_is_accepted() -> None:
-    check_estimate(good(), 10.0)
-
-
 def test_too_few_photons_say_how_many_more_seconds() -> None:
+    check_estimate(good(), 10.0)
     with pytest.raises(UsageError, match=r"too few photons: right_px is known to ±0\.196") as error:
         check_estimate(good(covariance=np.diag(np.full(DARK + 1, 0.1) ** 2)), 10.0, (0.05, 10.0))
     assert "--seconds 169: 159 s more" in error.value.remedy  # (0.196 / 0.05)^2 times 10 s, and a tenth more
