@@ -91,6 +91,7 @@ def test_every_fact_comes_back(
     assert bundle_bytes(read) == (tmp_path / "a.pans").read_bytes()
     part = {2: "pattern_bits", 3: "pattern_bytes", 256: "pattern_bytes"}.get(levels, "pattern_levels")
     header, arrays = taken_apart((tmp_path / "a.pans").read_bytes())
+    assert list(header) == sorted(header)
     assert header["automaton"] == {"dwell_steps": automaton.dwell_steps} | facts
     assert list(arrays)[:3] == [part, "state_pattern", "state_dwell"]
     assert "expected" not in taken_apart(bundle_bytes(plain))[0]
