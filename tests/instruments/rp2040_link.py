@@ -22,6 +22,7 @@ from pans.runtime.errors import LinkError
 
 BENCH = Path(__file__).parent / "rp2040" / "bench.mjs"
 NEEDED = ("PICO_SDK_PATH", "PANS_RP2040JS", "PANS_RP2040_BOOTROM")
+START_S, BRANCH_TO_ITSELF = 3, 0xE7FE
 WALK_SLOTS, PEAK_HZ, DARK_HZ = 33, 2000, 100  # of the shipped automaton, and of the profile dmd-spad
 
 
@@ -31,13 +32,18 @@ def missing() -> str:
     return ", ".join([name for name in NEEDED if not os.environ.get(name)] + programs)
 
 
-def build(folder: Path, *defines: str, board: str = "pico") -> tuple[Path, str]:
-    """Build the firmware; return the folder of pans.bin and pans.elf, and what the compiler said."""
-    words = [f"-DPICO_BOARD={board}", "-DPICO_NO_PICOTOOL=1", f"-DPANS_DEFINES={';'.join(defines)}"]
-    source = ["cmake", "-S", str(FOLDER / "rp2040"), "-B", str(folder)]
-    subprocess.run([*source, *words], check=True, capture_output=True, timeout=120)
-    done = subprocess.run(["cmake", "--build", str(folder)], check=True, capture_output=True, text=True, timeout=600)
-    return folder, done.stdout + done.stderr
+def build(folder: Path, *words: str) -> str:
+    """Build pans.bin and pans.elf in the folder, with more words for cmake; return what the compiler said."""
+    source = ["cmake", "-S", str(FOLDER / "rp2040"), "-B", str(folder), "-DPICO_NO_PICOTOOL=1"]
+    subprocess.run([*source, *words], check=True, capture_output=True, timeout=300)
+    done = subprocess.run(["cmake", "--build", str(folder)], check=True, capture_output=True, text=True, timeout=900)
+    return done.stdout + done.stderr
+
+
+def symbols(image: Path) -> dict[str, int]:
+    """Return the addresses of an ELF file's symbols."""
+    said = subprocess.run(["arm-none-eabi-nm", str(image)], check=True, capture_output=True, text=True).stdout
+    return {words[2]: int(words[0], 16) for words in map(str.split, said.splitlines()) if len(words) == 3}
 
 
 def write_scene(path: Path) -> Path:
@@ -57,20 +63,41 @@ class Rp2040Link(LockStepLink):
         library, rom = (os.environ[name] for name in NEEDED[1:])
         words = ["node", str(BENCH), library, rom, str(image), str(write_scene(image.with_suffix(".scene")))]
         self._node = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        self.run(0)
+        self.reopen()
 
     def run(self, until_ns: int) -> bytes:
-        """See `LockStepLink`."""
+        """See `LockStepLink`; a chip that restarts is gone from the bus."""
+        data, there = self._run(until_ns)
+        if not there:
+            self.closed = True
+            raise LinkError(f"{self.name} has left the bus")
+        return data
+
+    def reopen(self) -> Rp2040Link:
+        """Wait until the chip is on the bus, then open its port."""
+        until = self.at_ns + round(START_S * 1e9)
+        while not self._run(until)[1]:
+            if self.at_ns >= until:
+                raise LinkError(f"{self.name} is not on the bus")
+        self._run(self.at_ns + 5_000_000)
+        self.closed = False
+        return self
+
+    def hang(self, exposures: int, at: int) -> None:
+        """Let the processor run in a circle at an address in RAM, once so many exposures more have begun."""
+        self._ask(b"H" + struct.pack("<IIH", exposures, at & ~1, BRANCH_TO_ITSELF))
+
+    def _run(self, until_ns: int) -> tuple[bytes, bool]:
         self._ask(b"R" + struct.pack("<Q", until_ns))
-        self.at_ns, count = struct.unpack("<QI", self._take(12))
-        return self._take(count)
+        self.at_ns, there, count = struct.unpack("<QBI", self._take(13))
+        return self._take(count), bool(there)
 
     def send(self, data: bytes) -> None:
         """See `LockStepLink`."""
         self._ask(b"W" + struct.pack("<I", len(data)) + data)
 
     def log(self) -> dict[str, Any]:
-        """Return what the bench has seen: `edges` of (light, gate or watchdog, 0 or 1, ns), `clicks`, `starts` of the chip."""
+        """Return what the bench has seen: `edges` (light, gate, output or watchdog; 0 or 1; ns), `clicks`, `starts` of the chip, `clk_sys`."""
         self._ask(b"L")
         found: dict[str, Any] = json.loads(self._take(struct.unpack("<I", self._take(4))[0]))
         return found

@@ -2,20 +2,21 @@
  *
  *   GPIO 2      light: high while the pattern is to be lit (the projector's trigger, or the lamp's)
  *   GPIO 3      the detector's gate: high during an exposure
- *   GPIO 5      pulses of the detector, rising edges counted by PWM slice 2
+ *   GPIO 5      pulses of the detector: a rising edge while the gate is high is a click
  *   GPIO 6..9   the four actuation outputs
  *   GPIO 16..19 SPI to the projector: projector.c
  *   USB         CDC, serial number from the chip
  *
- * A PIO state machine makes light and gate (pulse.pio), from the tick at which the processor starts it: both end by themselves. An alarm of the
- * timer calls pans_edge LEAD_US ahead. The watchdog is fed while the main loop turns and edges are served; when it bites, the chip restarts with
- * all pins low. The timer counts microseconds in 64 bits. Docs: docs/how-to/bench.md.
+ * A PIO state machine makes light and gate (pulse.pio), from the tick at which the processor starts it: both end by themselves. Another one looks
+ * for clicks. An alarm of the timer calls pans_edge LEAD_US ahead, above all other interrupts. When an exposure began and ended is read from the
+ * gate's pin. The watchdog is fed while the main loop turns and edges are served; when it bites, the chip restarts with all pins low. The timer
+ * counts microseconds in 64 bits. Docs: docs/how-to/bench.md.
  */
 #include "board.h"
 #include "hardware/clocks.h"
 #include "hardware/irq.h"
 #include "hardware/pio.h"
-#include "hardware/pwm.h"
+#include "hardware/sync.h"
 #include "hardware/timer.h"
 #include "hardware/watchdog.h"
 #include "pico/stdlib.h"
@@ -27,18 +28,17 @@ enum { LIGHT = 2, DETECTOR_GATE = 3, PULSES = 5, FIRST_OUTPUT = 6, OUTPUTS = 4, 
 #define TICK_HZ 1000000u
 #define LEAD_US 15u      /* more than the interrupt, the longest `hold` and what expose does ahead of its tick */
 #define WATCHDOG_MS 100u /* a loop that hangs: no light after so long */
+#define OVERSHOOT_US 3u  /* a gate that has not closed by itself is closed */
 #define OVERDUE_US 2000u /* an edge that nobody serves for so long is a hang too */
 
 static struct {
     struct pans_device *device;
     uint32_t cycles; /* of the state machine in a microsecond */
-    uint64_t end;
-    uint16_t counted;
-    uint32_t exposures;
+    uint64_t end; /* of the exposure under way */
 } board;
 
 static const PIO pio = pio0;
-static const uint machine = 0;
+static const uint machine = 0, click_machine = 1;
 static uint program;
 
 /* -- clock and alarm -- */
@@ -49,9 +49,10 @@ static uint64_t hw_now(void *self)
     return time_us_64();
 }
 
+/* A tick that is at most half an hour ahead: looked at in a few cycles. */
 static void wait_until(uint64_t tick)
 {
-    while (time_us_64() < tick)
+    while ((int32_t)(timer_hw->timerawl - (uint32_t)tick) < 0)
         continue;
 }
 
@@ -81,6 +82,8 @@ static void hw_hold(void *self, bool on)
     if (!on)
         schedule();
     irq_set_enabled(hardware_alarm_get_irq_num(ALARM), !on);
+    __dsb();
+    __isb(); /* from here on it holds */
 }
 
 /* -- exposures -- */
@@ -102,25 +105,15 @@ static uint64_t hw_expose(void *self, const struct pans_exposure *exposure)
     on = on < 2 ? 2 : on > whole - 2 ? whole - 2 : on; /* the least that the state machine can do: 16 ns */
     pio_sm_put(pio, machine, on - 2);
     pio_sm_put(pio, machine, whole - on - 2);
+    while (!pio_sm_is_rx_fifo_empty(pio, click_machine)) /* the gate is closed: no more come */
+        (void)pio_sm_get(pio, click_machine);
     wait_until(exposure->tick);
-    board.counted = (uint16_t)pwm_get_counter(PULSES / 2);
     pio_sm_put(pio, machine, lit ? 3 : 2);
+    for (uint32_t i = 0; i < 100 && !gpio_get(DETECTOR_GATE); i++)
+        continue;
     uint64_t began = time_us_64();
     board.end = began + exposure->ticks;
-    board.exposures++;
     return began;
-}
-
-static uint64_t hw_clicks(void *self, uint8_t *word, uint16_t bytes)
-{
-    (void)self, (void)bytes;
-    while (pio_sm_is_rx_fifo_empty(pio, machine) && time_us_64() <= board.end + LEAD_US)
-        continue;
-    uint64_t ended = time_us_64();
-    word[0] = (uint16_t)pwm_get_counter(PULSES / 2) != board.counted;
-    if (!pio_sm_is_rx_fifo_empty(pio, machine))
-        (void)pio_sm_get(pio, machine);
-    return ended;
 }
 
 static void hw_dark(void *self)
@@ -132,6 +125,19 @@ static void hw_dark(void *self)
     pio_sm_exec(pio, machine, pio_encode_set(pio_pins, 0));
     pio_sm_exec(pio, machine, pio_encode_jmp(program));
     pio_sm_set_enabled(pio, machine, true);
+}
+
+static uint64_t hw_clicks(void *self, uint8_t *word, uint16_t bytes)
+{
+    (void)bytes;
+    uint32_t latest = (uint32_t)board.end + OVERSHOOT_US;
+    while (gpio_get(DETECTOR_GATE) && (int32_t)(timer_hw->timerawl - latest) < 0)
+        continue;
+    uint64_t ended = time_us_64();
+    if (gpio_get(DETECTOR_GATE))
+        hw_dark(self); /* what should have ended by itself */
+    word[0] = !pio_sm_is_rx_fifo_empty(pio, click_machine);
+    return ended;
 }
 
 static void hw_gate(void *self, uint16_t output, bool open, uint64_t tick)
@@ -189,12 +195,16 @@ static void start_pulses(void)
     board.cycles = clock_get_hz(clk_sys) / TICK_HZ;
 }
 
-static void start_counter(void)
+static void start_clicks(void)
 {
-    pwm_config config = pwm_get_default_config();
-    pwm_config_set_clkdiv_mode(&config, PWM_DIV_B_RISING);
-    gpio_set_function(PULSES, GPIO_FUNC_PWM);
-    pwm_init(PULSES / 2, &config, true);
+    uint offset = (uint)pio_add_program(pio, &click_program);
+    pio_sm_config config = click_program_get_default_config(offset);
+    gpio_init(PULSES);
+    gpio_pull_down(PULSES);
+    sm_config_set_in_pins(&config, PULSES);
+    sm_config_set_jmp_pin(&config, DETECTOR_GATE);
+    pio_sm_init(pio, click_machine, offset, &config);
+    pio_sm_set_enabled(pio, click_machine, true);
 }
 
 static void start_outputs(void)
@@ -256,10 +266,7 @@ int main(void)
 {
     static const struct pans_hardware hardware = {
         .now = hw_now, .read = hw_read, .write = hw_write, .store = hw_store, .prepare = hw_prepare, .dark = hw_dark, .mark = hw_mark,
-#ifndef POLLED /* of a test: firmware without an interrupt, whose exposures begin late */
-        .hold = hw_hold,
-#endif
-        .show = hw_show, .expose = hw_expose, .clicks = hw_clicks, .gate = hw_gate,
+        .hold = hw_hold, .show = hw_show, .expose = hw_expose, .clicks = hw_clicks, .gate = hw_gate,
     };
     static char serial[2 * PICO_UNIQUE_BOARD_ID_SIZE_BYTES + 1];
     pico_get_unique_board_id_string(serial, sizeof serial);
@@ -267,22 +274,16 @@ int main(void)
     limits.epoch = next_epoch();
     start_outputs();
     start_pulses();
-    start_counter();
+    start_clicks();
     projector_start();
     port_start(serial);
     board.device = pans_start(&limits, &hardware, memory, sizeof memory, time_us_64());
-    if (board.device == NULL)
-        panic("the limits do not fit the memory");
-#ifndef POLLED
+    if (board.device == NULL || limits.epoch == 0)
+        return 1; /* all pins stay low, and a host finds nobody */
     start_alarm();
-#endif
     watchdog_enable(WATCHDOG_MS, false);
     for (;;) {
         pans_turn(board.device);
-#ifdef HANG_AFTER /* of a test: the main loop hangs */
-        while (board.exposures >= HANG_AFTER)
-            continue;
-#endif
         if (edges_are_served())
             watchdog_update();
     }

@@ -9,7 +9,7 @@ void projector_start(void);
 void projector_store(const struct pans_pixels *pixels); /* while no run is on; NULL: forget all */
 void projector_choose(uint16_t pattern);                /* from an interrupt: microseconds */
 
-/* epoch.c: a number that no earlier start has had */
+/* epoch.c: a number that no earlier start has had; 0 when the flash does not keep it */
 uint32_t next_epoch(void);
 
 /* usb.c: the port */
