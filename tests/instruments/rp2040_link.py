@@ -62,6 +62,7 @@ class Rp2040Link(LockStepLink):
         super().__init__(f"rp2040:{image}")
         library, rom = (os.environ[name] for name in NEEDED[1:])
         words = ["node", str(BENCH), library, rom, str(image), str(write_scene(image.with_suffix(".scene")))]
+        self.sent, self.heard = bytearray(), bytearray()
         self._node = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self.reopen()
 
@@ -90,14 +91,17 @@ class Rp2040Link(LockStepLink):
     def _run(self, until_ns: int) -> tuple[bytes, bool]:
         self._ask(b"R" + struct.pack("<Q", until_ns))
         self.at_ns, there, count = struct.unpack("<QBI", self._take(13))
-        return self._take(count), bool(there)
+        data = self._take(count)
+        self.heard += data
+        return data, bool(there)
 
     def send(self, data: bytes) -> None:
         """See `LockStepLink`."""
+        self.sent += data
         self._ask(b"W" + struct.pack("<I", len(data)) + data)
 
     def log(self) -> dict[str, Any]:
-        """Return what the bench has seen: `edges` (light, gate, output or watchdog; 0 or 1; ns), `clicks`, `starts` of the chip, `clk_sys`."""
+        """Return what the bench has seen: `edges` (light, gate, pulse, output or watchdog; 0 or 1; ns), `starts` of the chip, `clk_sys`."""
         self._ask(b"L")
         found: dict[str, Any] = json.loads(self._take(struct.unpack("<I", self._take(4))[0]))
         return found

@@ -26,7 +26,7 @@
 enum { LIGHT = 2, DETECTOR_GATE = 3, PULSES = 5, FIRST_OUTPUT = 6, OUTPUTS = 4, ALARM = 0 };
 
 #define TICK_HZ 1000000u
-#define LEAD_US 15u      /* more than the interrupt, the longest `hold` and what expose does ahead of its tick */
+#define LEAD_US 10u      /* more than the interrupt, the longest `hold` and what expose does ahead of its tick */
 #define WATCHDOG_MS 100u /* a loop that hangs: no light after so long */
 #define OVERSHOOT_US 3u  /* a gate that has not closed by itself is closed */
 #define OVERDUE_US 2000u /* an edge that nobody serves for so long is a hang too */
@@ -246,7 +246,7 @@ static struct pans_limits limits = {
     .show_memory = 64,
     .exposure_min_ticks = 40,
     .exposure_max_ticks = 1000000,
-    .readout_ticks = 3,
+    .readout_ticks = 10, /* from the end of one exposure to the start of the next the interrupt takes 8 us */
     .pattern_ticks = 44, /* of a DLP7000: 23.1 kHz */
     .turn_ticks = 50,    /* the same, and what the core takes to choose */
     .buffer_messages = 128,

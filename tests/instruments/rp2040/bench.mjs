@@ -18,7 +18,7 @@ const [library, romFile, imageFile, sceneFile] = process.argv.slice(2);
 const { RP2040, USBCDC, BasePeripheral, ConsoleLogger, LogLevel } = await import(pathToFileURL(path.join(library, 'dist/esm/index.js')));
 const rom = new Uint32Array(fs.readFileSync(romFile, 'utf8').match(/0x[0-9a-f]{1,8}/gi).map(Number));
 const CYCLE_NS = 8, LIGHT = 2, GATE = 3, PULSES = 5, PULSE_NS = 40, RAM = 0x20000000;
-const NAMES = { [LIGHT]: 'light', [GATE]: 'gate', 6: 'output 0', 7: 'output 1', 8: 'output 2', 9: 'output 3' };
+const NAMES = { [LIGHT]: 'light', [GATE]: 'gate', [PULSES]: 'pulse', 6: 'output 0', 7: 'output 1', 8: 'output 2', 9: 'output 3' };
 const flash = new Uint8Array(2 << 20).fill(0xff);
 flash.set(fs.readFileSync(imageFile));
 const scene = fs.readFileSync(sceneFile); // u32 objects, pixels, slots of a walk, peak and dark counts in mHz; then bytes
@@ -71,15 +71,17 @@ class Select extends BasePeripheral {
 
 /* -- projector and detector -- */
 const masks = new Map(), edges = [], level = {};
-let chosen = 0xffff, exposure = -1, exposures = 0, clicks = 0, starts = 0, seed = 1n, hang = null;
+let chosen = 0xffff, exposure = -1, exposures = 0, starts = 0, seed = 1n, hang = null;
 function chance() {
   seed = seed * 6364136223846793005n + 1442695040888963407n & 0xffffffffffffffffn;
   return (Number(seed >> 11n) + 1) / 2 ** 53;
 }
 function wait(rate) { return Math.max(1, -Math.log(chance()) / rate * 1e9); }
 function projector(mcu) {
+  const [spi] = mcu.spi, sent = mcu.clock.createAlarm(() => spi.completeTransmit(0));
   let message = [], need = 1;
-  mcu.spi[0].onTransmit = (byte) => {
+  spi.onTransmit = (byte) => {
+    sent.schedule(8e9 / spi.clockFrequency);
     message.push(byte);
     if (message.length === need) {
       const what = String.fromCharCode(message[0]), n = message[5] | message[6] << 8;
@@ -96,7 +98,6 @@ function projector(mcu) {
         message = []; need = 1;
       }
     }
-    mcu.spi[0].completeTransmit(0);
   };
 }
 function brightness() {
@@ -107,11 +108,12 @@ function brightness() {
 }
 /* Light and dark clicks are two processes, each begun anew where its cause begins: exponential waits forget. */
 function detector(mcu) {
-  const pin = mcu.gpio[PULSES];
-  const fall = mcu.clock.createAlarm(() => pin.setInputValue(false));
-  const click = () => { clicks++; pin.setInputValue(true); fall.schedule(PULSE_NS); };
+  const pin = mcu.gpio[PULSES], { began } = one;
+  const pulse = (on) => { pin.setInputValue(on === 1); note(PULSES, on, began + mcu.clock.nanos); };
+  const fall = mcu.clock.createAlarm(() => pulse(0));
+  const click = () => { pulse(1); fall.schedule(PULSE_NS); };
   let rate = 0;
-  const photon = mcu.clock.createAlarm(() => { if (level[GATE]) click(); photon.schedule(wait(rate)); });
+  const photon = mcu.clock.createAlarm(() => { click(); photon.schedule(wait(rate)); });
   const dark = mcu.clock.createAlarm(() => { click(); dark.schedule(wait(darkRate / 1000)); });
   return (which, on) => {
     if (which === LIGHT) {
@@ -145,11 +147,11 @@ function powerOn(began, before) {
   mcu.peripherals[0x18000] = chip;
   mcu.peripherals[0x40018] = new Select(mcu, chip);
   if (before) { watchdog.reason = before.reason; watchdog.scratchData.set(before.scratchData); }
-  watchdog.onWatchdogTrigger = () => { one.bitten = true; };
+  watchdog.onWatchdogTrigger = () => { one.bitten = true; watchdog.alarm.enable = false; }; // once
   for (const block of mcu.pio) block.run = () => {}; // turn() does it
   projector(mcu);
   const changed = detector(mcu), here = one;
-  for (const pin of Object.keys(NAMES).map(Number))
+  for (const pin of Object.keys(NAMES).map(Number).filter((at) => at !== PULSES))
     mcu.gpio[pin].addListener((state) => {
       const on = +(state === 1);
       mcu.gpio[pin].setInputValue(on === 1);
@@ -222,7 +224,7 @@ for (;;) {
     head.writeBigUInt64LE(BigInt(Math.round(now())), 0); head.writeUInt8(+one.connected, 8); head.writeUInt32LE(data.length, 9);
     put(Buffer.concat([head, data]));
   } else {
-    const text = Buffer.from(JSON.stringify({ edges, clicks, starts, clk_sys: one.mcu.clkSys })), head = Buffer.alloc(4);
+    const text = Buffer.from(JSON.stringify({ edges, starts, clk_sys: one.mcu.clkSys })), head = Buffer.alloc(4);
     head.writeUInt32LE(text.length, 0); put(Buffer.concat([head, text]));
   }
 }
