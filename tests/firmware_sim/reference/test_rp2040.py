@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ from pans.runtime.wire.schema import DeviceState, MessageType, Opcode
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=f"not here: {missing()}")]
 
 TICK_NS = 1000
-EXPOSED = 0x85
 DARK_NS = 101_000_000  # the watchdog, and one turn of the main loop before the hang
 PIO_NS = 32  # as exactly as the emulator knows when an instruction reaches PIO
 RAM = 0x20000000
@@ -114,7 +114,7 @@ def planned(link: Rp2040Link, exposures: int) -> tuple[np.ndarray, int]:
 
 def told(link: Rp2040Link) -> list[tuple[int, int, int, int, int]]:
     """The device's EXPOSED: exposures, worst start error and length error in ticks, their numbers."""
-    return [struct.unpack("<IiiQQ", one.payload) for one in frames(link.heard) if one.type == EXPOSED]
+    return [struct.unpack("<IiiQQ", one.payload) for one in frames(link.heard) if one.type == MessageType.EXPOSED]
 
 
 def check_pins(link: Rp2040Link, exposures: int) -> tuple[np.ndarray, np.ndarray]:
@@ -131,11 +131,18 @@ def check_pins(link: Rp2040Link, exposures: int) -> tuple[np.ndarray, np.ndarray
     return late, longer
 
 
+@contextmanager
+def on_the_path(folder: Path) -> Iterator[None]:
+    """Makes `rp2040:IMAGE` a device URL."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(register(folder / "site", "rp2040", "rp2040_link:open_rp2040"))
+        yield
+
+
 def run(
     capsys: pytest.CaptureFixture[str], folder: Path, image: Path, profile: Path, decisions: int, code: int
 ) -> dict[str, Any]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(register(folder / "site", "rp2040", "rp2040_link:open_rp2040"))
+    with on_the_path(folder):
         words = ("--device", f"rp2040:{image}", "--profile", profile, "--decisions", decisions, "--drive", "device")
         return json_of(capsys, "run fashion-adaptive", *words, "--out", folder / "run", code=code)
 
@@ -148,7 +155,7 @@ def test_the_shipped_automaton_on_the_tick(
     assert found["verdict"] == "PASS"
     (link,) = open_links
     exposures = found["stream"]["exposures"]
-    assert exposures >= 1000
+    assert found["exposure_timing"]["exposures"] == exposures >= 1000
     late, longer = check_pins(link, exposures)
     assert late.min() >= 0
     assert late.max() <= TICK_NS
@@ -165,6 +172,15 @@ def test_the_shipped_automaton_on_the_tick(
     )
     assert least <= counted <= most
     assert least > 0.9 * most > 100
+
+
+def test_it_keeps_every_rule(
+    built: Callable[..., Path], profile: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], opened: Any
+) -> None:
+    with on_the_path(tmp_path):
+        found = json_of(capsys, "conform", f"rp2040:{built()}", "--profile", profile)
+    assert (found["verdict"], found["broken"], found["gone"]) == ("PASS", [], None)
+    assert found["kept"] >= 69
 
 
 def bench_of(link: Rp2040Link, profile: Path) -> Bench:
@@ -265,3 +281,6 @@ def test_the_polled_board_is_judged(
     (link,) = open_links
     late, longer = check_pins(link, found["stream"]["exposures"])
     assert max(late.max(), np.abs(longer).max()) > 5 * TICK_NS
+    told_us = (found["exposure_timing"][name] for name in ("worst_start_us", "worst_length_us"))
+    for worst_us, errors in zip(told_us, (late, longer), strict=True):
+        assert abs(worst_us * 1000 - errors[np.argmax(np.abs(errors))]) <= TICK_NS
