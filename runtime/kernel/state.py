@@ -42,7 +42,6 @@ REFUSAL = -1
 ALL_TAKEN, DUE, FULL, ODD, GONE, SIGNALLED, BROKEN = range(7)  # why a call ended
 WHY = ("all taken", "due", "full", "odd", "gone", "signalled", "broken")
 
-LARGEST_BODY = HEADER.size + MAX_PAYLOAD_BYTES
 KEPT_BYTES = 1 << 20
 MANY = 4096  # messages of one call: no more objects than marks are remembered (stream_kernels.MARK_SLOTS)
 SHOW_BYTES = 64  # a SHOW command on the wire is shorter

@@ -12,7 +12,6 @@ from pans.trainer.options import Options
 from .page import Row, read_toml
 
 SHOTS = (1, 2, 3, 5)
-CLICKS_TOLERANCE = 1.05  # a row counts at no more than this times the paper's clicks
 
 
 @dataclass(frozen=True, slots=True)
