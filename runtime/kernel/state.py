@@ -7,8 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.wire.schema import HEADER, MAX_PAYLOAD_BYTES
-
 U8 = npt.NDArray[np.uint8]
 I64 = npt.NDArray[np.int64]
 
