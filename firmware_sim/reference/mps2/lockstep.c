@@ -7,7 +7,7 @@
 #include "board.h"
 
 enum { OPEN = 0x01, WRITE = 0x05, READ = 0x06, FOR_READING = 1, FOR_WRITING = 5 };
-enum { HEAD = 12, ROOM = 1 << 19, MARGIN = 1000 }; /* MARGIN: ticks before an event that are not skipped, more than LEAD */
+enum { HEAD = 12, ROOM = 1 << 19, MARGIN = 600 }; /* MARGIN: ticks before an event that are not skipped, more than LEAD */
 
 __attribute__((section(".bench"))) static uint8_t in[ROOM], out[HEAD + ROOM];
 static uint32_t in_got, in_count, out_count, pipe_in, pipe_out;

@@ -60,8 +60,12 @@ def test_the_reference_instrument_keeps_every_rule(name: str) -> None:
     } == BEYOND | LONG
 
 
-@pytest.mark.parametrize("core", [False, pytest.param(True, marks=needs_compiler)], ids=["simulator", "C core"])
 @pytest.mark.parametrize("name", ["ideal", pytest.param("dmd-spad", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "core",
+    [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=needs_compiler)],
+    ids=["simulator", "C core"],
+)
 def test_both_devices_keep_the_long_rules(name: str, core: bool) -> None:
     device = c_core(name) if core else build_instrument(SimOptions(name, "uniform"), START_NS)
     found = tried(name, *device, *SOME, *LONG)
