@@ -24,7 +24,7 @@ static struct {
     uint32_t last_id, sequence, drops; /* of the message that comes next, and of the block before */
     uint64_t exposure;
     uint64_t exposing;
-    bool is_open[4], held;
+    bool is_open[4], held, ended;
     struct pans_device *device; /* that the interrupt is of; NULL: none */
     uint8_t body[LARGEST_FRAME], frame[LARGEST_FRAME + LARGEST_FRAME / 254 + 2], heard[LARGEST_FRAME];
     struct decoder decoder;
@@ -138,6 +138,7 @@ static uint64_t hw_clicks(void *self, uint8_t *word, uint16_t bytes)
 {
     (void)self;
     here.exposing--;
+    here.ended = true;
     for (uint16_t i = 0; i < bytes; i++)
         word[i] = (uint8_t)roll(256);
     return here.tick;
@@ -436,6 +437,10 @@ static void one_life(void)
             deaf--; /* for so long nobody takes what it says */
         if (deaf == 0)
             listen(device);
+        here.ended = false;
+        interrupt();
+        if (here.ended && here.device != NULL && pans_next_tick(device) > here.tick)
+            wrong("an exposure has ended, and nobody is called");
         if (pans_next_tick(device) < here.tick && roll(2) == 0)
             pans_step(device, here.tick, NULL, 0);
         if (here.exposing > 1)
