@@ -150,6 +150,11 @@ def click_list(recording: Recording, plan: Plan) -> ClickList:
     return ClickList(start, number, thing, channel, pattern, state, streams, exposures, first_tick, last_tick, photons)
 
 
+def first_tick(recording: Recording, plan: Plan) -> int:
+    """Return the begin of the first recorded exposure, 0 where there is none."""
+    return next((int(item.start_tick[0]) for item in iter_exposures(recording, plan) if len(item.start_tick)), 0)
+
+
 def is_dark(pattern: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Return where no light was shown."""
     return np.asarray(pattern == DARK_PATTERN)

@@ -138,6 +138,26 @@ class Recording:
                 where = f"{self.path}: an event in block {block.index}"
                 yield _checked_event(parse_json_object(line, where), where)
 
+    def to_frame(self, table: str = "decisions") -> Any:
+        """Return the `decisions` with their host times, or the `clicks`, as a pandas.DataFrame; needs the extra `frames`.
+
+        The index `time` is the time of day in UTC: exact between rows, its beginning known to about two seconds. Columns are those of
+        the CSV export; `attrs` has their `units` and `meanings` and the recording's facts. What is missing is NA or NaN.
+
+        >>> frame = pans.load_recording("run.pansrec").to_frame()  # doctest: +SKIP
+        >>> frame.latency_us.resample("1min").quantile(0.99)  # doctest: +SKIP
+        """
+        from .tables import frame_of
+
+        return frame_of(self, table)
+
+    def to_xarray(self, table: str = "decisions") -> Any:
+        """Return the same as an xarray.Dataset along `time`; each variable has `units` and `long_name`, and says what stands for a
+        missing value: -1, NaN or an empty text."""
+        from .tables import dataset_of
+
+        return dataset_of(self, table)
+
     def bundle_data(self) -> bytes:
         """Return the bytes of the bundle that the run used, b"" if it was not recorded."""
         return next((block.payload for block in self.iter_blocks(Kind.BUNDLE)), b"")

@@ -13,12 +13,13 @@ from bundles import made_bundle
 from heads import onnx_chain, random_layers
 from lab_bundle import read_bundle
 from lab_decisions import decide_again
-from lab_recording import read_recording
+from lab_recording import NO_NUMBER, read_recording
 from tree import ROOT
 
 from pans.runtime.bundle import Bundle, load_bundle, write_bundle
 from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.cli import EXIT_DEVICE, main
+from pans.runtime.errors import UsageError
 from pans.runtime.record import read_recording as our_reader
 
 D_F, CLASSES, LEVELS = 6, 4, 16
@@ -120,6 +121,36 @@ def test_decisions_come_out_the_same(tmp_path: Path, case: Case) -> None:
         assert rows["clicks"].max() > D_F * case.shots  # more than a click each
     if case.faults:
         assert 0 < np.count_nonzero(rows["flags"]) < len(rows)
+
+
+def test_frames_hold_what_the_lab_reads(tmp_path: Path) -> None:
+    pytest.importorskip("pandas", reason="needs the frames extra")
+    pytest.importorskip("xarray", reason="needs the frames extra")
+    case = Case("sequential", "table", trials=2, order="shot-major", faults=TROUBLE, decisions=900)
+    write_bundle(small_bundle(case.backend), tmp_path / "small.pans")
+    path = record(tmp_path, case, tmp_path / "small.pans")
+    lab, ours = read_recording(path.read_bytes()), our_reader(path)
+    frame, data = ours.to_frame(), ours.to_xarray()
+    columns = {"decision": "index", "exposure": "exposure_index", "first_shot": "shot"}
+    for name in ("decision", "tick", "exposure", "object", "first_shot", "clicks", "flags"):
+        assert frame[name].tolist() == data[name].values.tolist() == lab.rows[columns.get(name, name)].tolist()
+    for name, none in (("label", NO_NUMBER), ("truth", -1)):
+        wanted = [-1 if value == none else value for value in lab.rows[name].tolist()]
+        assert frame[name].fillna(-1).tolist() == data[name].values.tolist() == wanted
+    decided = lab.rows["label"] != NO_NUMBER
+    assert decided.any()
+    assert not decided.all()
+    assert frame.probability[decided].tolist() == lab.rows["probability"][decided].tolist()
+    assert frame.probability.isna().tolist() == (~decided).tolist()
+    times = np.array(lab.timings)
+    assert frame.latency_us.to_numpy() == pytest.approx((times[:, 3] - times[:, 1]) / 1000, abs=6e-4)
+    zero_ns = min(sent for sent, _ in lab.commands)
+    begun = np.datetime64(lab.header["created_utc"].removesuffix("+00:00"), "ns")
+    assert (frame.index.tz_localize(None).values - begun).astype(int).tolist() == (times[:, 1] - zero_ns).tolist()
+    assert (data.time.values == frame.index.tz_localize(None).values).all()
+    assert (frame.attrs["units"]["latency_us"], data.latency_us.attrs["units"]) == ("us", "us")
+    with pytest.raises(UsageError, match="decisions or clicks"):
+        ours.to_frame("photons")
 
 
 def test_a_head_of_hundreds_of_units(tmp_path: Path) -> None:
