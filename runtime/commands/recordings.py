@@ -140,7 +140,7 @@ def _export(args: argparse.Namespace) -> int:
     if is_folder:
         written = write_csv(args.out, recording, plan, clicks, force=args.force)
     elif args.format == "parquet":
-        write_decisions(args.out, recording, force=args.force)
+        write_decisions(args.out, recording, plan, force=args.force)
     else:
         from pans.runtime.report.photon_hdf5 import write_photon_hdf5
 

@@ -13,25 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.core.decision import NO_LABEL
-from pans.runtime.errors import UsageError
+from pans.runtime.cli.finding import missing_extra
+from pans.runtime.core.plan import Plan
 from pans.runtime.outputs import whole_file
 from pans.runtime.record import Recording
-
-COLUMNS = {  # name: its type, and the field of a decision ("": made of another one)
-    "decision": ("int64", "index"),
-    "tick": ("int64", "tick"),
-    "exposure": ("int64", "exposure_index"),
-    "object": ("int64", "object"),
-    "first_shot": ("int64", "shot"),
-    "clicks": ("int64", "clicks"),
-    "label": ("int32", "label"),
-    "class": ("string", ""),
-    "truth": ("int32", "truth"),
-    "probability": ("float32", "probability"),
-    "flags": ("int32", "flags"),
-    "exposures": ("int64", "exposures"),
-}
+from pans.runtime.record.tables import DECISIONS, facts_of, iter_decisions
 
 
 def need_pyarrow() -> Any:
@@ -40,40 +26,30 @@ def need_pyarrow() -> Any:
         importlib.import_module("pyarrow.parquet")
         return importlib.import_module("pyarrow")
     except ImportError as error:
-        what = "Parquet needs the package pyarrow, which is not installed"
-        raise UsageError(what, remedy="pip install 'pans-runtime[parquet]'") from error
+        raise missing_extra("Parquet", "pyarrow", "parquet") from error
 
 
-def write_decisions(path: Path, recording: Recording, *, force: bool = False) -> None:
-    """Write the decisions of `recording` to `path`, block by block; columns as in decisions.csv, unknown values are null.
+def write_decisions(path: Path, recording: Recording, plan: Plan, *, force: bool = False) -> None:
+    """Write the decisions of `recording` to `path`, block by block; columns as in decisions.csv, missing values are null.
 
-    The schema's metadata hold `pans`, a JSON object with the recording's facts (`simulated`, `tick_us`, `decisions_sha256`, ...).
+    The metadata of each field hold its `unit`, `meaning` and what null means (`missing`), those of the schema `pans`, a JSON object with
+    the recording's facts (`simulated`, `tick_us`, `decisions_sha256`, ...).
     """
     pyarrow = need_pyarrow()
-    classes = list(recording.bundle().classes if recording.bundle_place else ())
-    facts = {
-        "recording": recording.path.name,
-        "simulated": recording.simulated,
-        "complete": recording.complete,
-        "tick_us": 1e6 / int(recording.header["config"]["tick_hz"]),
-        "classes": classes,
-        "decisions_sha256": recording.decisions_sha256,
-        "bundle_sha256": recording.header.get("bundle_sha256"),
-    }
-    columns = [(name, getattr(pyarrow, kind)()) for name, (kind, _) in COLUMNS.items()]
-    schema = pyarrow.schema(columns, metadata={"pans": json.dumps(facts)})
-    names = np.array([*classes, None], object)  # the last one is that of an unknown or nameless label
+    fields = [
+        pyarrow.field(
+            name,
+            getattr(pyarrow, {"str": "string"}.get(column.dtype, column.dtype))(),
+            nullable=bool(column.missing),
+            metadata={key: said for key in ("unit", "meaning", "missing") if (said := getattr(column, key))},
+        )
+        for name, column in DECISIONS.items()
+    ]
+    schema = pyarrow.schema(fields, metadata={"pans": json.dumps(facts_of(recording))})
     with whole_file(path, force=force) as beside, pyarrow.parquet.ParquetWriter(beside, schema) as writer:
-        for rows in recording.iter_decisions():
-            label = rows["label"].astype(np.int64)
-            unknown = label == NO_LABEL
-            found = {name: rows[field] for name, (_, field) in COLUMNS.items() if field}
-            found["class"] = names[np.where(label < len(classes), label, len(classes))]
-            masks = {"label": unknown, "probability": unknown, "truth": rows["truth"] < 0}
-            arrays = [
-                pyarrow.array(np.ascontiguousarray(found[name]), mask=masks.get(name)).cast(kind)
-                for name, kind in columns
-            ]
+        for table in iter_decisions(recording, plan):
+            columns = ((table[one.name], one.type) for one in fields)
+            arrays = [pyarrow.array(np.ma.getdata(v), kind, mask=np.ma.getmaskarray(v)) for v, kind in columns]
             writer.write_batch(pyarrow.record_batch(arrays, schema=schema))
 
 

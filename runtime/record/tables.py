@@ -17,9 +17,9 @@ from pans.runtime.cli.finding import missing_extra
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.wire.messages import DARK_PATTERN
+from pans.runtime.wire.messages import NO_OBJECT
 
-from .exposures import ClickList, click_list, first_tick
+from .exposures import ClickList, click_list, first_tick, is_dark
 from .format import TIMING_DTYPE
 from .parts import part_of
 from .recording import Recording
@@ -133,13 +133,13 @@ def timing_table(rows: NDArray[np.void]) -> Table:
 
 def click_table(recording: Recording, plan: Plan, clicks: ClickList) -> Table:
     """Return the clicks as columns of CLICKS."""
-    dark = clicks.pattern == DARK_PATTERN
+    dark = is_dark(clicks.pattern)
     counts = plan.largest > 1 and plan.channels_at_once == 1
     found = {
         "exposure_start_tick": clicks.start_tick,
         "exposure_start_us": np.round((clicks.start_tick - clicks.first_tick) * tick_us(recording), 3),
         "exposure": clicks.exposure,
-        "object": np.ma.array(clicks.object, mask=clicks.object == np.iinfo(np.uint32).max),
+        "object": np.ma.array(clicks.object, mask=clicks.object == NO_OBJECT),
         "channel": clicks.channel,
         "pattern": np.ma.array(clicks.pattern, mask=dark),
         "dark_slot": dark,

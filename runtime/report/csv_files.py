@@ -1,107 +1,86 @@
-"""A recording as CSV files, units in the headers, and a JSON file about them."""
+"""A recording as CSV files, units in the headers, a data dictionary and a JSON file about them."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import make_folder, write_file
 from pans.runtime.record import Recording
-from pans.runtime.record.exposures import ClickList, is_dark
+from pans.runtime.record.exposures import ClickList
+from pans.runtime.record.tables import (
+    CLICKS,
+    DECISIONS,
+    TIMINGS,
+    Table,
+    click_table,
+    iter_decisions,
+    tick_us,
+    timing_table,
+)
 from pans.runtime.safe_text import csv_cell
 
-DECISIONS = (
-    *("decision", "tick", "time_us", "exposure", "object", "first_shot", "clicks", "label", "class"),
-    *("truth", "probability", "flags", "flag_names", "exposures"),
-)
-CLICKS = (
-    *("exposure_start_tick", "exposure_start_us", "exposure", "object", "channel", "pattern", "dark_slot", "stream"),
-    "state",
-)
-FILES = ("decisions.csv", "clicks.csv", "timings.csv", "about.json")
-TIMINGS = ("decision", "device_end_ns", "arrival_ns", "decided_ns", "recorded_ns", "end_to_decided_us")
+TABLES = {"decisions.csv": DECISIONS, "clicks.csv": CLICKS, "timings.csv": TIMINGS}
+FILES = (*TABLES, "columns.csv", "about.json")
 
 
 def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList, *, force: bool = False) -> list[Path]:
-    """Write decisions, clicks, timings and about.json into `folder`; return their paths. UsageError where `folder` is a file."""
+    """Write the tables, their dictionary columns.csv and about.json into `folder`; return their paths. UsageError where it is a file."""
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file", remedy="name a folder: csv is several files")
     make_folder(folder)
-    us = 1e6 / int(recording.header["config"]["tick_hz"])
-    classes = recording.bundle().classes if recording.bundle_place else ()
-    tables: dict[str, tuple[Sequence[str], Iterable[Sequence[Any]]]] = {
-        "decisions.csv": (
-            DECISIONS,
-            (_decision_row(row, clicks.first_tick, us, classes) for row in recording.decisions()),
-        ),
-        "clicks.csv": _click_table(clicks, us, plan),
-        "timings.csv": (TIMINGS, (_timing_row(row) for row in recording.timings())),
+    tables = {
+        "decisions.csv": _csv(DECISIONS, iter_decisions(recording, plan)),
+        "clicks.csv": _csv(CLICKS, [click_table(recording, plan, clicks)]),
+        "timings.csv": _csv(TIMINGS, map(timing_table, recording.iter_timings())),
+        "columns.csv": dictionary(),
     }
-    written = []
-    for name, (head, rows) in tables.items():
-        text = io.StringIO(newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(head)
-        writer.writerows(rows)
-        write_file(folder / name, text.getvalue().encode(), force=force)
-        written.append(folder / name)
     about = {
         "recording": recording.path.name,
         "simulated": recording.simulated,
         "complete": recording.complete,
         "exposure_us": plan.exposure_us,
-        "tick_us": us,
+        "tick_us": tick_us(recording),
         "exposures": clicks.exposures,
         "time_zero": "the begin of the first recorded exposure",
         "decisions_sha256": recording.decisions_sha256,
         "header": {key: value for key, value in recording.header.items() if key != "profile"},
         "events": list(recording.events()),
     }
-    write_file(folder / "about.json", (json.dumps(about, indent=1, sort_keys=True) + "\n").encode(), force=force)
-    return [*written, folder / "about.json"]
+    files = tables | {"about.json": json.dumps(about, indent=1, sort_keys=True) + "\n"}
+    for name, text in files.items():
+        write_file(folder / name, text.encode(), force=force)
+    return [folder / name for name in files]
 
 
-def _decision_row(row: Any, first_tick: int, us: float, classes: tuple[str, ...]) -> list[Any]:
-    label, flags = int(row["label"]), DecisionFlag(int(row["flags"]))
-    known = label != NO_LABEL
-    return [
-        *(int(row["index"]), int(row["tick"]), f"{(int(row['tick']) - first_tick) * us:.3f}"),
-        *(int(row[name]) for name in ("exposure_index", "object", "shot", "clicks")),
-        label if known else "",
-        csv_cell(classes[label]) if known and label < len(classes) else "",
-        int(row["truth"]) if row["truth"] >= 0 else "",
-        repr(float(row["probability"])) if known else "",
-        *(int(flags), "|".join(str(flag.name) for flag in flags)),
-        int(row["exposures"]) or "",
-    ]
+def dictionary() -> str:
+    """Return columns.csv: every column of every table with its unit, its type, what it means, and what an empty cell means."""
+    rows = (
+        (file, name, column.unit, column.dtype, column.meaning, column.missing)
+        for file, columns in TABLES.items()
+        for name, column in columns.items()
+    )
+    return _text(("file", "column", "unit", "dtype", "meaning", "empty_means"), rows)
 
 
-def _click_table(clicks: ClickList, us: float, plan: Plan) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
-    """Heads and rows of clicks.csv; those of a detector that counts have their photons too."""
-    rows = _click_rows(clicks, us, walks=plan.automaton is not None)
-    if plan.largest == 1 or plan.channels_at_once > 1:
-        return CLICKS, rows
-    return (*CLICKS, "photons"), ((*row, number) for row, number in zip(rows, clicks.photons.tolist()))
+def _csv(columns: Mapping[str, object], blocks: Iterable[Table]) -> str:
+    return _text(tuple(columns), chain.from_iterable(map(_rows, blocks)))
 
 
-def _click_rows(clicks: ClickList, us: float, *, walks: bool) -> Iterable[Sequence[Any]]:
-    dark = is_dark(clicks.pattern)
-    pattern = [("" if unlit else str(shown)) for shown, unlit in zip(clicks.pattern.tolist(), dark.tolist())]
-    since = [f"{value * us:.3f}" for value in (clicks.start_tick - clicks.first_tick).tolist()]
-    numbers = (column.tolist() for column in (clicks.exposure, clicks.object, clicks.channel))
-    unlit = dark.tolist()
-    state = [str(state) if walks and not off else "" for state, off in zip(clicks.state.tolist(), unlit)]
-    streams = clicks.stream.tolist()
-    return zip(clicks.start_tick.tolist(), since, *numbers, pattern, dark.astype(int).tolist(), streams, state)
+def _rows(table: Table) -> Iterator[tuple[Any, ...]]:
+    """The rows of a table; masked values are None, which the writer leaves empty."""
+    return zip(*([csv_cell(value) for value in column.tolist()] for column in table.values()))
 
 
-def _timing_row(row: Any) -> list[Any]:
-    values = [int(row[name]) for name in ("index", "device_end_ns", "arrival_ns", "decided_ns", "recorded_ns")]
-    return [*values, f"{(values[3] - values[1]) / 1000:.3f}"]
+def _text(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows([head])
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()

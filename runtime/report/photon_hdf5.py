@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from pans.runtime import __version__
+from pans.runtime.cli.finding import missing_extra
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import write_file
@@ -38,9 +39,7 @@ def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: Clic
     try:
         h5py: Any = importlib.import_module("h5py")
     except ModuleNotFoundError as error:
-        raise UsageError(
-            "Photon-HDF5 needs the package h5py, which is not installed", remedy="pip install 'pans-runtime[export]'"
-        ) from error
+        raise missing_extra("Photon-HDF5", "h5py", "export") from error
     if (np.diff(clicks.start_tick) < 0).any():
         raise UsageError(
             f"{recording.path}: the device's clock went back (it was switched off in between): the format has one clock",
@@ -103,6 +102,10 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
             "lifetime": 0,
             "excitation_alternated": np.zeros(1, np.uint8),
             "excitation_cw": np.ones(1, np.uint8),
+            "excitation_wavelengths": np.full(
+                1, np.nan
+            ),  # a profile does not state them, and readers expect the fields
+            "detection_wavelengths": np.full(1, np.nan),
         },
         "identity": _identity(path),
         "provenance": {
@@ -178,6 +181,10 @@ _SETUP = {
         "For each excitation source, this field indicates whether excitation is continuous wave (CW), True (i.e. 1), "
         "or pulsed, False (i.e. 0)."
     ),
+    "excitation_wavelengths": (
+        "List of excitation wavelengths (center wavelength if broad-band) in increasing order (unit: meter)."
+    ),
+    "detection_wavelengths": "Reference wavelengths (units: meter) for each detected spectral band.",
 }
 # The format's own words, to the letter (photon-hdf5.org, version 0.5); below /user ours.
 _TITLES = {

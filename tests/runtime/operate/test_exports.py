@@ -1,7 +1,10 @@
 """Exports: every click and decision of a run from CSV, Photon-HDF5 and Parquet; a bundle comes back from ONNX, arrays and PNG."""
 
+import contextlib
 import csv
 import json
+import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL
-from pans.runtime.errors import DamagedFileError
+from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.grey_png import png_bytes, read_grey_png
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.operate.parquet import write_rows
@@ -33,15 +36,19 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run.pansrec"
 
 
-def test_phconvert_accepts_and_loads_the_file(recording: Path, tmp_path: Path, pans: Pans) -> None:
+@pytest.mark.filterwarnings("error")
+def test_phconvert_opens_the_file_without_a_word(
+    run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("h5py", reason="needs the export extra")
-    hdf5 = pytest.importorskip("phconvert.hdf5", reason="needs the dev extra")
+    with warnings.catch_warnings(action="ignore"):  # of other packages that it imports
+        hdf5 = pytest.importorskip("phconvert.hdf5", reason="needs the dev extra")
     path = tmp_path / "run.h5"
-    found = pans("export", recording, "--format", "photon-hdf5", "-o", path)
-    source = read_recording(recording)
-    hdf5.assert_valid_photon_hdf5(str(path), warnings=False, strict_description=True, require_rootformat=True)
-    loaded = hdf5.load_photon_hdf5(str(path))
-    try:
+    found = json_of(capsys, "export", run_of, "--format", "photon-hdf5", "-o", path)
+    source = read_recording(run_of)
+    with contextlib.closing(hdf5.load_photon_hdf5(str(path))) as loaded:
+        hdf5.assert_valid_photon_hdf5(loaded, strict_description=True, require_rootformat=True)
+        assert capsys.readouterr().out == ""
         times = loaded.root.photon_data.timestamps.read()
         clicks = click_list(source, recorded_plan(source))
         assert len(times) == found["clicks"]
@@ -50,8 +57,6 @@ def test_phconvert_accepts_and_loads_the_file(recording: Path, tmp_path: Path, p
         assert tuple(names) == source.bundle().classes
         assert loaded.root.identity.format_name.read() == b"Photon-HDF5"
         assert loaded.root.description.read().startswith(b"SIMULATED")
-    finally:
-        loaded.close()
 
 
 def test_parquet_holds_every_decision(recording: Path, tmp_path: Path, pans: Pans) -> None:
@@ -70,6 +75,8 @@ def test_parquet_holds_every_decision(recording: Path, tmp_path: Path, pans: Pan
     assert columns["class"] == [classes[label] if one else None for label, one in zip(labels, known)]
     assert columns["truth"] == [None if truth < 0 else truth for truth in truths]
     assert columns["probability"] == [p if one else None for p, one in zip(probabilities, known)]
+    assert table.schema.field("time_us").metadata[b"unit"] == b"us"
+    assert table.schema.field("truth").metadata[b"missing"] == b"unknown"
     facts = json.loads(table.schema.metadata[b"pans"])
     assert (facts["simulated"], facts["decisions_sha256"]) == (True, source.decisions_sha256)
 
@@ -184,6 +191,39 @@ def test_csv_holds_every_click_and_decision(run_of: Path, tmp_path: Path, capsys
     assert found["simulated"] is True
     about = json.loads((tmp_path / "csv" / "about.json").read_text())
     assert about["exposures"] == found["exposures"]
+
+
+def test_other_readers_find_the_same_tables(run_of: Path, tmp_path: Path, pans: Pans) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs the frames extra")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the parquet extra")
+    for form, name in (("csv", "csv"), ("parquet", "d.parquet")):
+        pans("export", run_of, "--format", form, "-o", tmp_path / name)
+    dictionary = pandas.read_csv(tmp_path / "csv" / "columns.csv", keep_default_na=False)
+    recording = read_recording(run_of)
+    for file, columns in dictionary.groupby("file"):
+        # by the dictionary alone: nullable types where it says what an empty cell means
+        nullable = dict(zip(columns.column, columns.empty_means.ne("") & columns.dtype.str.startswith("int")))
+        kinds = {c: d.capitalize() if nullable[c] else d for c, d in zip(columns.column, columns.dtype)}
+        found = pandas.read_csv(tmp_path / "csv" / file, dtype=kinds, na_values=[""], keep_default_na=False)
+        assert found.columns.tolist() == columns.column.tolist()
+        for column, unit in zip(columns.column, columns.unit):
+            assert unit in ("", "1") or column.endswith(unit), column  # the unit stands in the name
+        wanted = recording.to_frame("clicks" if file == "clicks.csv" else "decisions").reset_index()
+        texts = dict.fromkeys(columns.column[columns.dtype == "str"], "")
+        pandas.testing.assert_frame_equal(found.fillna(texts), wanted[found.columns].fillna(texts), check_dtype=False)
+    table = parquet.read_table(tmp_path / "d.parquet").to_pandas()
+    wanted = recording.to_frame().reset_index()[table.columns]
+    for column in table:
+        assert table[column].fillna(-1).tolist() == wanted[column].fillna(-1).tolist()
+
+
+def test_without_the_frames_extra_the_remedy_is_named(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = read_recording(recording)
+    for name, call in (("pandas", source.to_frame), ("xarray", source.to_xarray)):
+        monkeypatch.setitem(sys.modules, name, None)
+        with pytest.raises(UsageError, match=name) as error:
+            call()
+        assert error.value.remedy == "pip install 'pans-runtime[frames]'"
 
 
 def test_the_clicks_are_in_order_and_within_the_plan(run_of: Path) -> None:
