@@ -1,19 +1,24 @@
-"""The run's figures for Prometheus: a small HTTP server that answers with the same picture as the state file.
+"""The run's figures for Prometheus: the picture of the state file in base units, served by prometheus_client.
 
 On this machine only, unless it is said twice that others may read: there is no password. Needs the extra `metrics`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from io import StringIO
+from ipaddress import ip_address
 from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler
 
+from pans.runtime.cli.finding import missing_extra
 from pans.runtime.errors import UsageError
 
-from .http import PageServer, is_loopback
-
 LOOPBACK = "127.0.0.1"
-# picture key -> (metric, counts up, help)
+REQUEST_S = 2.0  # without a byte from a client
+# picture key -> (metric, counts up, help); keys in us become seconds
 FIGURES = {
     "decisions": ("pans_decisions", True, "Decisions made"),
     "late": ("pans_late_decisions", True, "Decisions later than the deadline"),
@@ -23,25 +28,21 @@ FIGURES = {
     "reconnects": ("pans_reconnects", True, "Times the device was lost and found again"),
     "dark_exposures": ("pans_dark_exposures", True, "Exposures without light"),
     "dark_clicks": ("pans_dark_clicks", True, "Clicks in exposures without light"),
-    "latency_p99_us": ("pans_latency_p99_microseconds", False, "Exposure end to decision, 99 % quantile of the run"),
-    "latency_max_us": ("pans_latency_max_microseconds", False, "Exposure end to decision, longest of the run"),
-    "exposure_start_us": (
-        "pans_exposure_start_error_microseconds",
-        False,
-        "Farthest start of an exposure off its tick",
-    ),
-    "exposure_length_us": (
-        "pans_exposure_length_error_microseconds",
-        False,
-        "Farthest length of an exposure off the plan",
-    ),
+    "latency_p99_us": ("pans_latency_p99_seconds", False, "Exposure end to decision, 99 % quantile of the run"),
+    "latency_max_us": ("pans_latency_max_seconds", False, "Exposure end to decision, longest of the run"),
+    "exposure_start_us": ("pans_exposure_start_error_seconds", False, "Farthest start of an exposure off its tick"),
+    "exposure_length_us": ("pans_exposure_length_error_seconds", False, "Farthest length of an exposure off the plan"),
     "rss_bytes": ("pans_resident_memory_bytes", False, "Resident memory"),
     "handles": ("pans_open_handles", False, "Open file handles"),
     "threads": ("pans_threads", False, "Threads"),
     "loop_age_s": ("pans_loop_age_seconds", False, "Since the loop turned last"),
     "uptime_s": ("pans_uptime_seconds", False, "Since the start of the command"),
     "disk_free_bytes": ("pans_disk_free_bytes", False, "Free bytes on the disk of the recording"),
-    "disk_left_s": ("pans_disk_seconds_left", False, "Until that disk is full at the rate of the last ten minutes"),
+    "disk_left_s": (
+        "pans_disk_left_seconds",
+        False,
+        "Until that disk is full at the rate of the last ten minutes; +Inf while that is not known or the disk does not fill up",
+    ),
     "recording_bytes": ("pans_recording_bytes", False, "Size of the recording, or of its open part"),
     "host_clock_steps": ("pans_host_clock_steps", True, "Times the computer's clock was set during the run"),
     "host_clock_synchronised": ("pans_host_clock_synchronised", False, "Whether the computer's clock is synchronised"),
@@ -73,6 +74,14 @@ def check_address(text: str, *, public: bool, option: str = "--metrics") -> str:
     return text
 
 
+def is_loopback(host: str) -> bool:
+    """Whether `host`, a name or an address, is this machine itself."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 def is_public(text: str) -> bool:
     """Whether other machines can reach this address."""
     return not is_loopback(parse_address(text)[0])
@@ -89,9 +98,12 @@ class Collector:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         picture = self._look()
+        if "disk_free_bytes" in picture:  # a recording is written: an alert needs the figure to be there at all times
+            picture = {"disk_left_s": math.inf} | picture
         for key, (name, counts, words) in FIGURES.items():
             if key in picture:
-                yield (CounterMetricFamily if counts else GaugeMetricFamily)(name, words, value=picture[key])
+                value = picture[key] * (1e-6 if key.endswith("_us") else 1)
+                yield (CounterMetricFamily if counts else GaugeMetricFamily)(name, words, value=value)
         for key, (name, words) in CAUSES.items():
             family = CounterMetricFamily(name, words, labels=["cause"])
             for cause, count in picture.get(key, {}).items():
@@ -102,31 +114,58 @@ class Collector:
         yield running
 
 
+class _Handler(WSGIRequestHandler):
+    timeout = REQUEST_S
+
+    def handle(self) -> None:
+        with suppress(OSError):  # a client that goes away, or says nothing
+            super().handle()
+
+    def get_stderr(self) -> StringIO:
+        """Figures that change while they are read are answered by 500; the next scrape has them, and the live view stays whole."""
+        return StringIO()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Requests are not logged."""
+
+
 class MetricsServer:
-    """Serves the figures until `close`; `port` is the one that was given, or found for port 0."""
+    """Serves the figures until `close`; `port` is the one that was given, or found for port 0.
+
+    On a loopback address, requests that name another host are refused: a web page elsewhere could have made its own name point here (DNS
+    rebinding).
+    """
 
     def __init__(self, address: str, look: Callable[[], dict[str, Any]] = dict) -> None:
         self.look = look  # a run that is there later than its server gives its own
-        host, port = parse_address(address)
+        self.host, port = parse_address(address)
         try:
-            from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+            from prometheus_client import CollectorRegistry, make_wsgi_app, start_http_server
         except ImportError as error:
-            raise UsageError(
-                "--metrics needs prometheus-client, which is not installed",
-                remedy="pip install 'pans-runtime[metrics]'",
-            ) from error
+            raise missing_extra("--metrics", "prometheus-client", "metrics") from error
         registry = CollectorRegistry(auto_describe=False)
-        registry.register(Collector(lambda: self.look()))
         try:
-            self._server = PageServer(
-                host, port, lambda: generate_latest(registry), {"Content-Type": CONTENT_TYPE_LATEST}
-            )
+            self._server, self._thread = start_http_server(port, self.host, registry)
         except OSError as error:
             raise UsageError(
                 f"--metrics {address}: cannot listen there: {error.strerror or error}", remedy="choose another port"
             ) from error
-        self.host, self.port = host, self._server.port
+        self.port = self._server.server_port
+        self._server.RequestHandlerClass = _Handler
+        self._app = make_wsgi_app(registry)
+        self._server.set_app(self._answer)
+        registry.register(Collector(lambda: self.look()))  # from here on there is something to read
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.close()
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+    def _answer(self, environ: dict[str, Any], start_response: Any) -> Iterable[bytes]:
+        host = environ.get("HTTP_HOST", LOOPBACK).strip()  # every browser sends it
+        name = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
+        if is_loopback(self.host) and not is_loopback(name):
+            start_response("403 Forbidden", [])
+            return [b""]
+        return self._app(environ, start_response)
