@@ -60,9 +60,16 @@ def test_the_dashboard_is_one_that_grafana_reads_and_labels_exist() -> None:
         assert panel["targets"], panel["title"]
         for target in panel["targets"]:
             assert 'instance=~"$instance"' in target["expr"]
-            assert target["expr"].count("(") == target["expr"].count(")")
     assert set(LABELS.findall(RULES.read_text())) <= {"instance"}
     assert set(LABELS.findall(DASHBOARD.read_text())) <= {"instance", "cause"}
+
+
+def test_prometheus_reads_every_expression_of_the_dashboard(tmp_path: Path) -> None:
+    targets = [one["expr"] for panel in json.loads(DASHBOARD.read_text())["panels"] for one in panel["targets"]]
+    plain = [one.replace("$instance", ".+").replace("$__rate_interval", "1m") for one in targets]
+    rules = [{"record": f"panel:{place}", "expr": expression} for place, expression in enumerate(plain)]
+    (tmp_path / "rules.yml").write_text(json.dumps({"groups": [{"name": "dashboard", "rules": rules}]}))
+    assert f"SUCCESS: {len(rules)} rules found" in promtool("check", "rules", str(tmp_path / "rules.yml"))
 
 
 def test_promtool_accepts_the_rules() -> None:
