@@ -350,8 +350,9 @@ def _analysed(path: Path, *, user: bool) -> dict[str, Any]:
     if program is None:
         return _finding("systemd-analyze", True, "not installed: the unit's directives were not checked", "")
     words = [program, *(["--user"] if user else []), "--man=no", "verify", str(path)]
+    env = {"XDG_RUNTIME_DIR": str(path.parent.resolve()), **os.environ}  # over ssh or as root a session may have none
     try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=ANALYZE_S)
+        done = subprocess.run(words, capture_output=True, text=True, timeout=ANALYZE_S, env=env)
     except (OSError, subprocess.TimeoutExpired) as error:
         return _finding("systemd-analyze", False, f"could not be asked: {error}", f"run it by hand: {' '.join(words)}")
     said = [line for line in done.stderr.splitlines() if path.name in line or done.returncode]

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import socket
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,19 @@ def test_a_unit_is_installed_verified_and_removed(lab: Path, pans: Pans) -> None
     assert service(pans, "verify", "--name", "lab")["findings"][-1]["ok"]
     assert service(pans, "remove", "--name", "lab")["removed"] == str(unit)
     assert not unit.exists()
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd-analyze")
+@pytest.mark.parametrize("whose", [("--run-as", "root"), ("--user",)])
+def test_systemd_has_no_word_to_say_on_a_unit(
+    whose: tuple[str, ...], lab: Path, pans: Pans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    unit = service(pans, "install", "--config", "lab.toml", *whose)["unit"]
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    words = ["systemd-analyze", *({"--user"} & {*whose}), "--man=no", "verify", unit]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
 def test_folders_that_the_run_writes_to_are_writable(lab: Path, pans: Pans) -> None:
