@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime import __version__
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.onnx_model import protobuf
 from pans.runtime.container import read_file
@@ -20,7 +21,7 @@ from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.grey_png import levels_png, read_grey_png
 
 PICTURES_MAX = 65_535
-METADATA = 14  # ModelProto.metadata_props (onnx.proto)
+DOC_STRING, METADATA = 6, 14  # fields of ModelProto (onnx.proto)
 
 
 # ---- out ----
@@ -65,15 +66,34 @@ def about(bundle: Bundle) -> dict[str, Any]:
 
 
 def head_with_facts(bundle: Bundle) -> bytes:
-    """Return the head as an ONNX file whose metadata hold `about`; UsageError for a bundle without one."""
+    """Return the head as an ONNX file that says what it is, takes and gives; UsageError for a bundle without one."""
     if bundle.head_onnx is None:
         kind = "an automaton" if bundle.automaton is not None else "a table"
         raise UsageError(f"{bundle.name} decides by {kind}, and has no ONNX head", remedy="use --format npy")
     if b"pans.about" in bundle.head_onnx:
         return bundle.head_onnx
-    # fields of a serialised message come in any order: one more may follow the rest
-    facts = protobuf((1, "pans.about"), (2, json.dumps(about(bundle), sort_keys=True)))
-    return bundle.head_onnx + protobuf((METADATA, facts))
+    means = f"photons per exposure, 0 to {bundle.largest}" if bundle.largest > 1 else "clicks per exposure, 0 to 1"
+    picture = bundle.picture_shape
+    said = {
+        "name": bundle.name,
+        "task": bundle.task,
+        "classes": json.dumps(bundle.classes),
+        "input": f"float32 (decisions, {bundle.n_features}): mean {means}, of each pattern in the bundle's order",
+        "output": f"float32 (decisions, {bundle.n_outputs}): "
+        + (
+            "scores of the classes; their softmax is the posterior"
+            if picture is None
+            else f"pixels of {picture}, by rows"
+        ),
+        "data_licence": str(bundle.provenance.get("data_licence", "")),
+        "data_sha256": str(bundle.provenance.get("data_sha256", "")),
+        "pans_version": __version__,
+        "pans.about": json.dumps(about(bundle), sort_keys=True),
+    }
+    doc = f"Head of the pans bundle {bundle.name}. Input: {said['input']}. Output: {said['output']}."
+    facts = ((METADATA, protobuf((1, key), (2, value))) for key, value in said.items() if value)
+    # fields of a serialised message come in any order, and of a text the last one counts: more may follow the rest
+    return bundle.head_onnx + protobuf((DOC_STRING, doc), *facts)
 
 
 # ---- in ----

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime import __version__
 from pans.runtime.bundle import Automaton, BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.bundle.automaton import log_scores, walk_nodes
 from pans.runtime.bundle.layers import Layer, quantise_head, read_layers, reference_scores
@@ -189,7 +190,7 @@ def corrected_layers(layers: tuple[Layer, ...], correction: Correction) -> tuple
 
 
 def chain_onnx(layers: tuple[Layer, ...]) -> bytes:
-    """Return the layers as an ONNX model: `clicks` float32 (n, d_f) -> `scores` float32 (n, classes)."""
+    """Return the layers as an ONNX model: `clicks` float32 (decisions, d_f) -> `scores` float32 (decisions, classes)."""
     nodes, tensors, current = list[Field](), list[Field](), "clicks"
     for number, layer in enumerate(layers):
         is_last = number == len(layers) - 1
@@ -203,7 +204,9 @@ def chain_onnx(layers: tuple[Layer, ...]) -> bytes:
             tensors.append((5, protobuf(*dims, (2, FLOAT), (8, name), (9, values.astype("<f4").tobytes()))))
     ends: list[Field] = []
     for field, name, width in ((11, "clicks", layers[0].weights.shape[0]), (12, "scores", layers[-1].weights.shape[1])):
-        shape = protobuf((1, protobuf((2, "n"))), (1, protobuf((1, width))))
+        shape = protobuf((1, protobuf((2, "decisions"))), (1, protobuf((1, width))))
         ends.append((field, protobuf((1, name), (2, protobuf((1, protobuf((1, FLOAT), (2, shape))))))))
     graph = protobuf(*nodes, (2, "head"), *tensors, *ends)
-    return protobuf((1, IR_VERSION), (2, "pans-runtime"), (7, graph), (8, protobuf((1, ""), (2, OPSET))))
+    return protobuf(
+        (1, IR_VERSION), (2, "pans-runtime"), (3, __version__), (7, graph), (8, protobuf((1, ""), (2, OPSET)))
+    )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 from torch import Tensor
 
+from pans.runtime import __version__
 from pans.runtime.bundle.layers import STEP_MAX, Int8Head
 from pans.trainer.model.heads import CHANNELS, EPSILON, ConvHead, DecoderHead, DeepHead, Heads, MlpHead, PictureHead
 
@@ -66,11 +67,16 @@ def model_bytes(
 ) -> bytes:
     """Return a checked model of these nodes, serialised."""
     initializers = [numpy_helper.from_array(value, key) for key, value in constants.items()]
-    source = helper.make_tensor_value_info("clicks", TensorProto.FLOAT, ["n", n_inputs])
-    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, ["n", n_outputs])
+    means, told = (
+        "mean clicks (photons of a detector that counts) per exposure of each pattern",
+        "class scores or pixels",
+    )
+    source = helper.make_tensor_value_info("clicks", TensorProto.FLOAT, ["decisions", n_inputs], means)
+    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, ["decisions", n_outputs], told)
     graph = helper.make_graph(nodes, name, [source], [result], initializers)
     opset = helper.make_opsetid("", OPSET)
-    model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="pans-runtime")
+    producer = {"producer_name": "pans-runtime", "producer_version": __version__}
+    model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, **producer)
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
 

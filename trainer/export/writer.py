@@ -31,6 +31,7 @@ from pans.trainer.evaluate.optics import OverOptics, drawn_tables, over_optics
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.heads import Decoders, Heads
 from pans.trainer.options import Conditions
+from pans.trainer.tasks.public_sets import PUBLIC_SETS
 from pans.trainer.tasks.registry import Task
 from pans.trainer.train.data import encoder_input, full_scale_photoelectrons
 from pans.trainer.train.loop import Trained
@@ -149,7 +150,9 @@ def export(
 
 def origin(task: Task, profile: Profile) -> dict[str, Any]:
     """Return what a bundle says of the data and the instrument that it was trained with."""
+    public = PUBLIC_SETS.get(task.name)
     return {
+        **({} if public is None else {"data_licence": public.licence}),
         "data_sha256": task.sha256,
         "data_split": task.split,
         "task_light": task.light,

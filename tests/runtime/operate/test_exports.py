@@ -16,6 +16,7 @@ from heads import onnx_chain, random_layers
 
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle, write_bundle
+from pans.runtime.bundle.onnx_check import check_head
 from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL
 from pans.runtime.errors import DamagedFileError, UsageError
@@ -114,10 +115,14 @@ def test_the_exported_head_is_an_onnx_model_that_says_what_it_is(tmp_path: Path,
     path = tmp_path / "head.onnx"
     pans("export", FASHION, "--format", "onnx", "-o", path)
     model = onnx.load(path)
-    onnx.checker.check_model(model)
-    facts = json.loads({entry.key: entry.value for entry in model.metadata_props}["pans.about"])
+    onnx.checker.check_model(model, full_check=True)
+    said = {entry.key: entry.value for entry in model.metadata_props}
     bundle = load_bundle(FASHION)[0]
-    assert facts["classes"] == list(bundle.classes)
+    assert (said["name"], json.loads(said["classes"])) == (bundle.name, list(bundle.classes))
+    assert json.loads(said["pans.about"])["photons_per_level"] == bundle.photons_per_level
+    assert "mean clicks per exposure, 0 to 1" in model.doc_string
+    assert model.producer_name == "pans-runtime"
+    check_head(path.read_bytes(), 10, 10)  # a bundle of the exported head loads
     session = onnxruntime.InferenceSession(path)
     scores = session.run(None, {session.get_inputs()[0].name: bundle.golden_means})[0]
     assert np.allclose(scores, bundle.golden_scores, atol=1e-5)
