@@ -6,7 +6,7 @@ beginning is known to about two seconds.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from typing import Any, NamedTuple
 
@@ -96,11 +96,13 @@ def facts_of(recording: Recording) -> dict[str, Any]:
     }
 
 
-def iter_decisions(recording: Recording, plan: Plan) -> Iterator[Table]:
-    """Yield the decisions, columns of DECISIONS, block by block."""
+def iter_decisions(
+    recording: Recording, plan: Plan, blocks: Iterable[NDArray[np.void]] | None = None
+) -> Iterator[Table]:
+    """Yield the decisions, columns of DECISIONS, block by block; `blocks` are DECISION_DTYPE (n,), by default those of the file."""
     names = np.array([*(recording.bundle().classes if recording.bundle_place else ()), ""], object)
     zero, us = first_tick(recording, plan), tick_us(recording)
-    for rows in recording.iter_decisions():
+    for rows in recording.iter_decisions() if blocks is None else blocks:
         label = rows["label"].astype(np.int32)
         undecided, nameless = rows["label"] == NO_LABEL, label >= len(names) - 1
         flags, place = np.unique(rows["flags"], return_inverse=True)
@@ -159,12 +161,11 @@ def frame_of(recording: Recording, table: str) -> Any:
     columns, data, times = _timed(recording, table)
     found = {}
     for name, values in data.items():
-        mask, kind = np.ma.getmaskarray(values), columns[name].dtype
+        kind = columns[name].dtype
         if columns[name].missing and kind.startswith("int"):
-            found[name] = pandas.arrays.IntegerArray(np.ma.getdata(values), mask)
+            found[name] = pandas.arrays.IntegerArray(np.ma.getdata(values), np.ma.getmaskarray(values))
         else:
-            found[name] = np.where(mask, None if kind == "str" else np.nan, np.ma.getdata(values))
-            found[name] = found[name].astype(object if kind == "str" else kind)
+            found[name] = np.ma.filled(values, np.nan if kind.startswith("float") else None)
     frame = pandas.DataFrame(found, index=pandas.DatetimeIndex(times, tz="UTC", name="time"))
     frame.attrs = facts_of(recording)
     frame.attrs["units"] = {name: column.unit for name, column in columns.items() if column.unit}
@@ -210,14 +211,12 @@ def _timed(recording: Recording, table: str) -> tuple[Mapping[str, Column], Tabl
         return CLICKS, click_table(recording, plan, clicks), _times(recording, host + since)
     if table != "decisions":
         raise UsageError(f"table {table!r}: unknown", remedy="decisions or clicks")
-    blocks = list(iter_decisions(recording, plan)) or [_typed({name: np.zeros(0) for name in DECISIONS}, DECISIONS)]
-    found = {name: np.ma.concatenate([block[name] for block in blocks]) for name in DECISIONS}
-    # a cut file may lack the times of its last decisions
-    place = np.searchsorted(timings["index"], found["decision"])
-    known = place < len(timings)
-    rows = np.zeros(len(place), TIMING_DTYPE)
-    rows[known] = timings[place[known]]
-    missing = ~known | (rows["index"] != found["decision"])
+    (decided,) = iter_decisions(recording, plan, [recording.decisions()])
+    found = dict(decided)
+    # a cut file may lack the times of its last decisions: they get those of a row that no decision has
+    padded = np.append(timings, np.array([(2**64 - 1, 0, 0, 0, 0)], TIMING_DTYPE))
+    rows = padded[np.searchsorted(timings["index"], found["decision"])]
+    missing = rows["index"] != found["decision"]
     for name, values in timing_table(rows).items():
         if name != "decision":
             found[name] = np.ma.array(values, mask=missing)
