@@ -10,6 +10,7 @@ import os
 import re
 import secrets
 import stat
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
@@ -23,6 +24,16 @@ LATEST = "latest"
 NAME_CHARACTERS = 60
 FORCE_REMEDY = "choose another name, or replace it with --force"
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
+
+
+def user_cache() -> Path:
+    """Return the folder of what pans keeps for this user, by XDG_CACHE_HOME or the system's habit; it need not exist.
+
+    RuntimeError for a user without a home.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
+    habit = "Library/Caches" if sys.platform == "darwin" else ".cache"
+    return (Path(home) if home else Path.home() / habit) / "pans"
 
 
 def check_outputs(

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 from pans.runtime.cli import note, say
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import make_folder, replace_file
+from pans.runtime.outputs import make_folder, replace_file, user_cache
 
 if TYPE_CHECKING:
     import numpy as np
@@ -225,8 +225,7 @@ def _file() -> Path:
     """Where the answer for this machine, torch and environment is kept."""
     limits = [f"{name}={os.environ.get(name, '')}" for name in LIMITS[-1]]
     facts = "\n".join([version("torch"), platform.node(), platform.release(), _cpu(), *limits])
-    folder = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(folder) / "pans-runtime" / f"products-{hashlib.sha256(facts.encode()).hexdigest()[:16]}.json"
+    return user_cache() / f"products-{hashlib.sha256(facts.encode()).hexdigest()[:16]}.json"
 
 
 def _kept() -> Choice | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pans.firmware_sim.scene.marks import (
@@ -21,6 +20,7 @@ from pans.firmware_sim.scene.marks import (
     Stamp,
     no_marks,
 )
+from pans.runtime.wire.inner import njit
 from pans.runtime.wire.messages import BLOCK_HEADER_BYTES, NO_OBJECT
 from pans.runtime.wire.schema import HEADER, SCHEMA, MessageType
 from pans.runtime.wire.wire_kernels import crc32_span

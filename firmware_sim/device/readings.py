@@ -11,7 +11,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import States
@@ -19,6 +18,7 @@ from pans.firmware_sim.scene.detector import sample_clicks
 from pans.firmware_sim.scene.detector_kernels import GOLDEN_WORD, SHIFT_11, STEP_WORD, click_thresholds, mix
 from pans.firmware_sim.scene.detector_model import CLICK_STREAM, DetectorModel, first_click_probability, stream_key
 from pans.runtime.instrument.click_law import count_chances, counting
+from pans.runtime.wire.inner import njit
 from pans.runtime.wire.messages import DARK_PATTERN
 
 from .walking import Walked

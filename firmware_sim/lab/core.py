@@ -27,6 +27,7 @@ from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, MAX_SLOTS, MAX_UPLOAD_BYTES, Refused
 from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.outputs import user_cache
 from pans.runtime.wire.commands import PatternChunk
 from pans.runtime.wire.messages import MAX_PAYLOAD_BYTES, AckStatus
 
@@ -318,7 +319,7 @@ def build_library(folder: Path = FOLDER, cache: Path | None = None, flags: tuple
     digest = hashlib.sha256(" ".join((sys.platform, *flags)).encode())
     for path in sorted(folder.glob("*.[ch]")):
         digest.update(path.read_bytes())
-    cache = cache or _user_cache()
+    cache = cache or user_cache()
     cache.mkdir(mode=0o700, parents=True, exist_ok=True)
     target = cache / f"pans-core-{digest.hexdigest()[:20]}.{'so' if os.name == 'posix' else 'dll'}"
     if target.is_file():
@@ -333,8 +334,3 @@ def build_library(folder: Path = FOLDER, cache: Path | None = None, flags: tuple
             raise ConfigError(f"the C core did not compile: {done.stderr[:500]}", remedy=f"try {compiler[0]} by itself")
         library.replace(target)
     return target
-
-
-def _user_cache() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
-    return (Path(home) if home else Path.home() / ".cache") / "pans"

@@ -15,10 +15,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Exposures
+from pans.runtime.wire.inner import njit
 from pans.runtime.wire.messages import NO_OBJECT
 
 from .changes import Changes

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.wire.inner import njit
 
 from .detector_model import (
     CHANNEL_STEP,

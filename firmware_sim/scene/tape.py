@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Exposures
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.wire.inner import njit
 from pans.runtime.wire.messages import NO_OBJECT
 
 from .cells import MAX_HALF_EXPOSURES

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle, load_bundle
@@ -34,6 +33,7 @@ from pans.runtime.kernel.system import now_ns, offered, read_now, wait_for, writ
 from pans.runtime.link.base import Link, descriptor_of, open_link
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.wire.framing import FrameDecoder, unpack_body
+from pans.runtime.wire.inner import njit
 from pans.runtime.wire.messages import Ack, ClickBlock, Opcode, encode_ack, encode_clicks, encode_command
 from pans.runtime.wire.schema import SCHEMA
 

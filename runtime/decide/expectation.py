@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.detector import Afterpulses
 from pans.runtime.detector.afterpulses import LEAST_MEAN, SMALL_RATIO
 from pans.runtime.instrument.click_law import ClickLaw, CountLaw, both_chances, count_chances, log_no_click, outcomes_of
+from pans.runtime.wire.inner import njit
 
 NO_AFTERPULSES = Afterpulses(0.0)
 LEAF_NUMBERS_MAX = 1 << 27  # objects times leaves that are returned at once: 1 GiB

@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from pans.runtime.wire.inner import inner, outer
+from pans.runtime.wire.inner import inner, njit, outer
 
 STEP = 8  # rows of the first matrix taken at once
 _U = np.uint64  # unsigned indices: a signed one is tested for being negative, and then nothing is vectorised

@@ -275,8 +275,10 @@ def _spinning() -> Iterator[str]:
 def _spin() -> Any:
     """Return the compiled loop that waits until state[ENDED], int64, is not 0; state[SPINS] is 1 from the beginning on."""
     from llvmlite import ir  # numba, only where a core is kept awake
-    from numba import njit, types
+    from numba import types
     from numba.extending import intrinsic
+
+    from pans.runtime.wire.inner import njit
 
     @intrinsic
     def pause(typing_context: Any) -> Any:
@@ -292,7 +294,7 @@ def _spin() -> Any:
 
         return types.void(), generate
 
-    @njit(nogil=True)
+    @njit(cache=True, nogil=True)
     def spin(state):  # type: ignore[no-untyped-def]
         state[1] = 1
         while state[0] == 0:

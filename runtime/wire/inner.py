@@ -4,8 +4,9 @@ By itself numba optimises each kernel, makes machine code and two ways in from P
 kernel that calls it. An inner kernel is compiled only as far as its callers need it and stands in no cache: its callers' cache has it.
 It is inlined wherever it is called, since a call would hand over each number of some forty arrays.
 
-A kernel's cache counts for the files of all kernels as they are, since what a kernel calls is compiled into it. It is loaded without
-what numba needs to compile, and the collector is off while numba compiles.
+What is compiled is kept once per machine and user, for all environments with the same sources, numba and Python: in a folder that is
+named by what the sources hold, not by where they are or when they were written, since what a kernel calls is compiled into it. It is
+loaded without what numba needs to compile, and the collector is off while numba compiles. Kernels that allocate take `njit` from here.
 
 This replaces private parts of numba, for the sake of the start. CPU time of `pans demo --pace fast` (2 cores AMD EPYC, numba 0.68):
 with an empty cache 11.8 s, with ordinary kernels 24.5 s, with the collector on 13.7 s; from the cache 1.2 s, with numba's own loading
@@ -14,29 +15,46 @@ with an empty cache 11.8 s, with ordinary kernels 24.5 s, with the collector on 
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import gc
 import hashlib
+import os
+import re
+import shutil
+import stat
+import tempfile
+import time
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import llvmlite
 import numba
-from numba import njit, types
+from numba import njit as njit
+from numba import types
 from numba.core import caching, event
 from numba.core.runtime import rtsys
 
+from pans.runtime import __version__
+from pans.runtime.cli.printing import warn
+from pans.runtime.outputs import user_cache
+
 TRIED = ((0, 68),)  # versions of numba
-# packages of runtime whose files hold kernels, or constants that are compiled into them
+# Packages whose files hold kernels, or constants that are compiled into them: of runtime for all kernels, of the others for their own.
 SOURCES = ("core", "decide", "flow", "instrument", "kernel", "record", "timing", "wire")
+OTHERS = {"runtime": ("bench",), "firmware_sim": ("device", "scene"), "trainer": ("adaptive", "baselines")}
+KEPT, KEPT_AT_LEAST_S = 4, 3600.0  # folders of other sources that stay; those in use always
+FOLDER = re.compile(r"pans-kernels-[\w.+]+-[0-9a-f]{16}")
 
 
 def outer(function: Any) -> Any:
     """Return `function` as a kernel for Python and for other kernels to call; it must not allocate."""
     if numba.version_info.short not in TRIED:
         return njit(cache=True, nogil=True)(function)
-    return _for_these_sources(njit(cache=True, nogil=True, _nrt=False, no_cfunc_wrapper=True)(function))
+    return njit(cache=True, nogil=True, _nrt=False, no_cfunc_wrapper=True)(function)
 
 
 def inner(function: Any) -> Any:
@@ -97,30 +115,88 @@ def _compiler() -> Any:
     return Compiler
 
 
-def _for_these_sources(kernel: Any) -> Any:
-    """Return `kernel`, whose cache holds what was compiled from these files; without compilation it is a function of Python."""
-    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-    if file is not None:
-        load_index = file._load_index
+class _Place(caching.UserProvidedCacheLocator):  # type: ignore[misc]
+    """Where numba keeps what it compiles of pans, and what that depends on."""
 
-        def load_index_again() -> Any:
-            """Load the index, which an earlier release may have written with classes that are gone."""
-            try:
-                return load_index()
-            except (AttributeError, ImportError):
-                return {}
+    def __init__(self, function: Any, file: str) -> None:
+        self._py_file, self._lineno = file, function.__code__.co_firstlineno
+        self._module, self._cache_path = function.__module__, str(kernel_folder())
 
-        file._source_stamp = (file._source_stamp, digest_of(Path(__file__).parents[1]))
-        file._load_index = load_index_again
-    return kernel
+    def ensure_cache_path(self) -> None:
+        """Make the folder again if it was removed meanwhile."""
+        os.makedirs(self._cache_path, mode=0o700, exist_ok=True)
+
+    def get_source_stamp(self) -> str:
+        """Return the digest of the other sources that this kernel may depend on."""
+        package = self._module.split(".")[1]
+        return digest_of(Path(__file__).parents[2] / package, OTHERS[package])
+
+    def get_disambiguator(self) -> str:
+        """Return what tells kernels of one name apart."""
+        return f"{self._module}-{self._lineno}"
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> _Place | None:
+        """Return the place for a function of pans, None for others."""
+        first, package, *_ = [*function.__module__.split("."), ""]
+        return cls(function, file) if first == "pans" and package in OTHERS else None
+
+
+caching.CacheImpl._locator_classes.insert(0, _Place)
 
 
 @cache
-def digest_of(runtime: Path) -> str:
-    """Return a digest of the names, sizes and times of all files of SOURCES in the folder `runtime`."""
-    files = [path for package in SOURCES for path in sorted((runtime / package).glob("*.py"))]
-    facts = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-    return hashlib.sha256(repr(facts).encode()).hexdigest()
+def kernel_folder() -> Path:
+    """Return the folder of what is compiled of these sources: in NUMBA_CACHE_DIR or the user's cache; else one for this process alone.
+
+    What lies there is run: a folder that another user owns or can write to is not used.
+    """
+    facts = (numba.__version__, llvmlite.__version__, digest_of(Path(__file__).parents[1], SOURCES))
+    name = f"pans-kernels-{__version__}-{hashlib.sha256(repr(facts).encode()).hexdigest()[:16]}"
+    try:
+        parent = Path(numba.config.CACHE_DIR or user_cache())
+        return own_folder(parent / name)
+    except (OSError, RuntimeError) as error:  # RuntimeError: a user without a home
+        warn(f"kernels are compiled at each start, for some ten seconds: {error}; NUMBA_CACHE_DIR names another folder")
+    folder = tempfile.mkdtemp(prefix="pans-kernels-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def own_folder(folder: Path) -> Path:
+    """Return `folder`, made if need be, marked as used and tried; PermissionError where others could have put something there."""
+    is_new = not folder.exists()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = folder.lstat()
+    if os.name == "posix" and (
+        not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    ):
+        raise PermissionError(f"{folder} is another user's, or others can write to it")
+    os.utime(folder)
+    if is_new:
+        _prune(folder)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} cannot be written to")
+    return folder
+
+
+def _prune(folder: Path) -> None:
+    """Remove the folders of other sources beside `folder`, but for those used last."""
+    others = [path for path in folder.parent.iterdir() if FOLDER.fullmatch(path.name) and path != folder]
+    used_s = {path: path.lstat().st_mtime for path in others}
+    for path in sorted(others, key=used_s.__getitem__)[:-KEPT]:
+        if time.time() - used_s[path] > KEPT_AT_LEAST_S:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+@cache
+def digest_of(top: Path, packages: tuple[str, ...]) -> str:
+    """Return a digest of the names and contents of all files of `packages` in the folder `top`."""
+    digest = hashlib.sha256()
+    for path in (path for package in packages for path in sorted((top / package).glob("*.py"))):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(top).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
 
 
 class _Uncollected(event.Listener):  # type: ignore[misc]
@@ -148,8 +224,16 @@ def _load_overload(cache: Any, signature: Any, context: Any) -> Any:
     """Return what numba's `cache` holds for `signature`, None where it holds nothing: as Cache.load_overload, all else left out."""
     rtsys.initialize(context)  # what compiled code may call
     with cache._guard_against_spurious_io_errors():
-        return cache._load_overload(signature, context)
+        found = cache._load_overload(signature, context)
+    # two processes that compiled at the same time may have given one name to two files
+    return found if found is not None and tuple(found.signature.args) == tuple(signature) else None
+
+
+def _save_overload(cache: Any, signature: Any, data: Any) -> None:
+    """Keep what was compiled, where that can be done: a full disk costs the next start its time, not this run."""
+    with suppress(OSError):
+        cache._save_overload(signature, data)
 
 
 if numba.version_info.short in TRIED:
-    caching.Cache.load_overload = _load_overload
+    caching.Cache.load_overload, caching.Cache.save_overload = _load_overload, _save_overload

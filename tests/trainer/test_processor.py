@@ -74,7 +74,7 @@ def test_refused_products_and_convolutions_are_found_out_once(tmp_path, how):
     assert first.stdout.strip() == answer
     assert "once per machine" in first.stderr
     # by the environment before and after the choice
-    kept, inherited = (tmp_path / "cache" / "pans-runtime").iterdir()
+    kept, inherited = (tmp_path / "cache" / "pans").glob("products-*")
     told = json.loads(kept.read_text())
     reasons = {reason for tried in told["trials"] for reason in tried["failed"].values()}
     assert reasons == {"SIGILL" if how == "die" else "RuntimeError: could not create a primitive"}

@@ -13,10 +13,10 @@ from functools import reduce
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pans.runtime.wire.inner import njit
 from pans.trainer.options import AutomatonOptions
 
 from .machine import COUNT_FLOOR, Aim, Grey, Level, Machine, Sight, Spent, brought, children

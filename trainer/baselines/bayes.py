@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pans.runtime.wire.inner import njit
 
 from .common import F32, F64, I64, Decide, Measurement, Report, blocks, detect, silent
 
@@ -84,7 +85,7 @@ def products(readouts: F32, weights: F32) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _add_present(ends: I64, places: I64, values: F32, columns: F32, out: F32) -> None:
     """Add values[k] * columns[places[k]] to row i of `out` for all k from ends[i - 1] to ends[i]."""
     k = 0

@@ -15,9 +15,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from pans.runtime.wire.inner import njit
 
 from .bayes import FLOORS
 from .common import F32, F64, I64, Light, Measurement, Report, Trials, blocks, silent
@@ -146,7 +147,7 @@ def of_posterior(measurement: Measurement, floor: float, known: int) -> Source:
     return follow
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _hear(log_joint: F32, log_rates: F32, totals: F32, pixels: NDArray[np.int32], wait: np.float32) -> None:
     """Add `pixels` hit during `wait` to `log_joint`, (objects,)."""
     for j in range(len(log_joint)):

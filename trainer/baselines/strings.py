@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 
+from pans.runtime.wire.inner import njit
 from pans.trainer.evaluate.information import entropy_bits, mutual_information_bits
 from pans.trainer.evaluate.readings import outcome_probabilities
 from pans.trainer.tasks.barcode import N_BARS, all_strings, weights
