@@ -64,7 +64,7 @@ def _run(args: argparse.Namespace) -> int:
         say(f"{profile.name} by {args.projector} and {args.counter}; Ctrl-C ends it")
         gc.freeze()  # what was made so far is never collected
         try:
-            serve(core, hardware.clock, port, lambda: False, args.core)
+            serve(core, hardware.clock, port, lambda: False, args.core, realtime=not simulated)
         finally:
             with contextlib.suppress(Exception):
                 hardware.dark()

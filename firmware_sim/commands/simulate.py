@@ -48,7 +48,7 @@ def _run(args: argparse.Namespace) -> int:
         _announce(args, port.url)
         gc.freeze()  # what was made so far is never collected: hardware has no pauses
         gc.enable()
-        serve(instrument, clock, port, orphaned.is_set, args.core)
+        serve(instrument, clock, port, orphaned.is_set, args.core, args.realtime)
     finally:
         port.close()
     return 0

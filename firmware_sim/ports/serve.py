@@ -70,6 +70,7 @@ class SimOptions:
         metavar="D0[:mixed]",
     )
     changes: str = option("", "like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)")
+    realtime: bool = option(False, "ask for real-time priority, above that of a run: most of a core is then its own")
     exposure_late_us: float = option(0.0, "a fault: exposures begin so much later than planned")
     exposure_short_us: float = option(0.0, "a fault: exposures are so much shorter than planned")
 
@@ -259,9 +260,9 @@ def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
 
 def _value(url: str, key: str, text: str, kind: str) -> Any:
     try:
-        return {"int": int, "float": float, "str": str}[kind](text)
-    except ValueError:
-        noun = "a whole number" if kind == "int" else "a number"
+        return {"int": int, "float": float, "str": str, "bool": {"0": False, "1": True}.__getitem__}[kind](text)
+    except (ValueError, KeyError):
+        noun = {"int": "a whole number", "bool": "0 or 1"}.get(kind, "a number")
         raise UsageError(f"{url!r}: {key} must be {noun}, found {text!r}") from None
 
 

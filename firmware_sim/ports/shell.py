@@ -10,13 +10,13 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Protocol
 
 from pans.firmware_sim.device.clock import SteppedDevice
 from pans.runtime.errors import LinkError, UsageError
-from pans.runtime.timing.realtime import busy_core
+from pans.runtime.timing.realtime import busy_core, scheduled
 
 READ_BYTES = 1 << 16
 MAX_BACKLOG_BYTES = 1 << 20
@@ -162,27 +162,19 @@ class TcpPort:
             self._client = None
 
 
-@contextmanager
-def prompt_thread() -> Iterator[None]:
-    """SCHED_FIFO for the calling thread where it is granted, since the instrument stands in for hardware that is never late itself."""
-    if not hasattr(os, "sched_setscheduler"):
-        yield
-        return
-    policy, before = os.sched_getscheduler(0), os.sched_getparam(0)
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
-    try:
-        yield
-    finally:
-        with suppress(OSError):
-            os.sched_setscheduler(0, policy, before)
-
-
 def serve(
-    device: SteppedDevice, clock: Clock, port: Port, stopped: Callable[[], bool], core: int | None = None
+    device: SteppedDevice,
+    clock: Clock,
+    port: Port,
+    stopped: Callable[[], bool],
+    core: int | None = None,
+    realtime: bool = False,
 ) -> None:
-    """Step `device` in real time and carry its bytes over `port` until `stopped()`; on `core`, kept awake, if one is given."""
-    with prompt_thread(), busy_core(core):
+    """Step `device` in real time and carry its bytes over `port` until `stopped()`; on `core`, kept awake, if one is given.
+
+    With `realtime` the thread asks for SCHED_FIFO. A simulator computes its clicks: so it may take most of a core from all others.
+    """
+    with scheduled("SCHED_FIFO", FIFO_PRIORITY) if realtime else nullcontext(), busy_core(core):
         _serve(device, clock, port, stopped)
 
 

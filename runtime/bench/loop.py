@@ -60,8 +60,10 @@ def _row(bundle: Bundle, slot_us: float, realtime: bool, drive: str, options: Be
         profile = slot_profile(bundle, slot_us, path)
         plan = build_plan(profile, bundle, drive=drive)
         core = Core(plan, make_decider(bundle), 1, 0)
-        link = open_link(f"sim:{path}?scene=fashion200&seed=1&pace=real")
-        config = RunOptions(seconds=options.seconds, deadline_us=DEADLINE_US, lease_ms=1000, realtime=realtime)
+        link = open_link(f"sim:{path}?scene=fashion200&seed=1&pace=real&realtime={realtime:d}")
+        config = RunOptions(
+            seconds=options.seconds, deadline_us=DEADLINE_US, lease_ms=1000, realtime_simulated=realtime
+        )
         started, load_before, steal_before = time.process_time(), os.getloadavg()[0], steal_ms()
         with Recorder(Path(folder) / "loop.pansrec", {"simulated": True}) as recorder:
             # starved for a whole lease, the host finds its instrument dark

@@ -104,7 +104,7 @@ def refuse_without(options: object, needed: str, defaults: Mapping[str, Any]) ->
 
 
 def words_of(options: object) -> list[str]:
-    """Return the words of a command line that gives these options; those of their default are left out.
+    """Return the words of a command line that gives these options, none of which is True by default; those of their default are left out.
 
     >>> from dataclasses import make_dataclass
     >>> Light = make_dataclass("Light", [("level", int, option(3, "how bright")), ("colour", str, option("red", "of it"))])
@@ -112,7 +112,7 @@ def words_of(options: object) -> list[str]:
     ['--colour=blue']
     """
     values = ((one, flag, getattr(options, one.name)) for one, flag in option_fields(options))
-    return [f"{flag}={value}" for one, flag, value in values if value != one.default]
+    return [flag if value is True else f"{flag}={value}" for one, flag, value in values if value != one.default]
 
 
 def option_fields(options: Any) -> Iterator[tuple[Field[Any], str]]:

@@ -139,10 +139,13 @@ def receiver_of(run: LiveRun, core: Follower, *, prompt: bool) -> Receiver:
 @contextmanager
 def _granted(run: LiveRun) -> Iterator[None]:
     """What the machine grants to a run at real pace, as long as it lasts; `run.realtime` says what that is."""
-    link, reader = run.connection.link, run.connection.reader.thread_id
+    link, reader, config = run.connection.link, run.connection.reader.thread_id, run.config
+    welcome = run.connection.session.welcome
+    simulated = link.simulated or bool(welcome and welcome.facts.get("simulated"))
+    wanted = config.realtime and not link.virtual and (config.realtime_simulated or not simulated)
     with (
-        busy_core(None if link.virtual else run.config.core) as awake,
-        arm_realtime(run.config.realtime and not link.virtual, [] if reader is None else [reader]) as granted,
+        busy_core(None if link.virtual else config.core) as awake,
+        arm_realtime(wanted, [] if reader is None else [reader]) as granted,
     ):
         run.realtime = granted | awake | {"turn": "; ".join(filter(None, ("compiled", why_fed(link))))}
         yield

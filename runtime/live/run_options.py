@@ -55,6 +55,9 @@ class RunOptions:
     dark_slots: int = option(1, "dark displays per cycle (default 1)", range=Range(0, 65534, whole=True))
     backend: str = option("auto", "decision back end", choices=backend_names)
     realtime: bool = option(True, "do not ask for SCHED_FIFO and locked memory", flag="--no-realtime")
+    realtime_simulated: bool = option(
+        False, "ask for SCHED_FIFO and locked memory with a simulated device too", flag="--realtime"
+    )
     core: int | None = option(None, "pin to core N and busy-wait; uses 100 %% of that core", type=int, metavar="N")
     out: Path | None = option(
         None, f"folder for the recording and the summary (default: a new one in {RUNS})", type=Path, metavar="DIR"
