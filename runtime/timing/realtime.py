@@ -8,13 +8,11 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-import platform
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -255,7 +253,9 @@ def _spinning() -> Iterator[str]:
     It gets its priority only while it spins and loses it before it ends: a thread of idle priority that holds the interpreter's lock on a
     core that others want would stop this process for seconds.
     """
-    spin, state = _spin(), np.array([1, 0])
+    from pans.runtime.wire.bare import spin  # numba, only where a core is kept awake
+
+    state = np.array([1, 0])
     spin(state)  # compiled before it is waited for
     state[:] = 0
     thread = threading.Thread(target=spin, args=(state,), name="pans-awake", daemon=True)
@@ -269,38 +269,6 @@ def _spinning() -> Iterator[str]:
             answer = held.enter_context(scheduled("SCHED_IDLE", 0, [thread.native_id or 0]))
         state[ENDED] = answer != GRANTED
         yield answer
-
-
-@cache
-def _spin() -> Any:
-    """Return the compiled loop that waits until state[ENDED], int64, is not 0; state[SPINS] is 1 from the beginning on."""
-    from llvmlite import ir  # numba, only where a core is kept awake
-    from numba import types
-    from numba.extending import intrinsic
-
-    from pans.runtime.wire.inner import njit
-
-    @intrinsic
-    def pause(typing_context: Any) -> Any:
-        """The processor's hint that a loop waits; memory counts as changed, so that the loop looks at it again."""
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            if platform.machine() in ("x86_64", "AMD64"):
-                kind = ir.FunctionType(ir.VoidType(), [])
-                builder.call(builder.module.declare_intrinsic("llvm.x86.sse2.pause", (), kind), [])
-            else:
-                builder.fence("seq_cst")
-            return context.get_dummy_value()
-
-        return types.void(), generate
-
-    @njit(cache=True, nogil=True)
-    def spin(state):  # type: ignore[no-untyped-def]
-        state[1] = 1
-        while state[0] == 0:
-            pause()
-
-    return spin
 
 
 # ---- what the kernel did to a thread ----

@@ -1,4 +1,4 @@
-"""What kernels need and numba has not: arrays without a count of references, bytes as numbers.
+"""What kernels need and numba has not: arrays without a count of references, bytes as numbers, a pause of a loop that waits.
 
 A kernel that takes an array out of a tuple counts a reference, and again when it lets go: two locked
 additions each time, which for a block of one exposure added up to most of its time. A bare array owns nothing and counts nothing; its
@@ -10,15 +10,19 @@ instruction from the beginning.
 
 from __future__ import annotations
 
+import platform
 import sys
 from typing import Any
 
 import numba
 import numpy as np
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.errors import TypingError
 from numba.extending import intrinsic
+
+from .inner import outer
 
 if numba.config.DISABLE_JIT:
 
@@ -41,6 +45,9 @@ if numba.config.DISABLE_JIT:
     def copy_span(source: Any, start: Any, stop: Any, target: Any, at: Any) -> None:
         """Copy source[start:stop] to target[at:], uint8, which may be the same array."""
         target[int(at) : int(at) + int(stop) - int(start)] = source[int(start) : int(stop)].copy()
+
+    def pause() -> None:
+        """Do nothing."""
 
 else:
 
@@ -86,6 +93,28 @@ else:
 
         places = (types.uint64, types.uint64, _bytes_of(target), types.uint64)
         return types.void(_bytes_of(source), *places), code
+
+    @intrinsic
+    def pause(typing_context):  # type: ignore[no-untyped-def]
+        """The processor's hint that a loop waits; memory counts as changed, so that the loop looks at it again."""
+
+        def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+            if platform.machine() in ("x86_64", "AMD64"):
+                kind = ir.FunctionType(ir.VoidType(), [])
+                builder.call(builder.module.declare_intrinsic("llvm.x86.sse2.pause", (), kind), [])
+            else:
+                builder.fence("seq_cst")
+            return context.get_dummy_value()
+
+        return types.void(), code
+
+
+@outer
+def spin(state):  # type: ignore[no-untyped-def]
+    """Wait until state[0], int64, is not 0; state[1] is 1 from the beginning on."""
+    state[1] = 1
+    while state[0] == 0:
+        pause()
 
 
 def _bytes_of(kind: Any) -> Any:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from collections.abc import Callable
+import tempfile
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numba
@@ -16,7 +18,7 @@ from tree import ROOT
 
 from pans.runtime.wire import inner as wire_inner
 from pans.runtime.wire.bare import as_float32, copy_span, load4, load8
-from pans.runtime.wire.inner import SOURCES, TRIED, digest_of, inner
+from pans.runtime.wire.inner import OTHERS, SOURCES, TRIED, digest_of, inner, kernel_folder, own_folder
 
 U = np.uint64
 
@@ -65,42 +67,100 @@ def doubled(x):
 """
 
 
-@pytest.mark.skipif(numba.version_info.short not in TRIED, reason="cached as all others with this version of numba")
-@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is cached")
-def test_a_cached_kernel_is_for_the_files_that_kernels_are_made_from(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty cache of kernels."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    (tmp_path / "made.py").write_text(KERNEL)
-    found = []
-    for digest in ("as it is", "as it is", "changed", "as it is"):
-        monkeypatch.setattr(wire_inner, "digest_of", lambda runtime, digest=digest: digest)
-        spec = importlib.util.spec_from_file_location("made", tmp_path / "made.py")
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        assert module.doubled(4) == 8
-        found.append(sum(module.doubled.stats.cache_hits.values()))
-    assert found == [0, 1, 0, 0]
+    kernel_folder.cache_clear()
+    yield tmp_path / "cache"
+    kernel_folder.cache_clear()
 
 
-def test_the_digest_is_of_every_file_of_the_packages(tmp_path: Path) -> None:
+def hits_of(file: Path) -> int:
+    """Load the kernel of `file` as one of pans; how often it came from the cache."""
+    kernel_folder.cache_clear()
+    spec = importlib.util.spec_from_file_location("pans.runtime.made", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.doubled(4) == 8
+    return sum(module.doubled.stats.cache_hits.values())
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is cached")
+def test_a_kernel_is_compiled_once_for_all_places_of_the_same_sources(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = tmp_path / "first" / "made.py", tmp_path / "second" / "made.py"
+    for seconds, file in enumerate((first, second)):
+        file.parent.mkdir()
+        file.write_text(KERNEL)
+        os.utime(file, (seconds, seconds))
+    found = [hits_of(first), hits_of(first), hits_of(second)]
+    with monkeypatch.context() as changed:
+        changed.setattr(wire_inner, "digest_of", lambda top, packages: "changed")
+        found += [hits_of(first), hits_of(second)]
+    assert [*found, hits_of(first)] == [0, 1, 1, 0, 1, 1]
+    assert [path.stat().st_mode & 0o777 for path in cache.iterdir()] == [0o700, 0o700]
+
+
+def test_the_digest_is_of_what_the_files_hold(tmp_path: Path) -> None:
     for package in SOURCES:
         (tmp_path / package).mkdir()
         (tmp_path / package / "kernels.py").write_text("x = 1")
     first, last = (tmp_path / package for package in (SOURCES[0], SOURCES[-1]))
     changes: list[Callable[[], object]] = [
-        lambda: (last / "kernels.py").write_text("x = 12"),
-        lambda: os.utime(first / "kernels.py", ns=(1, 1)),
+        lambda: (last / "kernels.py").write_text("x = 2"),
         lambda: (first / "more.py").touch(),
+        lambda: os.utime(first / "kernels.py", ns=(1, 1)),
         lambda: (first / "notes.txt").touch(),
     ]
-    digests = [digest_of.__wrapped__(tmp_path)]
+    digests = [digest_of.__wrapped__(tmp_path, SOURCES)]
     for change in changes:
         change()
-        digests.append(digest_of.__wrapped__(tmp_path))
-    assert (len(set(digests)), digests[-1]) == (4, digests[-2])
+        digests.append(digest_of.__wrapped__(tmp_path, SOURCES))
+    assert (len(set(digests)), len(set(digests[2:]))) == (3, 1)
+
+
+@pytest.mark.parametrize("how", ["writable", "link", "owner", "file"])
+def test_what_others_may_have_put_there_is_not_run(
+    how: str, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    usual = kernel_folder()
+    usual.rmdir()
+    if how == "owner" and os.geteuid() != 0:
+        pytest.skip("a folder is given away by root alone")
+    made = {"link": lambda: usual.symlink_to(tmp_path), "file": usual.touch}.get(how, usual.mkdir)
+    made()
+    if how == "writable":
+        usual.chmod(0o770)
+    if how == "owner":
+        os.chown(usual, 12345, -1)
+    kernel_folder.cache_clear()
+    found = kernel_folder()
+    assert found.parent == Path(tempfile.gettempdir())
+    assert found.stat().st_mode & 0o777 == 0o700
+    said = capsys.readouterr().err
+    assert "compiled at each start" in said
+    assert str(usual) in said
+
+
+def test_old_folders_go_when_a_new_one_comes(cache: Path) -> None:
+    kernel_folder().rmdir()
+    for age_h in range(8):
+        for name in (f"pans-kernels-0.1.0-{age_h:016x}", f"pans-kernels-of-mine-{age_h}"):
+            (cache / name).mkdir()
+            os.utime(cache / name, (time.time() - 3600 * age_h + 60,) * 2)
+    own_folder(cache / f"pans-kernels-0.2.0-{99:016x}")
+    assert sorted(path.name[-2:] for path in cache.glob("pans-kernels-0*")) == ["00", "01", "02", "03", "63"]
+    assert len(list(cache.glob("pans-kernels-of-mine-*"))) == 8
+
+
+def test_every_kernel_that_is_kept_is_kept_there() -> None:
+    files = [file for top in OTHERS for file in (ROOT / top).rglob("*.py") if "cache=True" in file.read_text()]
+    kept = [file.name for file in files if "wire.inner import" in file.read_text()]
+    assert sorted(kept) == sorted(file.name for file in files if file.name != "inner.py") != []
 
 
 def test_with_another_numba_kernels_are_ordinary_ones(monkeypatch: pytest.MonkeyPatch) -> None:
