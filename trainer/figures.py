@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,18 @@ def new_figure(width: float = 10.0, height: float = 4.0, panels: int = 2, rows: 
     return pyplot.subplots(rows, panels, figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Any, path: Path, *, force: bool = True) -> None:
-    """Write `figure` to `path` (PNG), whole or not at all; without `force`, UsageError if `path` exists."""
+def drawn(figure: Any) -> Any:
+    """Return `figure` as a Pillow image of its pixels, RGB."""
     from matplotlib import pyplot
+    from PIL import Image
 
-    with whole_file(path, force=force) as beside:
-        figure.savefig(beside, dpi=DPI, format="png")
+    png = BytesIO()
+    figure.savefig(png, dpi=DPI, format="png")
     pyplot.close(figure)
+    return Image.open(png).convert("RGB")
+
+
+def save_figure(figure: Any, path: Path, *, force: bool = True) -> None:
+    """Write `figure` to `path`, a PNG of 256 colours, whole or not at all; without `force`, UsageError if `path` exists."""
+    with whole_file(path, force=force) as beside:
+        drawn(figure).quantize(256).save(beside, format="png", optimize=True)
