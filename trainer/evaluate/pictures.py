@@ -194,18 +194,23 @@ def draw_optics(folder: Path, bundles: Mapping[str, Mapping[str, Points]], *, fo
 
 def _curves(path: Path, panels: Sequence[tuple[str, str, Mapping[str, Points]]], force: bool) -> Path:
     """Accuracy over points in panels: label of the axis, key of a point, and curves by name."""
+    from matplotlib import rc_context
+
     make_folder(path.parent)
-    figure, axes = new_figure(width=11.0, height=3.6, panels=len(panels))
-    for axis, (label, key, curves) in zip(axes, panels):
+    rows = -(-len(panels) // 2)
+    with rc_context({"font.size": 14}):
+        figure, axes = new_figure(width=8.9, height=3.6 * rows + 0.6, rows=rows)
+    for axis, (label, key, curves) in zip(axes.flat, panels):
         for number, (name, points) in enumerate(curves.items()):
             shown = [[point[key] for point in points], [100 * (point["accuracy_mean"] or 0.0) for point in points]]
             errors = [(point["accuracy_se_objects"] or 0.0, point.get("accuracy_se_trials", 0.0)) for point in points]
             bars = [100 * math.hypot(*both) for both in errors]
             marker = MARKERS[number % len(MARKERS)]
-            axis.errorbar(*shown, yerr=bars, label=name, marker=marker, markersize=4, linewidth=1, capsize=2)
-        axis.set(xlabel=label, ylim=(0, 100))
+            axis.errorbar(*shown, yerr=bars, label=name, marker=marker, markersize=5, linewidth=1.5, capsize=2)
+        axis.set(ylim=(0, 100))
+        axis.set_xlabel(label, fontsize=14)
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("accuracy (%), SIMULATED")
-    axes[0].legend(fontsize=8, loc="lower right")
+    figure.supylabel("accuracy (%), SIMULATED", fontsize=14)
+    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, fontsize=14)
     save_figure(figure, path, force=force)
     return path
