@@ -38,5 +38,8 @@ def drawn(figure: Any) -> Any:
 
 def save_figure(figure: Any, path: Path, *, force: bool = True) -> None:
     """Write `figure` to `path`, a PNG of 256 colours, whole or not at all; without `force`, UsageError if `path` exists."""
+    from PIL import Image
+
     with whole_file(path, force=force) as beside:
-        drawn(figure).quantize(256).save(beside, format="png", optimize=True)
+        # the usual palette leaves out colours of few pixels, such as those of points
+        drawn(figure).quantize(256, Image.Quantize.MAXCOVERAGE).save(beside, format="png", optimize=True)

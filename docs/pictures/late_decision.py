@@ -7,9 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from pans.firmware_sim.ports.serve import open_sim
@@ -19,6 +16,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import RunOptions, run_live
 from pans.runtime.timing import causes
 from pans.runtime.timing.causes import IDLE, OVERSLEPT, Facts, Verdict
+from pans.trainer.figures import new_figure, save_figure
 
 CASES = {
     "stall:60ms/400ms": "the link stalls",
@@ -71,27 +69,28 @@ def draw(axis: plt.Axes, title: str, facts: Facts, verdict: Verdict) -> None:
             [(at - start) / MS for at, _ in points], [lane for _, lane in points], "o-", color="#2a6f3a", ms=4, lw=1.2
         )
     axis.axvline(10.0, color="#555555", ls=":", lw=1)
-    axis.text(10.4, 3.42, "deadline", fontsize=7, color="#555555")
-    axis.set_yticks([0, 1, 2, 3], ["device", "probe sent / back", "loop", "decision is due"])
-    axis.set_ylim(-0.6, 3.7)
+    axis.text(10.6, 3.42, "deadline", fontsize=12, color="#555555")
+    axis.set_yticks([0, 1, 2, 3], ["device", "probe", "loop", "decision due"])
+    axis.set_ylim(-0.6, 4.0)
     axis.set_xlim(-6, 68)
-    axis.set_title(f"{title}: named “{verdict.cause}”{'' if verdict.sure else ' (not sure)'}", fontsize=10, loc="left")
+    axis.set_title(f"{title}: named “{verdict.cause}”{'' if verdict.sure else ' (not sure)'}", fontsize=15, loc="left")
 
 
 def main() -> None:
     """Draw all cases beside the script."""
-    figure, axes = plt.subplots(len(CASES), 1, figsize=(8.4, 7.2), sharex=True, layout="constrained")
+    plt.rcParams["font.size"] = 14
+    figure, axes = new_figure(8.9, 8.6, panels=1, rows=len(CASES))
     for axis, (faults, title) in zip(axes, CASES.items()):
         draw(axis, title, *witnessed(faults))
     axes[-1].set_xlabel("time after the end of the exposure (ms)")
-    names = {"late": "exposure ended, not decided", IDLE: "awake, waits for bytes", OVERSLEPT: "slept beyond its timer"}
+    names = {"late": "not decided yet", IDLE: "awake, waits for bytes", OVERSLEPT: "slept beyond its timer"}
     handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[key], label=name) for key, name in names.items()]
     handles.append(
-        plt.Line2D([], [], color="#2a6f3a", marker="o", ms=4, label="clock probe: sent, there, answered, back")
+        plt.Line2D([], [], color="#2a6f3a", marker="o", ms=4, label="clock probe, there and back")
     )
-    figure.legend(handles=handles, loc="outside lower center", ncol=2, fontsize=8, frameon=False)
-    figure.suptitle("SIMULATED: what the host knows about one late decision", fontsize=11)
-    figure.savefig(Path(__file__).with_name("late-decision.png"), dpi=110)
+    figure.legend(handles=handles, loc="outside lower center", ncol=2, frameon=False)
+    figure.suptitle("SIMULATED: what the host knows about one late decision", fontsize=16)
+    save_figure(figure, Path(__file__).with_name("late-decision.png"))
 
 
 if __name__ == "__main__":
