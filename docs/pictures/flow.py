@@ -8,9 +8,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -21,6 +18,7 @@ from pans.runtime.flow.matching import abort_reason
 from pans.runtime.record import read_recording
 from pans.runtime.record.sent_plan import sent_to_device
 from pans.runtime.wire.messages import MessageType, decode_frames, decode_mark, unpack_body
+from pans.trainer.figures import new_figure, save_figure
 
 recording = read_recording(Path(sys.argv[1]))
 first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
@@ -65,9 +63,8 @@ smooth = np.stack([np.convolve(p, np.ones(5) / 5, "same") for p in posterior.T],
 smooth[sums <= core.limits.release_clicks] = np.nan
 
 colours = plt.cm.tab10.colors
-fig, (top, middle, bottom) = plt.subplots(
-    3, 1, figsize=(11, 6.2), sharex=True, height_ratios=(3, 2.2, 1.6), layout="constrained"
-)
+plt.rcParams["font.size"] = 13
+fig, (top, middle, bottom) = new_figure(8.9, 8.4, panels=1, rows=3)
 top.plot(time_us, sums, color="0.25", lw=0.9)
 top.axhline(
     core.limits.onset_clicks,
@@ -76,37 +73,38 @@ top.axhline(
     ls="--",
     label=f"onset: {core.limits.onset_clicks} clicks",
 )
-for decision, passage in rows:
+for place, (decision, passage) in enumerate(rows):
     top.axvspan(passage.first * period_us, passage.last * period_us, color="tab:blue", alpha=0.10)
     at = (decision.exposure_index + 0.5) * period_us
     named = decision.label != NO_LABEL
     text = f"{bundle.classes[decision.label]}\n{decision.probability:.0%}" if named else abort_reason(decision.flags)
     top.axvline(at, color="tab:red", lw=1.0)
-    top.text(at, sums.max() * 1.30, text, ha="center", va="top", fontsize=8, color="tab:red")
-top.set_ylim(0, sums.max() * 1.34)
+    top.text(at, sums.max() * (1.52 - 0.24 * (place % 2)), text, ha="center", va="top", fontsize=12, color="tab:red")
+top.set_ylim(0, sums.max() * 1.56)
 top.set_ylabel(f"clicks in {width} frames")
-top.legend(loc="center left", fontsize=8)
+top.legend(loc="center", bbox_to_anchor=(0.54, 0.5))
 for label, name in enumerate(bundle.classes):
     middle.plot(time_us, smooth[:, label], color=colours[label], lw=1.1, label=name)
 middle.set_ylabel("posterior per frame\n(mean of 5)")
-middle.legend(loc="center left", fontsize=8)
+middle.legend(loc="center", bbox_to_anchor=(0.54, 0.5), fontsize=12)
 for number, mark in enumerate(marks):
     span = (
         (mark.exposure_index - mark.half_exposures) * period_us,
         (mark.exposure_index + mark.half_exposures) * period_us,
     )
     bottom.plot(span, (2, 2), color=colours[mark.truth], lw=5, solid_capstyle="butt")
-    bottom.text(sum(span) / 2, 2.25 + 0.4 * (number % 2), bundle.classes[mark.truth], ha="center", fontsize=8)
+    bottom.text(sum(span) / 2, 2.15 + 0.3 * (number % 3), bundle.classes[mark.truth], ha="center")
 for decision, passage in rows:
     leave = passage.last * period_us
     bottom.plot((leave, leave), (0.8, 1.2), color="tab:blue")
     if decision.number in gates:
         gate_us = (gates[decision.number] - arm.start_tick) * plan.tick_us
         bottom.annotate("", (gate_us, 1), (leave, 1), arrowprops={"arrowstyle": "->", "color": "tab:red"})
-        bottom.text(gate_us, 0.35, "gate", color="tab:red", fontsize=8, ha="center")
+        bottom.text(gate_us, 0.35, "gate", color="tab:red", ha="center")
 bottom.set_ylim(0, 3.2)
 bottom.set_yticks((1, 2), ("release, pulse", "MARK: truth"))
 bottom.set_xlabel("time, us")
-bottom.set_xlim(time_us[0], time_us[-1])
-fig.suptitle(f"SIMULATED: {bundle.name}, a frame every {period_us:.3g} us", fontsize=10)
-fig.savefig(Path(__file__).with_name("flow.png"), dpi=110)
+for axis in (top, middle, bottom):
+    axis.set_xlim(time_us[0], time_us[-1])
+fig.suptitle(f"SIMULATED: {bundle.name}, a frame every {period_us:.3g} us")
+save_figure(fig, Path(__file__).with_name("flow.png"))

@@ -85,9 +85,7 @@ def main() -> None:
     axes[-1].set_xlabel("time after the end of the exposure (ms)")
     names = {"late": "not decided yet", IDLE: "awake, waits for bytes", OVERSLEPT: "slept beyond its timer"}
     handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[key], label=name) for key, name in names.items()]
-    handles.append(
-        plt.Line2D([], [], color="#2a6f3a", marker="o", ms=4, label="clock probe, there and back")
-    )
+    handles.append(plt.Line2D([], [], color="#2a6f3a", marker="o", ms=4, label="clock probe, there and back"))
     figure.legend(handles=handles, loc="outside lower center", ncol=2, frameon=False)
     figure.suptitle("SIMULATED: what the host knows about one late decision", fontsize=16)
     save_figure(figure, Path(__file__).with_name("late-decision.png"))

@@ -8,7 +8,6 @@ are those recorded, posteriors the bundle's; photons are what the profile expect
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -85,7 +84,9 @@ def demo_walk() -> Walk:
     assert machine is not None
     right = (decisions["label"] == decisions["truth"]) & (decisions["probability"] > SURE)
     chosen = decisions[right.argmax()]
-    state, number, click = (np.concatenate([getattr(one, key) for one in seen]) for key in ("state", "number", "clicks"))
+    state, number, click = (
+        np.concatenate([getattr(one, key) for one in seen]) for key in ("state", "number", "clicks")
+    )
     here = (number <= chosen["exposure_index"]) & (number > chosen["exposure_index"] - chosen["exposures"])
     states, clicks = state[here].astype(int), click[here, 0]
     leaf = machine.successors[states[-1], int(clicks[-1])]

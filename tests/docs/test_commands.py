@@ -86,7 +86,7 @@ def test_every_package_has_a_page_of_its_interface() -> None:
 
 @pytest.mark.parametrize("name", ["README.md", "CHANGELOG.md", "CONTRIBUTING.md"])
 def test_links_into_the_documents_lead_somewhere(name: str) -> None:
-    found = re.findall(r"\]\((?!http)([^)#]+)[^)]*\)", (ROOT / name).read_text(encoding="utf-8"))
+    found = re.findall(r"""(?:\]\(|(?:src|srcset)=")(?!http)([^)#"]+)""", (ROOT / name).read_text(encoding="utf-8"))
     assert [link for link in found if not (ROOT / link).exists()] == []
 
 
