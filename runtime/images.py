@@ -1,14 +1,18 @@
-"""Pictures of a user as 8-bit grey (`read_grey`), labelled sets of them (`read_labelled`), and how alike two pictures are (`likeness`).
+"""Pictures of a user as 8-bit grey (`read_grey`), labelled sets of them (`read_labelled`), how alike two pictures are (`likeness`), and
+patterns as PNG and back (`levels_png`, `read_grey_png`).
 
 Nothing is resized and no contrast stretched. Full scale of 8-bit and 1-bit pictures is white, of 16-bit ones 65535 (a 12-bit camera's file
 stays dark: scale it before), of floating-point ones 1.0; colours become luminance (ITU-R 601), transparency is ignored. Pillow is loaded
-only to read a picture. SSIM is that of the paper's release: 11 x 11 Gaussian window, sigma 1.5, zeros outside, C1 = 1e-4, C2 = 9e-4, data
+only for a picture. SSIM is that of the paper's release: 11 x 11 Gaussian window, sigma 1.5, zeros outside, C1 = 1e-4, C2 = 9e-4, data
 range 1, mean over all pixels.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
+import struct
+import zlib
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +36,11 @@ FAULTS_SHOWN = 5  # of each kind in a folder; the rest is counted
 KINDS_OF_FAULT = ("cannot be read", "hold what is not accepted", "have another size", "are in the wrong place")
 DAMAGED, STRANGE, SIZE, PLACE = KINDS_OF_FAULT
 PILLOW_REMEDY = "pip install pillow"
+PNG_END, PNG_SIDE_MAX, PNG_TOPS = (
+    b"IEND\xaeB`\x82",
+    1 << 14,
+    {"L": 255, "I;16B": 65535},
+)  # how Pillow calls 8 and 16 bits
 LITTER = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx"))
 PICTURE_SUFFIXES = frozenset((".png", ".tif", ".tiff", ".pgm", ".jpg", ".jpeg", ".bmp"))
 
@@ -145,10 +154,7 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
     UsageError for more than `pixels_max` pixels, several frames, or values outside the full scale; DamagedFileError for a
     file that is no picture.
     """
-    try:
-        from PIL import Image
-    except ModuleNotFoundError as error:
-        raise UsageError(f"{path}: pictures need the package pillow", remedy=PILLOW_REMEDY) from error
+    Image = _pillow(f"{path}: pictures need")
     try:
         with open_regular(path) as file, Image.open(file) as picture:
             if picture.width * picture.height > pixels_max:
@@ -165,6 +171,59 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
     except (OSError, SyntaxError, ValueError) as error:  # what damaged files make the decoders raise
         remedy = "repair it, or move it elsewhere"
         raise DamagedFileError(f"{path}: not an image that can be read: {error}", remedy=remedy) from error
+
+
+def _pillow(what: str = "a picture needs") -> Any:
+    try:
+        from PIL import Image
+    except ModuleNotFoundError as error:
+        raise UsageError(f"{what} the package pillow", remedy=PILLOW_REMEDY) from error
+    return Image
+
+
+# ---- patterns as PNG ----
+
+
+def grey_png(grey: NDArray[np.unsignedinteger[Any]]) -> bytes:
+    """Return a grey picture, uint8 or uint16 (height, width), as PNG; UsageError without Pillow."""
+    stream = io.BytesIO()
+    _pillow().fromarray(grey).save(stream, "PNG", optimize=True)
+    return stream.getvalue()
+
+
+def levels_png(levels: NDArray[np.unsignedinteger[Any]], count: int) -> bytes:
+    """Return levels (height, width), each below `count`, as PNG with the highest level white: 8 bits for up to 256 levels, else 16."""
+    top, kind = (255, np.uint8) if count <= 256 else (65535, np.uint16)
+    return grey_png(np.rint(levels * (top / max(count - 1, 1))).astype(kind))
+
+
+def read_grey_png(data: bytes, where: str) -> NDArray[np.float64]:
+    """Return a plain grey PNG (8 or 16 bits, not interlaced) as float64 (height, width), white 1.
+
+    DamagedFileError for any other; its size is checked before anything is unpacked. UsageError without Pillow.
+    """
+    image = _pillow()
+    try:
+        if not data.endswith(PNG_END):
+            raise ValueError("it does not end as a PNG does")
+        image.open(io.BytesIO(data), formats=("PNG",)).verify()  # its checksums, which reading alone passes over
+        picture = image.open(io.BytesIO(data), formats=("PNG",))
+        coding, extra = picture.tile[0][3], picture.info.keys() & {"transparency", "interlace"}
+        if max(picture.size) > PNG_SIDE_MAX or coding not in PNG_TOPS or extra:
+            found = f"{picture.width} x {picture.height} pixels, {coding} {' '.join(sorted(extra))}"
+            raise ValueError(f"{found}, allowed: {PNG_SIDE_MAX} each, 8 or 16 bits of grey, nothing else")
+        return np.asarray(picture, np.float64) / PNG_TOPS[coding]
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        EOFError,
+        struct.error,
+        zlib.error,
+        image.DecompressionBombError,
+    ) as error:
+        remedy = "save it as 8-bit or 16-bit grey, without transparency"
+        raise DamagedFileError(f"{where}: not a readable grey PNG: {error}", remedy=remedy) from error
 
 
 def to_8_bits(where: Path, values: NDArray[Any], full_scale: float) -> NDArray[np.uint8]:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pans.runtime import SHIPPED
 from pans.runtime.outputs import whole_file
-from pans.runtime.report.figures import pyplot
+from pans.runtime.pages.charts import needed
 
 Row = dict[str, Any]
 REPEATS = 7
@@ -131,7 +131,7 @@ def write_plot(rows: list[Row], path: Path, *, force: bool = False) -> None:
     """Draw speed against error of the rows that have both (`ns`, `score_error`), and the rates of the others."""
     points = [row for row in rows if "ns" in row and isinstance(row.get("score_error"), float)]
     others = [row for row in rows if "rate" in row]
-    figure, axes = pyplot("--plot").subplots(1, 2, figsize=(14, 6), layout="constrained")
+    figure, axes = needed("matplotlib.pyplot", "--plot").subplots(1, 2, figsize=(14, 6), layout="constrained")
     for row in points:
         axes[0].loglog(row["ns"], max(row["score_error"], 1e-9), "o", label=row["name"])
     if points:
@@ -143,7 +143,7 @@ def write_plot(rows: list[Row], path: Path, *, force: bool = False) -> None:
         panel.set_visible(bool(shown))
     with whole_file(path, force=force) as beside:
         figure.savefig(beside, dpi=120, format=path.suffix[1:] or "png")
-    pyplot().close(figure)
+    needed("matplotlib.pyplot").close(figure)
 
 
 def table_text(rows: list[Row]) -> str:

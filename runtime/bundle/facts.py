@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -14,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.grey_png import levels_png
+from pans.runtime.errors import UsageError
 from pans.runtime.html_card import html_card
+from pans.runtime.images import levels_png
 from pans.runtime.ranges import Range, demand
 
 from .automaton import COUNT_OUTCOMES, Automaton, greatest_light, log_scores, walk_difference
@@ -181,7 +183,9 @@ class Bundle:
             **{f"expected {name}": value for name, value in (self.expected or {}).items()},
         }
         shown = self.pattern_levels[:SHOWN_MAX] if 0 < self.n_pixels <= SHOWN_PIXELS_MAX else ()
-        pictures = [levels_png(levels.reshape(self.image_shape), self.levels) for levels in shown]
+        pictures: list[bytes] = []
+        with suppress(UsageError):  # without Pillow the card has no pictures
+            pictures = [levels_png(levels.reshape(self.image_shape), self.levels) for levels in shown]
         return html_card(f"Bundle {self.name}", rows, [(f"pattern {at}", one) for at, one in enumerate(pictures)])
 
 

@@ -36,7 +36,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from pans.runtime.bench.rows import BenchOptions, machine_facts, table_text, write_plot
-    from pans.runtime.report.figures import pyplot
+    from pans.runtime.pages.charts import needed
 
     for option, name in USES.items():
         if getattr(args, option) and args.what not in (name, "all"):
@@ -46,7 +46,7 @@ def _run(args: argparse.Namespace) -> int:
         raise UsageError(what, remedy="give one --inputs for each --bundle")
     options = BenchOptions(tuple(args.bundle), tuple(args.inputs), args.seconds, args.load, args.quick)
     if args.plot is not None:
-        pyplot("--plot")
+        needed("matplotlib.pyplot", "--plot")
         check_outputs([args.plot], inputs=[*args.bundle, *args.inputs], force=args.force)
     before, rows = machine_facts(), list[dict[str, Any]]()
     benches = {point.name: point for point in entry_points(group="pans.benches")}

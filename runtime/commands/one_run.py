@@ -383,7 +383,7 @@ class _Run:
 
     def _conclude(self, options: RunOptions, result: RunResult, summary: Summary) -> Outcome:
         """Write the page and return what came of the run."""
-        from pans.runtime.report.summary_page import write_markdown
+        from pans.runtime.report.words import write_markdown
 
         confusion, page = result.tally.confusion, options.page
         if self.flow_run is not None:

@@ -63,7 +63,7 @@ def _replay(args: argparse.Namespace) -> int:
         head = f"{path.name}: {found.decisions} decisions" if of_parts else of_one
         lines += [
             f"{head}: {_agreement_words(recording, found)}",
-            *([] if found.passages is None else passage_words(found.passages)),
+            *([] if found.passages is None else passage_words(found.passages.as_json())),
             *([f"  fault         {fault}"] if (fault := exposure_fault(found.exposure_timing)) else []),
         ]
         if of_parts:

@@ -18,7 +18,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.onnx_model import protobuf
 from pans.runtime.container import read_file
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.grey_png import levels_png, read_grey_png
+from pans.runtime.images import levels_png, read_grey_png
 
 PICTURES_MAX = 65_535
 DOC_STRING, METADATA = 6, 14  # fields of ModelProto (onnx.proto)

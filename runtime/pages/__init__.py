@@ -1,18 +1,30 @@
-"""HTML pages of recordings and bundles in one file each, readable on a screen of any width, in light and dark, and on paper.
+"""HTML pages of runs, bundles, measurements and folders of runs: one file each, for any width, in light and dark, and on paper.
 
-What comes in are recordings and bundles; what goes out is HTML. Verdicts and figures of a whole run are those of its summary
-(report/summary.py); verdict.py adds why a run passed, and the advice on each fault, which it finds by the words of its sentence: change
-both together. No page runs a script or loads anything. Start with run.py and page.py.
-
->>> from pans.runtime.pages import Page
->>> page = Page("A & B", simulated=False)
->>> page.text("one <b>")
->>> b"one &lt;b&gt;" in page.html()
-True
+What comes in are files of this project; what goes out is HTML. Structure and words stand in templates/ (Jinja2), charts.py draws
+(matplotlib), both of the extra `ui`. No page runs a script or loads anything. Start with run.py and templates/run.html.
 """
 
-from .charts import Axis, Bars, Chart, Curve, Mark
-from .page import Page
-from .run import page_of
+from __future__ import annotations
 
-__all__ = ["Axis", "Bars", "Chart", "Curve", "Mark", "Page", "page_of"]
+from pathlib import Path
+
+from pans.runtime.errors import UsageError
+from pans.runtime.report.verify import file_kind
+
+
+def page_of(path: str | Path) -> bytes:
+    """Return the page of a recording, a bundle, a calibration or a registration.
+
+    UsageError for another kind of file, a missing one, and without the extra `ui`.
+    """
+    from pans.runtime.record.parts import open_recording
+
+    from .bundle import bundle_page, measured_page
+    from .run import run_page
+
+    kind = file_kind(path)
+    if kind == "recording":
+        return run_page(open_recording(path, salvage=True))
+    if kind == "profile":
+        raise UsageError(f"{path} is a {kind}", remedy="`pans info` shows it")
+    return bundle_page(Path(path)) if kind == "bundle" else measured_page(Path(path))

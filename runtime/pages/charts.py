@@ -1,49 +1,90 @@
-"""Charts as inline SVG: curves with bands, bars, shaded tables, with axes, units and words for screen readers.
+"""Charts of the pages: arrays in, inline SVG out, drawn by matplotlib (extra `ui`), which is loaded with the first of them.
 
-Colours are classes of the page's style, so that they follow light and dark. A chart is drawn for a given width in pixels: a page holds a
-wide and a narrow form, so that letters keep their size on a telephone.
+A chart is drawn once, so small that it can be read on a telephone, and scales with its column. Its colours are variables of the page's
+style, so that they follow light, dark and print.
 """
 
 from __future__ import annotations
 
+import importlib
+import io
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime import safe_text
+from pans.runtime.cli.finding import missing_extra
+from pans.runtime.safe_text import html, one_line
 
-LEFT, RIGHT, TOP, BOTTOM = 62, 12, 24, 40
+WIDTH, HEIGHT = 440, 240  # pixels
 POINTS_MAX = 500  # of a curve
+BLUES = ("#eef3fa", "#5e94cd", "#08265c")  # light to dark, so that more is darker on paper too
+# A colour that stands for a variable of page.css, and is replaced by it.
+_INKS = {
+    "a": "#fe01a0",
+    "b": "#fe01b0",
+    "c": "#fe01c0",
+    "d": "#fe01d0",
+    "bad": "#fe01e0",
+    "soft": "#fe01f0",
+    "line": "#fe0110",
+}
+_DASHES = {"a": "-", "b": (0, (5, 2)), "c": (0, (1.5, 2)), "d": (0, (7, 2, 2, 2))}
+_STYLE = {
+    **{"font.size": 13, "svg.fonttype": "none", "axes.spines.top": False, "axes.spines.right": False},
+    **{"axes.edgecolor": _INKS["line"], "axes.labelcolor": _INKS["soft"], "text.color": _INKS["soft"]},
+    **{"xtick.color": _INKS["soft"], "ytick.color": _INKS["soft"], "axes.titlesize": 13, "axes.titlecolor": _INKS["soft"]},
+    **{"xtick.labelsize": 12, "ytick.labelsize": 12, "grid.color": _INKS["line"], "grid.linewidth": 0.8, "legend.fontsize": 12},
+}  # fmt: skip
+
+
+def needed(name: str, what: str = "a page") -> ModuleType:
+    """Return the module `name` of the extra `ui`; UsageError that says what needs it where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise missing_extra(what, name.partition(".")[0], "ui") from error
+
+
+# ---- numbers on axes ----
 
 
 def number(value: float) -> str:
-    """Return a number for an axis: three digits, no trailing zeros."""
-    if value == 0 or not math.isfinite(value):
-        return "0" if value == 0 else "∞"
-    if abs(value) >= 1e5 or abs(value) < 1e-3:
-        mantissa, exponent = (
-            f"{value:.2g}".partition("e")[::2] if "e" in f"{value:.2g}" else (f"{value:.1e}".split("e"))
-        )
-        return f"{float(mantissa):g}e{int(exponent)}"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    """Return a number in three digits, thousands with commas.
+
+    >>> number(0.000012), number(1234.5), number(0.25)
+    ('1.2e-05', '1,234', '0.25')
+    """
+    return f"{value:,.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def percent(value: float) -> str:
-    """Return a share for an axis."""
+    """Return a share in percent."""
     return f"{100 * value:.3g} %"
 
 
-def span(us: float) -> str:
-    """Return microseconds for an axis, in the unit that fits."""
-    return f"{us / 1e6:.3g} s" if us >= 1e6 else f"{us / 1e3:.3g} ms" if us >= 1e3 else f"{us:.3g} us"
+def whole(value: float) -> str:
+    """Return a count; nothing between two of them."""
+    return f"{value:.0f}" if value == round(value) else ""
 
 
 def seconds(value: float) -> str:
-    """Return seconds for an axis, in the unit that fits."""
+    """Return seconds, in the unit that fits."""
     return f"{value:.3g} s" if value < 300 else f"{value / 60:.3g} min" if value < 18_000 else f"{value / 3600:.3g} h"
+
+
+def span(us: float) -> str:
+    """Return microseconds, in the unit that fits."""
+    return f"{us / 1e6:.3g} s" if us >= 1e6 else f"{us / 1e3:.3g} ms" if us >= 1e3 else f"{us:.3g} us"
+
+
+# ---- what is drawn ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,27 +96,6 @@ class Axis:
     high: float
     log: bool = False
     text: Callable[[float], str] = number
-
-    def at(self, values: ArrayLike) -> np.ndarray:
-        """Return the places of `values`, 0 at the low end and 1 at the high one; values beyond are at the ends."""
-        low, high, found = self.low, self.high, np.asarray(values, np.float64)
-        if self.log:
-            low, high, found = math.log(low), math.log(high), np.log(np.maximum(found, 1e-300))
-        return np.clip((found - low) / ((high - low) or 1.0), 0.0, 1.0)
-
-    def ticks(self, most: int) -> list[float]:
-        """Return at most about `most` round numbers."""
-        if self.log:
-            least, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
-            stride = max(1, -(-(last - least + 1) // most))
-            found = [10.0**power for power in range(least, last + 1, stride)]
-            return found if len(found) > 1 else [self.low, self.high]
-        reach = (self.high - self.low) or 1.0
-        unit = 10.0 ** math.floor(math.log10(reach / most))
-        steps = (factor * unit for factor in (1, 2, 5, 10, 20, 50))
-        step = next(one for one in steps if reach / one <= most)
-        first = math.ceil(self.low / step - 1e-9)
-        return [n * step for n in range(first, math.floor(self.high / step + 1e-9) + 1)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +109,15 @@ class Curve:
     low: ArrayLike | None = None
     high: ArrayLike | None = None
     dots: bool = False
+
+    def thinned(self) -> list[NDArray[np.float64] | None]:
+        """Return x, y, low and high with at most POINTS_MAX points; outliers stay."""
+        given = (self.x, self.y, self.low, self.high)
+        arrays = [None if one is None else np.asarray(one, np.float64) for one in given]
+        if len(y := np.asarray(self.y, np.float64)) <= POINTS_MAX:
+            return arrays
+        kept = extremes(y, POINTS_MAX // 2)
+        return [None if one is None else one[kept] for one in arrays]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,67 +141,17 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class Chart:
-    """What is drawn; `label` says in words what there is to see."""
+class Node:
+    """A picture of a tree: its level, place from left (0) to right (1), lines below it, and the numbers of the nodes after it, -1: none."""
 
-    label: str
-    x: Axis
-    y: Axis
-    curves: Sequence[Curve] = ()
-    bars: Sequence[Bars] = ()
-    marks: Sequence[Mark] = ()
-    height: int = 230
-    heat: bytes = b""  # a PNG that fills the axes
-
-    @property
-    def names(self) -> list[tuple[str, str]]:
-        """The kind and the name of what has one, for a legend; empty for a single one."""
-        drawn: list[Curve | Bars] = [*self.curves, *self.bars]
-        named = [(one.kind, one.name) for one in drawn if one.name]
-        return named if len(named) > 1 else []
-
-    def svg(self, width: int) -> str:
-        """Return the chart `width` pixels wide."""
-        inner = width - LEFT - RIGHT, self.height - TOP - BOTTOM
-        parts = [_frame(self, width, inner)]
-        if self.heat:
-            parts.append(_image(self.heat, (LEFT, TOP), inner))
-        for bars in self.bars:
-            parts.append(_bars(self, bars, inner))
-        for curve in self.curves:
-            parts.append(_band(self, curve, inner))
-            parts.append(_curve(self, curve, inner))
-        parts += [_mark(self, mark, inner, width) for mark in self.marks]
-        label = safe_text.html(self.label)
-        size = f'viewBox="0 0 {width} {self.height}" width="{width}" height="{self.height}"'
-        return f'<svg {size} role="img" aria-label="{label}">{"".join(parts)}</svg>'
+    level: int
+    place: float
+    picture: NDArray[np.float64]
+    lines: tuple[str, ...]
+    leads: tuple[int, ...]
 
 
-def _frame(chart: Chart, width: int, inner: tuple[int, int]) -> str:
-    parts = []
-    for value in chart.y.ticks(5 if chart.height > 160 else 3):
-        y = TOP + inner[1] * (1 - float(chart.y.at(value)))
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(
-            f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{safe_text.html(chart.y.text(value))}</text>'
-        )
-    for value in chart.x.ticks(max(3, width // 130)):
-        x = LEFT + inner[0] * float(chart.x.at(value))
-        parts.append(f'<line class="tick" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP + inner[1]}" y2="{TOP + inner[1] + 5}"/>')
-        anchor = "end" if x > width - RIGHT - 20 else "middle"
-        place = f'x="{x:.1f}" y="{TOP + inner[1] + 18}" text-anchor="{anchor}"'
-        parts.append(f"<text {place}>{safe_text.html(chart.x.text(value))}</text>")
-    parts.append(f'<text class="title" x="2" y="13">{safe_text.html(chart.y.title)}</text>')
-    place = f'x="{width - RIGHT}" y="{chart.height - 5}" text-anchor="end"'
-    parts.append(f'<text class="title" {place}>{safe_text.html(chart.x.title)}</text>')
-    return "".join(parts)
-
-
-def _places(chart: Chart, x: ArrayLike, y: ArrayLike, inner: tuple[int, int]) -> np.ndarray:
-    return np.stack([LEFT + inner[0] * chart.x.at(x), TOP + inner[1] * (1 - chart.y.at(y))], axis=-1)
-
-
-def extremes(values: np.ndarray, stretches: int) -> np.ndarray:
+def extremes(values: NDArray[np.float64], stretches: int) -> NDArray[np.int64]:
     """Return the places of the least and the largest of `values` in each of `stretches` parts, in order, without doubles; NaN is neither.
 
     >>> extremes(np.array([0.0, 1.0, 9.0, 1.0, 0.0, 0.0]), 2).tolist()
@@ -180,78 +159,143 @@ def extremes(values: np.ndarray, stretches: int) -> np.ndarray:
     """
     parts = np.array_split(np.arange(len(values)), stretches)
     low, high = np.where(np.isnan(values), np.inf, values), np.where(np.isnan(values), -np.inf, values)
-    places = [int(part[ends.argmin()]) for part in parts if len(part) for ends in (low[part], -high[part])]
-    return np.unique(places)
+    return np.unique([int(part[ends.argmin()]) for part in parts if len(part) for ends in (low[part], -high[part])])
 
 
-def _thinned(curve: Curve) -> list[np.ndarray | None]:
-    """The curve with at most POINTS_MAX points; outliers stay."""
-    arrays = [None if one is None else np.asarray(one, np.float64) for one in (curve.x, curve.y, curve.low, curve.high)]
-    y = arrays[1]
-    assert y is not None
-    if len(y) <= POINTS_MAX:
-        return arrays
-    kept = extremes(y, POINTS_MAX // 2)
-    return [None if one is None else one[kept] for one in arrays]
+def chart(
+    label: str,
+    x: Axis,
+    y: Axis,
+    *,
+    curves: Sequence[Curve] = (),
+    bars: Sequence[Bars] = (),
+    marks: Sequence[Mark] = (),
+    heat: NDArray[np.float64] | None = None,
+    height: int = HEIGHT,
+) -> Any:
+    """Return a chart as markup; `label` says in words what there is to see.
+
+    `heat`, float64 (rows, columns), fills the axes from their low ends on, in shades from 0 to its highest number; NaN stays empty.
+    """
+    with _figure(label, height) as (figure, drawn):
+        axes = figure.add_subplot()
+        axes.set_title(y.title, loc="left")
+        axes.set(xlabel=x.title, xlim=(x.low, x.high), ylim=(y.low, y.high))
+        for axis, one in ((axes.xaxis, x), (axes.yaxis, y)):
+            (axes.set_xscale if one is x else axes.set_yscale)("log" if one.log else "linear")
+            axis.set_major_formatter(lambda value, _, one=one: one_line(one.text(value)))
+            axis.set_minor_formatter(lambda value, _: "")
+            (axis.get_major_locator().set_params)(**({"numticks": 6} if one.log else {"nbins": 5}))
+        if heat is not None:
+            _heat(figure, axes, (x.low, x.high, y.low, y.high), heat)
+        else:
+            axes.grid(axis="y")
+            axes.set_axisbelow(True)
+        for one in bars:
+            edges = np.asarray(one.edges, np.float64)
+            axes.bar(
+                edges[:-1], one.heights, np.diff(edges), one.base, align="edge", color=_INKS[one.kind], label=one.name
+            )
+        for curve in curves:
+            _curve(axes, curve)
+        for mark in marks:
+            _mark(axes, mark, x, y)
+        if len(names := [one.name for one in (*curves, *bars) if one.name]) > 1:
+            columns = 2 if max(map(len, names)) < 20 else 1
+            figure.legend(loc="outside upper left", ncols=columns, frameon=False, handlelength=1.6, borderpad=0)
+    return drawn()
 
 
-def _curve(chart: Chart, curve: Curve, inner: tuple[int, int]) -> str:
-    x, y, _, _ = _thinned(curve)
-    assert x is not None
-    assert y is not None
-    known = np.isfinite(y) & np.isfinite(x)
-    points = _places(chart, x[known], y[known], inner)
-    if curve.dots or len(points) == 1:
-        return "".join(f'<circle class="dot {curve.kind}" cx="{a:.1f}" cy="{b:.1f}" r="2.6"/>' for a, b in points)
-    breaks = np.flatnonzero(np.diff(np.flatnonzero(known)) > 1) + 1
-    strokes = (" ".join(f"{a:.1f},{b:.1f}" for a, b in part) for part in np.split(points, breaks))
-    return "".join(f'<polyline class="curve {curve.kind}" points="{stroke}"/>' for stroke in strokes if stroke)
+def _curve(axes: Any, curve: Curve) -> None:
+    x, y, low, high = curve.thinned()
+    colour = _INKS[curve.kind]
+    if low is not None and high is not None:
+        if curve.dots or len(np.atleast_1d(curve.x)) == 1:
+            axes.vlines(x, low, high, colors=colour, alpha=0.6, lw=1.2)
+        else:
+            axes.fill_between(x, low, high, color=colour, alpha=0.22, lw=0)
+    if curve.dots or np.isfinite(np.asarray(y)).sum() == 1:
+        axes.plot(x, y, "o", color=colour, ms=4, label=curve.name)
+    else:
+        axes.plot(x, y, ls=_DASHES[curve.kind], color=colour, lw=1.8, label=curve.name)
 
 
-def _band(chart: Chart, curve: Curve, inner: tuple[int, int]) -> str:
-    x, _, low, high = _thinned(curve)
-    if x is None or low is None or high is None:
-        return ""
-    known = np.isfinite(low) & np.isfinite(high)
-    if curve.dots:
-        ends = zip(_places(chart, x[known], low[known], inner), _places(chart, x[known], high[known], inner))
-        return "".join(
-            f'<line class="error {curve.kind}" x1="{a[0]:.1f}" x2="{a[0]:.1f}" y1="{a[1]:.1f}" y2="{b[1]:.1f}"/>'
-            for a, b in ends
+def _mark(axes: Any, mark: Mark, x: Axis, y: Axis) -> None:
+    (axes.axvline if mark.upright else axes.axhline)(mark.at, color=_INKS["bad"], ls=(0, (4, 3)), lw=1)
+    one = x if mark.upright else y
+    low, at, high = ((math.log(v) if one.log else v) for v in (one.low, mark.at, one.high))
+    far = (at - low) / ((high - low) or 1.0) > 0.6
+    if mark.upright:
+        place, align = {"xy": (mark.at, 1), "xycoords": ("data", "axes fraction")}, ("right" if far else "left", "top")
+        shift = (-4 if far else 4, -2)
+    else:
+        place, align = (
+            {"xy": (1, mark.at), "xycoords": ("axes fraction", "data")},
+            ("right", "top" if far else "bottom"),
         )
-    there, back = _places(chart, x[known], high[known], inner), _places(chart, x[known], low[known], inner)[::-1]
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in np.concatenate([there, back]))
-    return f'<polygon class="band {curve.kind}" points="{points}"/>'
+        shift = (0, -3 if far else 2)
+    where = {"xytext": shift, "textcoords": "offset points", "ha": align[0], "va": align[1]}
+    axes.annotate(mark.name, **place, **where, color=_INKS["bad"], fontsize=12)
 
 
-def _bars(chart: Chart, bars: Bars, inner: tuple[int, int]) -> str:
-    edges, heights = np.asarray(bars.edges, np.float64), np.asarray(bars.heights, np.float64)
-    base = np.broadcast_to(np.asarray(bars.base, np.float64), heights.shape)
-    low, high = _places(chart, edges[:-1], base, inner), _places(chart, edges[1:], base + heights, inner)
-    gap = 1.0 if len(heights) * 3 < inner[0] else 0.0
-    return "".join(
-        f'<rect class="bar {bars.kind}" x="{a[0]:.1f}" y="{b[1]:.1f}" width="{max(b[0] - a[0] - gap, 0.5):.1f}" '
-        f'height="{max(a[1] - b[1], 0):.1f}"/>'
-        for a, b, height in zip(low, high, heights)
-        if height > 0
+def _heat(figure: Any, axes: Any, extent: tuple[float, ...], heat: NDArray[np.float64]) -> None:
+    colours = needed("matplotlib.colors").LinearSegmentedColormap.from_list("blues", BLUES)
+    top = float(np.nanmax(heat)) if np.isfinite(heat).any() else 1.0
+    shades = {"cmap": colours, "vmin": 0.0, "vmax": top or 1.0, "interpolation": "none"}
+    image = axes.imshow(heat, extent=extent, origin="lower", aspect="auto", **shades)
+    figure.colorbar(image, ax=axes, pad=0.02, fraction=0.06, format=lambda value, _: number(value)).outline.set_visible(
+        False
     )
 
 
-def _mark(chart: Chart, mark: Mark, inner: tuple[int, int], width: int) -> str:
-    name = safe_text.html(mark.name)
-    if mark.upright:
-        x = LEFT + inner[0] * float(chart.x.at(mark.at))
-        anchor, shift = ("end", -5) if x > width * 0.6 else ("start", 5)
-        line = f'<line class="mark" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{TOP + inner[1]}"/>'
-        return f'{line}<text class="mark" x="{x + shift:.1f}" y="{TOP + 12}" text-anchor="{anchor}">{name}</text>'
-    y = TOP + inner[1] * (1 - float(chart.y.at(mark.at)))
-    line = f'<line class="mark" x1="{LEFT}" x2="{width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
-    return f'{line}<text class="mark" x="{width - RIGHT - 2}" y="{y - 4:.1f}" text-anchor="end">{name}</text>'
+def tree(label: str, nodes: Sequence[Node]) -> Any:
+    """Return pictures at the places of their nodes, the first level on top, with lines between them: solid to the last of `leads`."""
+    levels, widest = max(one.level for one in nodes) + 1, max(np.bincount([one.level for one in nodes]))
+    size, step = min(80, WIDTH / widest - 6), min(80, WIDTH / widest - 6) + 58
+    height = round(levels * step)
+    with _figure(label, height, layout="none") as (figure, drawn):
+        line = needed("matplotlib.lines").Line2D
+        for one in nodes:
+            top = height - one.level * step
+            for outcome, lead in enumerate(one.leads):
+                if lead >= 0:
+                    ends = (
+                        (one.place, nodes[lead].place),
+                        ((top - size - 34) / height, (height - nodes[lead].level * step) / height),
+                    )
+                    last = outcome == len(one.leads) - 1
+                    figure.add_artist(
+                        line(*ends, color=_INKS["b" if last else "soft"], lw=1.8, ls="-" if last else (0, (4, 3)))
+                    )
+            axes = figure.add_axes((one.place - size / WIDTH / 2, (top - size) / height, size / WIDTH, size / height))
+            axes.imshow(one.picture, cmap="gray", vmin=0.0, interpolation="none")
+            axes.set_axis_off()
+            for number_, text in enumerate(one.lines):
+                where = one.place, (top - size - 13 - 15 * number_) / height
+                figure.text(*where, text, ha="center", fontsize=12)
+    return drawn()
 
 
-def _image(data: bytes, place: tuple[int, int], size: tuple[int, int]) -> str:
-    import base64
+@contextmanager
+def _figure(label: str, height: int, layout: str = "constrained") -> Iterator[tuple[Any, Callable[[], Any]]]:
+    """Yield an empty figure and the function that returns it as markup, once it is drawn."""
+    matplotlib, markup = needed("matplotlib"), needed("markupsafe").Markup
+    stream = io.StringIO()
+    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": label}):
+        figure = needed("matplotlib.figure").Figure(figsize=(WIDTH / 72, height / 72), layout=layout)
+        yield figure, lambda: markup(_page_svg(stream.getvalue(), label))
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
 
-    source = f"data:image/png;base64,{base64.b64encode(data).decode()}"
-    where = f'x="{place[0]}" y="{place[1]}" width="{size[0]}" height="{size[1]}"'
-    return f'<image class="pixels" {where} preserveAspectRatio="none" href="{source}"/>'
+
+def _page_svg(text: str, label: str) -> str:
+    """The SVG as a part of a page: no prologue, no names that repeat from chart to chart, colours and letters of the page."""
+    body = text[text.index("<defs>") : text.rindex("</svg>")] if "<defs>" in text else text
+    body = re.sub(r"<style.*?</style>|<metadata>.*?</metadata>|<!--.*?-->|\n\s*", " ", body, flags=re.DOTALL)
+    body = re.sub(r' id="[A-Za-z0-9.]+_\d+"', "", body)
+    body = re.sub(r"font(?:-family)?: [^;\"]*'[^;\"]+;? ?", "", body)
+    for name, colour in _INKS.items():
+        body = body.replace(colour, f"var(--{name})")
+    box = re.search(r'viewBox="[^"]+"', text)
+    assert box is not None
+    return f'<svg {box[0]} role="img" aria-label="{html(label)}">{body}</svg>'

@@ -1,20 +1,10 @@
-"""The section on what happened during a run: each recorded event as a sentence, the raw records folded away.
-
-The kinds of events stand in docs/reference/formats.md.
-"""
+"""A recorded event as a sentence; the kinds of events stand in docs/reference/formats.md."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from pans.runtime.record import Recording
-
-from .page import Page
-
-SHOWN = 200
-OF_A_KIND = 30
 # kind -> sentence; what stands in braces are the event's own facts
 SENTENCES = {
     "late": "Decision {decision} was late: {latency_us} us after the end of its exposure.",
@@ -71,35 +61,3 @@ def _plain(value: Any) -> str:
     if not isinstance(value, float):
         return str(value)
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def add_events(page: Page, recording: Recording) -> None:
-    """Add the events: how many of each kind, the first as sentences, their records folded away."""
-    kinds: Counter[str] = Counter()
-    shown: list[Mapping[str, Any]] = []
-    for event in recording.events():
-        kind = str(event.get("kind", "?"))
-        kinds[kind] += 1
-        if len(shown) < SHOWN and kinds[kind] <= OF_A_KIND and kind != "session":
-            shown.append(event)
-    page.heading("Events")
-    noted = sum(kinds.values()) - kinds["session"]
-    if not noted:
-        page.text("Nothing out of the ordinary was noted.")
-        return
-    page.text(
-        "Noted during the run: " + ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in kinds.most_common()) + "."
-    )
-    sentences = [sentence_of(event) for event in shown]
-    page.sentences(sentences[:20])
-    if len(sentences) > 20:
-        with page.folded(f"{len(sentences) - 20} more"):
-            page.sentences(sentences[20:])
-    if noted > len(shown):
-        page.text(
-            f"{len(shown)} of {noted} are shown, the first {OF_A_KIND} of a kind at most; `pans export` writes them all.",
-            "note",
-        )
-    with page.folded("The records as they were written"):
-        rows = [(str(e.get("kind")), ", ".join(f"{k} {v}" for k, v in e.items() if k != "kind")) for e in shown]
-        page.table(rows, ("event", "what was noted"))

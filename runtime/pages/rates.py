@@ -1,214 +1,195 @@
-"""The section on clicks over time, from recorded messages: rates of patterns, channels or steps of a walk, and dark counts."""
+"""Clicks over time, from recorded exposures as they come: rates of patterns, channels or steps of a walk, and dark counts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.core.plan import Plan
 from pans.runtime.intervals import wilson_interval
-from pans.runtime.record import Recording
-from pans.runtime.record.exposures import Exposures, is_dark, iter_exposures
+from pans.runtime.record.exposures import Exposures, is_dark
 
-from .charts import Axis, Chart, Curve, Mark, number, seconds
-from .page import Page
-from .pixels import heat_png
+from .charts import Axis, Curve, Mark, chart, seconds, whole
 
-BINS = 120
-DARK_BINS, DARK_PER_BIN = 40, 200  # stretches of the dark counts' strip, and exposures in one
-EXPOSURES_PER_BIN = 25  # of each pattern: a rate from fewer is noise
+HEAT_BINS, EXPOSURES_PER_BIN = 120, 25  # of each pattern: a rate from fewer is noise
+DARK_BINS, DARK_PER_BIN = 40, 200
 OBJECTS_KEPT = 1 << 14  # whose true class is remembered: the exposures of an object come soon after its mark
+CLASSES_NAMED = 2
+LEAST_EXPOSURES = 20  # of a class, before anything is said about it
+BINS = 128
+SET_MAX = 4096  # different objects of a stretch that are told apart: an interval counts no more of them
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
 
-class Rates(NamedTuple):
-    """Clicks and exposures per time bin and pattern, channel or step of a walk, and in the dark, (bins, channels) and (bins,).
+class Stretches:
+    """Named sums, float64 (BINS, *shape), over equal stretches of something numbered from 0; the stretches double as the numbers grow."""
 
-    Of an automaton also clicks and exposures of each state in the whole run, (states,); of fixed patterns those of each pattern and true
-    class, (channels, classes).
+    def __init__(self, **shapes: tuple[int, ...]) -> None:
+        self.width, self.used = 1, 0
+        self.sums: dict[str, F64] = {name: np.zeros((BINS, *shape)) for name, shape in shapes.items()}
+        self.sets: dict[int, NDArray[Any]] = {}
+
+    def at(self, numbers: I64) -> I64:
+        """Return the stretch of each number, after making them wide enough."""
+        if not len(numbers):
+            return numbers
+        while (top := int(numbers.max()) // self.width) >= BINS:
+            self.width *= 2
+            rest = [(name, one[::2] + one[1::2]) for name, one in self.sums.items()]
+            self.sums = {name: np.concatenate([one, np.zeros_like(one)]) for name, one in rest}
+            self.used, sets, self.sets = -(-self.used // 2), self.sets, {}
+            for place, one in sets.items():
+                self._join(place // 2, one)
+        self.used = max(self.used, top + 1)
+        return np.maximum(numbers, 0) // self.width
+
+    def add(self, name: str, numbers: I64, weights: Any = None) -> None:
+        """Add to the sum `name`, of no shape, which begins with the first that is added."""
+        self.sums.setdefault(name, np.zeros(BINS))
+        places = self.at(numbers)
+        self.sums[name] += np.bincount(places, weights, BINS)
+
+    def tell_apart(self, numbers: I64, things: NDArray[Any]) -> None:
+        """Remember which different `things` each stretch has."""
+        places = self.at(numbers)
+        for place in np.unique(places).tolist():
+            self._join(place, things[places == place])
+
+    def _join(self, place: int, things: NDArray[Any]) -> None:
+        known = self.sets.get(place, things[:0])
+        self.sets[place] = known if len(known) >= SET_MAX else np.union1d(known, things)[:SET_MAX]
+
+    def merged(self, most: int) -> Stretches:
+        """Return the same in at most `most` stretches."""
+        found, times = Stretches(), -(-max(self.used, 1) // max(most, 1))
+        firsts = np.arange(0, max(self.used, 1), times)
+        found.width, found.used = self.width * times, len(firsts)
+        found.sums = {name: np.add.reduceat(one[: max(self.used, 1)], firsts) for name, one in self.sums.items()}
+        for place, one in self.sets.items():
+            found._join(place // times, one)
+        return found
+
+
+class Rates:
+    """Clicks and exposures over time per pattern, channel or step of a walk ("clicks", "exposures") and in the dark ("dark clicks", ...).
+
+    Of an automaton also those of each state in the whole run, `state_clicks` and `state_exposures` (states,); of fixed patterns those of each
+    pattern and true class, `class_clicks` and `class_exposures` (channels, classes). A clock that went back adds to the first stretch.
     """
 
-    edges_s: F64
-    clicks: F64
-    exposures: F64
-    dark_clicks: F64
-    dark_exposures: F64
-    state_clicks: F64
-    state_exposures: F64
-    class_clicks: F64
-    class_exposures: F64
+    def __init__(self, plan: Plan, n_classes: int = 0) -> None:
+        self._plan = plan
+        self._first: int | None = None
+        walks, self.parallel = plan.automaton is not None, plan.mode == "parallel"
+        self.n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
+        self.what = "channel" if self.parallel else "step of the walk" if walks else "pattern"
+        self.over = Stretches(**{"clicks": (self.n,), "exposures": (self.n,), "dark clicks": (), "dark exposures": ()})
+        self.state_clicks, self.state_exposures = np.zeros(
+            (2, 0 if plan.automaton is None else plan.automaton.n_states)
+        )
+        self.class_clicks, self.class_exposures = np.zeros((2, self.n, 0 if walks else n_classes))
+        self._truths: dict[int, int] = {}
 
-
-def count_rates(recording: Recording, plan: Plan, n_classes: int = 0) -> Rates:
-    """Sum clicks and exposures over at most `BINS` equal stretches of device time; a clock that went back starts no new bin.
-
-    The messages are read twice, first for the length of the run: what is kept does not grow with it.
-    """
-    n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
-    edges = _edges(recording, plan, n)
-    bins, first_tick = len(edges) - 1, None
-    rates = Rates(
-        edges,
-        *np.zeros((2, bins, n)),
-        *np.zeros((2, bins)),
-        *np.zeros((2, 0 if plan.automaton is None else plan.automaton.n_states)),
-        *np.zeros((2, n, n_classes if plan.automaton is None else 0)),
-    )
-    truths: dict[int, int] = {}
-    for item in iter_exposures(recording, plan):
-        truths |= item.truths
+    def take(self, item: Exposures) -> None:
+        """Add the next exposures."""
+        self._truths |= item.truths
         if not len(item.message_tick):
-            continue
-        first_tick = int(item.message_tick[0]) if first_tick is None else first_tick
-        seconds = np.maximum(item.message_tick - first_tick, 0) * plan.tick_us * 1e-6
-        which = np.clip(np.searchsorted(edges, seconds, "right") - 1, 0, bins - 1)
-        _add(rates, item, which, plan, _classes(item.object, truths, n_classes))
-        while len(truths) > OBJECTS_KEPT:
-            del truths[next(iter(truths))]
-    return rates
+            return
+        plan = self._plan
+        if self._first is None:
+            self._first = int(item.message_tick[0])
+        cycles = np.maximum(item.message_tick - self._first, 0) * (plan.tick_us / plan.cycle_us)
+        where, dark = self.over.at(cycles.astype(np.int64)), is_dark(item.pattern)
+        clicks = (
+            item.clicks[:, : self.n] if self.parallel else np.asarray(item.clicks.any(axis=1))[:, None]
+        )  # in any of the channels
+        sums = self.over.sums
+        sums["dark clicks"] += np.bincount(where[dark], clicks[dark].sum(axis=1), BINS)
+        sums["dark exposures"] += np.bincount(where[dark], minlength=BINS) * (self.n if self.parallel else 1)
+        lit, at, truth = clicks[~dark], where[~dark], self._classes(item.object[~dark])
+        if self.parallel:
+            for channel in range(lit.shape[1]):
+                self._add(at, np.full(len(at), channel), lit[:, channel], truth)
+        else:
+            shown = item.pattern[~dark].astype(np.int64)
+            if plan.automaton is not None:
+                states = np.minimum(item.state[~dark], plan.automaton.n_states - 1)
+                self.state_clicks += np.bincount(states, lit[:, 0], plan.automaton.n_states)
+                self.state_exposures += np.bincount(states, minlength=plan.automaton.n_states)
+                shown = plan.automaton.depth[states].astype(np.int64)
+            self._add(at, np.minimum(shown, self.n - 1), lit[:, 0], truth)
+        while len(self._truths) > OBJECTS_KEPT:
+            del self._truths[next(iter(self._truths))]
 
+    def _classes(self, objects: I64) -> I64:
+        """The true class of each object, -1 where it is not known."""
+        different, at = np.unique(objects, return_inverse=True)
+        known = np.array([self._truths.get(number, -1) for number in different.tolist()], np.int64)
+        return np.where(known < self.class_clicks.shape[1], known, -1)[at]
 
-def _edges(recording: Recording, plan: Plan, n: int) -> F64:
-    """The ends of the stretches of time: as many as the exposures of each of `n` patterns, channels or steps are enough for."""
-    first, last, lit = None, 0, 0
-    for item in iter_exposures(recording, plan):
-        if len(item.message_tick):
-            first = int(item.message_tick[0]) if first is None else first
-            last = max(last, int(item.message_tick.max()))
-            lit += int((~is_dark(item.pattern)).sum())
-    if first is None:
-        return np.array([0.0, 1.0])
-    per_pattern = lit if plan.mode == "parallel" else lit / n
-    bins = int(np.clip(per_pattern / EXPOSURES_PER_BIN, 1, BINS))
-    return np.linspace(0.0, (last - first) * plan.tick_us * 1e-6 + plan.cycle_us * 1e-6, bins + 1)
+    def _add(self, at: I64, shown: I64, clicked: NDArray[np.bool_], truth: I64) -> None:
+        """Add exposures in the stretches `at`, one pattern, channel or step each."""
+        places, size = at * self.n + shown, BINS * self.n
+        self.over.sums["clicks"] += np.bincount(places, clicked, size).reshape(BINS, self.n)
+        self.over.sums["exposures"] += np.bincount(places, minlength=size).reshape(BINS, self.n)
+        if n := self.class_clicks.shape[1]:
+            known = truth >= 0
+            places = shown[known] * n + truth[known]
+            self.class_clicks += np.bincount(places, clicked[known], self.n * n).reshape(self.n, n)
+            self.class_exposures += np.bincount(places, minlength=self.n * n).reshape(self.n, n)
 
+    def _edges(self, over: Stretches) -> F64:
+        return np.arange(over.used + 1) * over.width * self._plan.cycle_us * 1e-6
 
-def _classes(objects: NDArray[np.int64], truths: Mapping[int, int], n_classes: int) -> NDArray[np.int64]:
-    """The true class of each object, -1 where it is not known."""
-    different, at = np.unique(objects, return_inverse=True)
-    known = np.array([truths.get(number, -1) for number in different.tolist()], np.int64)
-    return np.where(known < n_classes, known, -1)[at]
+    def heat(self) -> tuple[Any, float, int]:
+        """Return clicks per exposure over time as shades, the largest rate, and how many stretches of the run are shown."""
+        exposures = float(self.over.sums["exposures"].sum()) / self.n
+        over = self.over.merged(int(np.clip(exposures / EXPOSURES_PER_BIN, 1, HEAT_BINS)))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rate = over.sums["clicks"] / over.sums["exposures"]
+        high = float(np.nanmax(rate)) if np.isfinite(rate).any() else 0.0
+        x = Axis("time since the first exposure", 0.0, float(self._edges(over)[-1]), text=seconds)
+        y = Axis(self.what, -0.5, self.n - 0.5, text=whole)
+        return chart(f"Clicks per exposure of each {self.what} over the run", x, y, heat=rate.T), high, over.used
 
+    def dark(self) -> tuple[int, int, float, float] | None:
+        """Return clicks and dark exposures, and the 95 % interval of their ratio; None without dark exposures."""
+        clicks, exposures = (int(self.over.sums[f"dark {what}"].sum()) for what in ("clicks", "exposures"))
+        return (clicks, exposures, *wilson_interval(clicks, exposures)) if exposures else None
 
-def _add(rates: Rates, item: Exposures, which: NDArray[np.int64], plan: Plan, truth: NDArray[np.int64]) -> None:
-    """Add clicks and exposures of `item`, in the bins `which` and of the classes `truth` (-1: unknown)."""
-    dark, (bins, n) = is_dark(item.pattern), rates.clicks.shape
-    parallel = plan.mode == "parallel"
-    clicks = item.clicks[:, :n] if parallel else np.asarray(item.clicks.any(axis=1))[:, None]  # in any of the channels
-    rates.dark_clicks[:] += np.bincount(which[dark], clicks[dark].sum(axis=1), bins)
-    rates.dark_exposures[:] += np.bincount(which[dark], minlength=bins) * (n if parallel else 1)
-    lit, at, truth = clicks[~dark], which[~dark], truth[~dark]
-    if parallel:
-        for channel in range(lit.shape[1]):
-            _add_lit(rates, at, np.full(len(at), channel), lit[:, channel], truth)
-        return
-    shown = item.pattern[~dark].astype(np.int64)
-    if plan.automaton is not None:
-        states = np.minimum(item.state[~dark], plan.automaton.n_states - 1)
-        rates.state_clicks[:] += np.bincount(states, lit[:, 0], plan.automaton.n_states)
-        rates.state_exposures[:] += np.bincount(states, minlength=plan.automaton.n_states)
-        shown = plan.automaton.depth[states].astype(np.int64)
-    _add_lit(rates, at, np.minimum(shown, n - 1), lit[:, 0], truth)
+    def dark_chart(self, expected: float | None) -> Any:
+        """Return the dark rate over time with its interval and what is expected."""
+        total = float(self.over.sums["dark exposures"].sum())
+        over = self.over.merged(int(np.clip(total / DARK_PER_BIN, 1, DARK_BINS)))
+        some, edges = over.sums["dark exposures"] > 0, self._edges(over)
+        clicks, exposures = over.sums["dark clicks"][some], over.sums["dark exposures"][some]
+        ends = np.array([wilson_interval(int(c), int(n)) for c, n in zip(clicks, exposures)]).T
+        top = min(max(float(ends[1].max()), 1.2 * (expected or 0.0), 1e-12), 1.0)
+        return chart(
+            f"Dark clicks per exposure over the run, {clicks.sum() / total:.3g} on average",
+            Axis("time since the first exposure", 0.0, float(edges[-1]), text=seconds),
+            Axis("dark clicks per dark exposure", 0.0, top),
+            curves=[Curve(((edges[1:] + edges[:-1]) / 2)[some], clicks / exposures, low=ends[0], high=ends[1])],
+            marks=[] if expected is None else [Mark(expected, f"expected {expected:.3g}")],
+            height=190,
+        )
 
-
-def _add_lit(
-    rates: Rates, at: NDArray[np.int64], shown: NDArray[np.int64], clicked: NDArray[np.bool_], truth: NDArray[np.int64]
-) -> None:
-    """Add exposures in the bins `at`, one pattern, channel or step each."""
-    bins, n = rates.clicks.shape
-    places = at * n + shown
-    rates.clicks[:] += np.bincount(places, clicked, bins * n).reshape(bins, n)
-    rates.exposures[:] += np.bincount(places, minlength=bins * n).reshape(bins, n)
-    if sums := rates.class_clicks.size:
-        known = truth >= 0
-        places = shown[known] * rates.class_clicks.shape[1] + truth[known]
-        rates.class_clicks[:] += np.bincount(places, clicked[known], sums).reshape(rates.class_clicks.shape)
-        rates.class_exposures[:] += np.bincount(places, minlength=sums).reshape(rates.class_clicks.shape)
-
-
-def add_rates(page: Page, plan: Plan, rates: Rates) -> None:
-    """Add clicks per exposure over time."""
-    page.heading("Clicks over time")
-    what = "channel" if plan.mode == "parallel" else "pattern" if plan.automaton is None else "step of the walk"
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rate = np.where(rates.exposures > 0, rates.clicks / rates.exposures, np.nan)
-    high = float(np.nanmax(rate)) if np.isfinite(rate).any() else 1.0
-    n = rates.clicks.shape[1]
-    chart = Chart(
-        label=f"Clicks per exposure of each {what} over the run",
-        x=Axis("time since the first exposure", 0.0, float(rates.edges_s[-1]), text=seconds),
-        y=Axis(what, -0.5, n - 0.5, text=lambda value: f"{value:.0f}"),
-        heat=heat_png(rate.T[::-1], 0.0, high or 1.0),
-        height=min(420, 110 + 9 * n),
-    )
-    page.figure(
-        chart,
-        f"Clicks per exposure of each {what} in {len(rates.clicks)} stretches of the run, from 0 (light) to {high:.3g} (dark). Stripes "
-        "from top to bottom are moments in which the light changed; a stripe from left to right that differs from its neighbours is that "
-        f"{what} alone.",
-    )
-
-
-def add_dark(page: Page, rates: Rates, summary: Mapping[str, Any]) -> None:
-    """Add the dark counts over time as one strip."""
-    page.heading("Dark counts")
-    if not rates.dark_exposures.sum():
-        _empty_fields(page, summary)
-        return
-    clicks, exposures = int(rates.dark_clicks.sum()), int(rates.dark_exposures.sum())
-    low, high = wilson_interval(clicks, exposures)
-    told = summary.get("dark", {}).get("expected") if isinstance(summary.get("dark"), Mapping) else None
-    expected = float(np.mean(told)) if told is not None else None
-    page.text(
-        f"{clicks} clicks in {exposures} dark exposures: {clicks / exposures:.3g} per exposure, 95 % interval {low:.3g} to {high:.3g}"
-        + ("." if expected is None else f"; expected {expected:.3g}.")
-    )
-    page.figure(
-        dark_chart(rates, expected),
-        "Dark clicks per dark exposure in each stretch of the run, with 95 % intervals (Wilson).",
-    )
-    for words in summary.get("dark", {}).get("present", ()) if isinstance(summary.get("dark"), Mapping) else ():
-        page.text(str(words), "warn")
-
-
-def dark_chart(rates: Rates, expected: float | None) -> Chart:
-    """Return the dark rate over time with its interval and what is expected."""
-    total = float(rates.dark_exposures.sum())
-    group = -(-len(rates.dark_exposures) // int(np.clip(total // DARK_PER_BIN, 1, DARK_BINS)))  # bins to one stretch
-    firsts = np.arange(0, len(rates.dark_exposures), group)
-    exposures, clicks = (np.add.reduceat(sums, firsts) for sums in (rates.dark_exposures, rates.dark_clicks))
-    ends = rates.edges_s[np.minimum(firsts + group, len(rates.edges_s) - 1)]
-    some = exposures > 0
-    counted = zip(clicks[some].astype(int).tolist(), exposures[some].astype(int).tolist())
-    intervals = np.array([wilson_interval(c, n) for c, n in counted])
-    centres = ((rates.edges_s[firsts] + ends) / 2)[some]
-    rate = clicks[some] / exposures[some]
-    top = max(float(intervals[:, 1].max()), 1.2 * (expected or 0.0), 1e-12)
-    return Chart(
-        label=f"Dark clicks per exposure over the run, {rates.dark_clicks.sum() / rates.dark_exposures.sum():.3g} on average",
-        x=Axis("time since the first exposure", 0.0, float(rates.edges_s[-1]), text=seconds),
-        y=Axis("dark clicks per exposure", 0.0, min(top, 1.0), text=number),
-        curves=[Curve(centres, rate, low=intervals[:, 0], high=intervals[:, 1])],
-        marks=[] if expected is None else [Mark(expected, f"expected {expected:.3g}")],
-        height=150,
-    )
-
-
-def _empty_fields(page: Page, summary: Mapping[str, Any]) -> None:
-    """Without dark slots: what a flow's frames without an object told, channel by channel."""
-    dark = summary.get("dark")
-    channels = dark.get("channels") or [] if isinstance(dark, Mapping) else []
-    if not channels or not channels[0]["exposures"]:
-        page.text("The run had no dark slots: nothing is known about dark counts.", "note")
-        return
-    page.text(
-        "The run had no dark slots. Frames in which no object was found tell instead, as the run counted them.", "note"
-    )
-    rows = [
-        (channel, row["clicks"], row["exposures"], f"{row['low']:.3g} to {row['high']:.3g}", f"{row['expected']:.3g}")
-        for channel, row in enumerate(channels)
-    ]
-    page.table(rows, ("channel", "clicks", "frames", "per frame, 95 %", "expected"))
+    def meaning(self, number: int, classes: tuple[str, ...]) -> list[str]:
+        """Return how often pattern `number` clicked, and with which classes most and least often: counted, not modelled."""
+        exposures, clicks = (int(self.over.sums[name][:, number].sum()) for name in ("exposures", "clicks"))
+        if not exposures:
+            return ["never shown"]
+        low, high = wilson_interval(clicks, exposures)
+        lines = [f"clicked in {100 * clicks / exposures:.1f} % of exposures ({100 * low:.1f} to {100 * high:.1f} %)"]
+        if number >= len(self.class_exposures) or self.class_exposures.shape[1] != len(classes):
+            return lines
+        seen = self.class_exposures[number]
+        known = np.flatnonzero(seen >= LEAST_EXPOSURES)
+        if len(known) < 2:
+            return lines
+        share = self.class_clicks[number] / np.maximum(seen, 1)
+        named = [f"{classes[one]} {100 * share[one]:.0f} %" for one in known[np.argsort(-share[known])]]
+        return [*lines, f"most with {', '.join(named[:CLASSES_NAMED])}", f"least with {named[-1]}"]

@@ -16,9 +16,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.container import Block
 from pans.runtime.errors import DamagedFileError, UsageError
@@ -190,10 +187,9 @@ class JoinedRecording(Recording):
             once = REPEATED if number else frozenset()
             yield from (block for block in part.iter_blocks(*wanted) if block.kind not in once)
 
-    def iter_decisions(self) -> Iterator[NDArray[np.void]]:
-        """Yield the decisions block by block, DECISION_DTYPE (n,)."""
-        for part in self.parts:
-            yield from part.iter_decisions()
+    def read(self, *wanted: Kind) -> Iterator[tuple[Kind, Any]]:
+        """Yield the kind and the content of each whole block of these kinds, part by part."""
+        return (one for part in self.parts for one in part.read(*wanted))
 
     def bundle_data(self) -> bytes:
         """Return the bytes of the bundle that the run used, b"" if it was not recorded."""

@@ -95,48 +95,60 @@ class Recording:
                 if block.end >= self.end_offset:
                     return
 
+    def read(self, *wanted: Kind) -> Iterator[tuple[Kind, Any]]:
+        """Yield the kind and the content of each whole block of these kinds, in order; memory holds one block.
+
+        MESSAGES, COMMANDS and ANSWERS are (host_ns, bytes) pairs, EVENTS objects; DECISIONS, TIMINGS and CLOCK arrays of rows.
+        """
+        log = LogReader()
+        for block in self.iter_blocks(*wanted):
+            kind = Kind(block.kind)
+            if kind == Kind.DECISIONS:
+                yield kind, log.rows(block.payload, f"{self.path}: block {block.index}")
+            elif kind == Kind.TIMINGS:
+                yield kind, expand_timings(_checked_runs(block, self.path))
+            elif kind == Kind.CLOCK:
+                yield kind, _rows(block, CLOCK_DTYPE, self.path)
+            elif kind == Kind.EVENTS:
+                yield kind, _events(block, self.path)
+            else:
+                yield kind, _pairs(block, self.path)
+
     def messages(self) -> Iterator[tuple[int, bytes]]:
         """Yield (arrival host_ns, decoded bytes) of the device's messages, in order."""
-        return self._pairs(Kind.MESSAGES)
+        return (pair for _, pairs in self.read(Kind.MESSAGES) for pair in pairs)
 
     def commands(self) -> Iterator[tuple[int, bytes]]:
         """Yield (sent host_ns, bytes) of the commands, in order."""
-        return self._pairs(Kind.COMMANDS)
+        return (pair for _, pairs in self.read(Kind.COMMANDS) for pair in pairs)
 
     def answers(self) -> Iterator[tuple[int, bytes]]:
         """Yield (arrival host_ns, decoded bytes) of WELCOME, ACK and PONG, in order."""
-        return self._pairs(Kind.ANSWERS)
+        return (pair for _, pairs in self.read(Kind.ANSWERS) for pair in pairs)
 
     def decisions(self) -> NDArray[np.void]:
         """Return all decisions, DECISION_DTYPE (n,)."""
         return np.concatenate([np.zeros(0, DECISION_DTYPE), *self.iter_decisions()])
 
     def iter_decisions(self) -> Iterator[NDArray[np.void]]:
-        """Yield the decisions block by block, DECISION_DTYPE (n,); memory holds one block."""
-        reader = LogReader()
-        for block in self.iter_blocks(Kind.DECISIONS):
-            yield reader.rows(block.payload, f"{self.path}: block {block.index}")
+        """Yield the decisions block by block, DECISION_DTYPE (n,)."""
+        return (rows for _, rows in self.read(Kind.DECISIONS))
 
     def timings(self) -> NDArray[np.void]:
         """Return the host times of all decisions, TIMING_DTYPE (n,)."""
         return np.concatenate([np.zeros(0, TIMING_DTYPE), *self.iter_timings()])
 
     def iter_timings(self) -> Iterator[NDArray[np.void]]:
-        """Yield the host times block by block, TIMING_DTYPE (n,); memory holds one block."""
-        for block in self.iter_blocks(Kind.TIMINGS):
-            yield expand_timings(_checked_runs(block, self.path))
+        """Yield the host times block by block, TIMING_DTYPE (n,)."""
+        return (rows for _, rows in self.read(Kind.TIMINGS))
 
     def iter_clock_samples(self) -> Iterator[NDArray[np.void]]:
         """Yield the clock samples block by block, CLOCK_DTYPE (n,)."""
-        for block in self.iter_blocks(Kind.CLOCK):
-            yield _rows(block, CLOCK_DTYPE, self.path)
+        return (rows for _, rows in self.read(Kind.CLOCK))
 
     def events(self) -> Iterator[dict[str, Any]]:
         """Yield the events, in order."""
-        for block in self.iter_blocks(Kind.EVENTS):
-            for line in block.payload.splitlines():
-                where = f"{self.path}: an event in block {block.index}"
-                yield _checked_event(parse_json_object(line, where), where)
+        return (event for _, events in self.read(Kind.EVENTS) for event in events)
 
     def to_frame(self, table: str = "decisions") -> Any:
         """Return the `decisions` with their host times, or the `clicks`, as a pandas.DataFrame; needs the extra `frames`.
@@ -184,16 +196,21 @@ class Recording:
                     raise _past_block(self.path, block)
                 yield Messages(payload, spans[:count])
 
-    def _pairs(self, kind: Kind) -> Iterator[tuple[int, bytes]]:
-        for block in self.iter_blocks(kind):
-            position, payload = 0, block.payload
-            while position < len(payload):
-                start = position + MESSAGE.size
-                host_ns, length = MESSAGE.unpack_from(payload, position) if start <= len(payload) else (0, len(payload))
-                if start + length > len(payload):
-                    raise _past_block(self.path, block)
-                yield host_ns, payload[start : start + length]
-                position = start + length
+
+def _pairs(block: Block, path: Path) -> Iterator[tuple[int, bytes]]:
+    position, payload = 0, block.payload
+    while position < len(payload):
+        start = position + MESSAGE.size
+        host_ns, length = MESSAGE.unpack_from(payload, position) if start <= len(payload) else (0, len(payload))
+        if start + length > len(payload):
+            raise _past_block(path, block)
+        yield host_ns, payload[start : start + length]
+        position = start + length
+
+
+def _events(block: Block, path: Path) -> Iterator[dict[str, Any]]:
+    where = f"{path}: an event in block {block.index}"
+    return (_checked_event(parse_json_object(line, where), where) for line in block.payload.splitlines())
 
 
 def together(some: Iterable[NDArray[np.void]]) -> Iterator[NDArray[np.void]]:

@@ -10,7 +10,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.link import serial as serial
 from pans.runtime.record import Recorder
 from pans.runtime.report import summary as summary
-from pans.runtime.report import summary_page as summary_page
+from pans.runtime.report import words as words
 from pans.runtime.timing import ledger as ledger
 from pans.runtime.watch import watchers as watchers
 from pans.runtime.wire import FrameDecoder

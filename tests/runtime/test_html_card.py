@@ -10,7 +10,7 @@ from automata import automaton_bundle
 from commands import words_of
 
 import pans
-from pans.runtime.grey_png import read_grey_png
+from pans.runtime.images import read_grey_png
 from pans.runtime.html_card import html_card
 
 

@@ -112,7 +112,7 @@ def test_the_summary_page_of_a_run(text: str, tmp_path: Path) -> None:
     from dataclasses import replace
 
     import pans
-    from pans.runtime.report.summary_page import write_markdown
+    from pans.runtime.report.words import write_markdown
     from pans.runtime.report.words import closing_words
 
     if not hasattr(test_the_summary_page_of_a_run, "done"):

@@ -20,7 +20,7 @@ from pans.runtime.bundle.onnx_check import check_head
 from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.grey_png import png_bytes, read_grey_png
+from pans.runtime.images import grey_png, read_grey_png
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.operate.parquet import write_rows
 from pans.runtime.record import read_recording
@@ -133,7 +133,7 @@ def test_png_pictures_are_those_of_other_readers(dtype: Any, tmp_path: Path) -> 
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
     top = np.iinfo(dtype).max
     grey = np.random.default_rng(1).integers(0, top + 1, (7, 5)).astype(dtype)
-    (tmp_path / "ours.png").write_bytes(png_bytes(grey))
+    (tmp_path / "ours.png").write_bytes(grey_png(grey))
     assert (np.asarray(image.open(tmp_path / "ours.png")) == grey).all()
     smooth = np.linspace(0, top, 640).reshape(20, 32).astype(dtype)
     image.fromarray(smooth).save(tmp_path / "theirs.png", optimize=True)  # with filters
@@ -142,7 +142,7 @@ def test_png_pictures_are_those_of_other_readers(dtype: Any, tmp_path: Path) -> 
 
 
 def test_damaged_pictures_are_refused(tmp_path: Path) -> None:
-    data = png_bytes(np.zeros((4, 4), np.uint8))
+    data = grey_png(np.zeros((4, 4), np.uint8))
     wrong = [b"", b"GIF89a", data[:-1], data[:20], data[:40] + b"x" + data[41:], data.replace(b"IHDR", b"JHDR")]
     wrong += [data[:cut] for cut in range(8, len(data), 3)]
     for one in wrong:
