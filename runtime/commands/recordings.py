@@ -247,12 +247,10 @@ def _compare(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_outputs([args.out], inputs=[args.first, args.second], force=args.force)
     from pans.runtime.compare import compare, read_side
-    from pans.runtime.compare.words import comparison_words
+    from pans.runtime.compare.words import comparison_page, comparison_words
 
     found = compare(read_side(args.first), read_side(args.second), args.objects)
     if args.out is not None:
-        from pans.runtime.compare.page import comparison_page
-
         write_file(args.out, comparison_page(found), force=args.force)
     report = {"report": None if args.out is None else str(args.out)}
     emit(args, found.as_json() | report, comparison_words(found))

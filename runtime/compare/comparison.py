@@ -6,16 +6,26 @@ P-values of one comparison are corrected for their number (Holm), and 0.05 is th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .side import Side
+from pans.runtime.container import parse_json_object, read_file
+from pans.runtime.errors import UsageError
+from pans.runtime.intervals import Z_95
+from pans.runtime.pages.page import flat
+from pans.runtime.record import Recording, read_recording
+from pans.runtime.record.format import Kind
+from pans.runtime.record.parts import find_parts
+
 from .statistics import (
     LEAST_US,
+    Interval,
     fisher_exact,
     holm,
     mcnemar_exact,
@@ -29,6 +39,8 @@ from .statistics import (
 ALPHA = 0.05
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 LEAST_BEYOND = 10  # decisions slower than a quantile, or nothing is said about it
+SUMMARY_MAX_BYTES = 1 << 24
+RECORDING = "run.pansrec"
 # Facts that differ between any two runs, or that follow from others.
 _ALWAYS_DIFFERENT = ("created_utc", "command", "format_version", "toml", "decisions_sha256", "tick", "part")
 _DERIVED = (
@@ -40,7 +52,86 @@ _DERIVED = (
     "options.force",
 )
 _FIRST = ("bundle_sha256", "profile.", "device_url")  # what a reader asks for first
+_MEANS = {"photons_mean": "photons per decision", "illumination": "illumination per decision"}
 F64 = NDArray[np.float64]
+
+
+# ---- the sides ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Side:
+    """A run: where it was found, header and summary as they were written, decisions and host times (None of a summary alone)."""
+
+    path: Path
+    header: Mapping[str, Any]
+    summary: Mapping[str, Any]
+    decisions: NDArray[np.void] | None
+    timings: NDArray[np.void] | None
+    complete: bool
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the clicks are simulated."""
+        return bool(self.header.get("simulated") or self.summary.get("simulated"))
+
+    @property
+    def scene(self) -> str:
+        """The scene that a simulated instrument was given, "" where none is named."""
+        query = str(self.header.get("device_url", "")).partition("?")[2]
+        return (parse_qs(query).get("scene") or [""])[0]
+
+    @property
+    def latency_us(self) -> F64 | None:
+        """From the end of the exposure to the decision, in the order of time."""
+        return None if self.timings is None else (self.timings["decided_ns"] - self.timings["device_end_ns"]) / 1000.0
+
+
+def read_side(path: str | Path) -> Side:
+    """Return the run at `path`: its folder, a recording, or the JSON object that `pans run --json` printed.
+
+    UsageError where there is none, DamagedFileError for a damaged file.
+    """
+    place = Path(path)
+    if place.suffix == ".json" and place.is_file():
+        summary = parse_json_object(read_file(place, SUMMARY_MAX_BYTES), str(place))
+        if "decisions" not in summary or "verdict" not in summary:
+            remedy = "save what `pans run --json` prints, or name the recording"
+            raise UsageError(f"{place}: not a summary: it has no keys `decisions` and `verdict`", remedy=remedy)
+        return Side(place, {}, summary, None, None, True)
+    found = [read_recording(one, salvage=True) for one in _recordings(place)]
+    decisions, timings = _rows(found)
+    return Side(place, found[0].header, found[-1].summary, decisions, timings, all(one.complete for one in found))
+
+
+def _rows(recordings: list[Recording]) -> tuple[NDArray[np.void], NDArray[np.void]]:
+    """Decisions and host times of the recordings, which are read once."""
+    held: dict[Kind, list[NDArray[np.void]]] = {Kind.DECISIONS: [], Kind.TIMINGS: []}
+    for one in recordings:
+        for kind, rows in one.read(*held):
+            held[kind].append(rows)
+    none = recordings[0]
+    decisions, timings = (np.concatenate(some) if some else None for some in held.values())
+    return none.decisions() if decisions is None else decisions, none.timings() if timings is None else timings
+
+
+def _recordings(place: Path) -> list[Path]:
+    if place.is_file():
+        return [place]
+    if (place / RECORDING).is_file():
+        return [place / RECORDING]
+    if parts := find_parts(place):
+        return list(parts)
+    whole = sorted(place.glob("*.pansrec")) if place.is_dir() else []
+    if len(whole) != 1:
+        words = (
+            f"{len(whole)} recordings in this folder, expected one run" if place.is_dir() else "no such file or folder"
+        )
+        raise UsageError(f"{place}: {words}", remedy="name a run's folder, a recording or a summary")
+    return whole
+
+
+# ---- what is found ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +173,9 @@ class Finding:
 
     def as_json(self) -> dict[str, Any]:
         """Return it JSON-able; what is not finite becomes None."""
-        facts = {key: _finite(value) for key, value in asdict(self).items()}
+        facts = {
+            key: None if isinstance(one, float) and not np.isfinite(one) else one for key, one in asdict(self).items()
+        }
         return facts | {"difference_is": "a / b" if self.is_ratio else "a - b", "significant": self.significant}
 
 
@@ -114,56 +207,27 @@ class Comparison:
 def compare(first: Side, second: Side, pairing: str = "auto") -> Comparison:
     """Return in what two runs differ; `pairing` says whether their objects are the same, or `auto` to find out."""
     paired, why = _pairing(first, second, pairing)
-    found = [
-        *_accuracy(first, second, paired),
-        *_abstained(first, second),
-        *(_mean(first, second, name, unit) for name, unit in _MEANS.items()),
-        *_late_and_lost(first, second),
-        *_dark(first, second),
-        *_latencies(first, second),
-    ]
-    tested = [finding for finding in found if finding.p is not None]
-    corrected = dict(zip(map(id, tested), holm([finding.p for finding in tested if finding.p is not None])))
-    findings = tuple(_corrected(finding, corrected.get(id(finding))) for finding in found)
-    return Comparison(first, second, paired, why, tuple(changes_of(first, second)), findings)
-
-
-def _corrected(finding: Finding, p: float | None) -> Finding:
-    return finding if p is None else Finding(**{**asdict(finding), "p_corrected": p})
-
-
-# ---- what was different about the runs ----
+    found = list(_findings(first, second, paired))
+    tested = [at for at, finding in enumerate(found) if finding.p is not None]
+    for at, p in zip(tested, holm([found[at].p or 0.0 for at in tested])):
+        found[at] = replace(found[at], p_corrected=p)
+    return Comparison(first, second, paired, why, tuple(changes_of(first, second)), tuple(found))
 
 
 def changes_of(first: Side, second: Side) -> list[Change]:
     """Return the facts of headers and devices that differ: bundle, profile and device first, the others in the order of their names."""
-    facts = [_facts(side) for side in (first, second)]
-    names = sorted({*facts[0], *facts[1]}, key=lambda name: (not name.startswith(_FIRST), name))
-    rows = ((name, facts[0].get(name, ""), facts[1].get(name, "")) for name in names)
-    return [Change(*row) for row in rows if row[1] != row[2]]
+    one, two = (_facts(side) for side in (first, second))
+    names = sorted({*one, *two}, key=lambda name: (not name.startswith(_FIRST), name))
+    return [Change(name, one.get(name, ""), two.get(name, "")) for name in names if one.get(name) != two.get(name)]
 
 
 def _facts(side: Side) -> dict[str, str]:
-    kept = {key: value for key, value in side.header.items() if key not in _ALWAYS_DIFFERENT}
     told = {"device": side.summary.get("device", {}), "deadline_us": side.summary.get("deadline_us")}
     return {
         name: text
-        for name, text in _flat({**kept, **told})
-        if name.rpartition(".")[2] not in _ALWAYS_DIFFERENT and not name.startswith(_DERIVED)
+        for name, text in flat({**side.header, **told})
+        if not {*name.split(".")} & {*_ALWAYS_DIFFERENT} and not name.startswith(_DERIVED)
     }
-
-
-def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    found = []
-    for name, value in facts.items():
-        if isinstance(value, Mapping):
-            found += _flat(value, f"{prefix}{name}.")
-        elif value is not None:
-            found.append((f"{prefix}{name}", f"{value:.6g}" if isinstance(value, float) else str(value)))
-    return found
-
-
-# ---- whether objects are the same ----
 
 
 def _pairing(first: Side, second: Side, pairing: str) -> tuple[bool, str]:
@@ -171,12 +235,12 @@ def _pairing(first: Side, second: Side, pairing: str) -> tuple[bool, str]:
         return False, "the objects are different ones, as was said"
     if first.decisions is None or second.decisions is None:
         return False, "a summary has no decisions: objects cannot be compared one by one"
-    truths = [_truth_of_objects(side.decisions) for side in (first, second)]
-    common = truths[0].keys() & truths[1].keys()
+    known = [rows[rows["truth"] >= 0] for rows in (first.decisions, second.decisions)]
+    one, two = (dict(zip(rows["object"].tolist(), rows["truth"].tolist())) for rows in known)
+    common = one.keys() & two.keys()
     if not common:
         return False, "no object with a known truth is in both runs"
-    differ = sum(truths[0][number] != truths[1][number] for number in common)
-    if differ:
+    if differ := sum(one[number] != two[number] for number in common):
         return False, f"{differ} of {len(common)} objects of the same number have another true class"
     if pairing == "same":
         return True, f"{len(common)} objects are the same, as was said"
@@ -185,180 +249,128 @@ def _pairing(first: Side, second: Side, pairing: str) -> tuple[bool, str]:
     return False, "nothing says that the objects are the same; `--objects same` does"
 
 
-def _truth_of_objects(decisions: NDArray[np.void] | None) -> dict[int, int]:
-    if decisions is None:
-        return {}
-    known = decisions[decisions["truth"] >= 0]
-    return dict(zip(known["object"].tolist(), known["truth"].tolist()))
-
-
-def _share_right(decisions: NDArray[np.void]) -> dict[int, float]:
-    """The share of right decisions of each object with a known truth."""
-    known = decisions[decisions["truth"] >= 0]
-    objects, at = np.unique(known["object"], return_inverse=True)
-    right = np.bincount(at, weights=known["label"] == known["truth"])
-    return dict(zip(objects.tolist(), (right / np.maximum(np.bincount(at), 1)).tolist()))
-
-
 # ---- figures ----
 
-_MEANS = {
-    "clicks_mean": "clicks per decision",
-    "photons_mean": "photons per decision",
-    "illumination": "illumination per decision",
-}
+
+def _findings(first: Side, second: Side, paired: bool) -> Iterator[Finding]:
+    sides = (first, second)
+    if (accuracy := _accuracy(first, second, paired)) is not None:
+        yield accuracy
+    yield from _abstained(first, second)
+    yield _clicks(first, second)
+    for name, unit in _MEANS.items():
+        values = [side.summary.get(name) for side in sides]
+        if name == "illumination":
+            values = [side.summary.get("illumination_mean", value) for side, value in zip(sides, values)]
+        yield _untested(name, unit, values)
+    for name, unit in (("late", "decisions"), ("lost", "exposures")):
+        totals = [
+            (side.summary if name == "late" else side.summary.get("stream") or {}).get(unit) or 0 for side in sides
+        ]
+        counts = [int(side.summary.get(name) or 0) for side in sides]
+        if any(counts) and all(totals):
+            yield _counted(name, f"per {unit[:-1]}", unit, counts, totals, "; bursts look surer than they are")
+    darks = [side.summary.get("dark") or {} for side in sides]
+    if all(dark.get("exposures") for dark in darks):
+        counts, totals = ([int(dark[key]) for dark in darks] for key in ("clicks", "exposures"))
+        yield _counted("dark_rate", "clicks per dark exposure", "dark exposures", counts, totals, ", exact")
+    yield from _latencies(first, second)
 
 
-def _accuracy(first: Side, second: Side, paired: bool) -> list[Finding]:
+def _untested(name: str, unit: str, values: list[Any], why: str = "not tested", *, is_ratio: bool = False) -> Finding:
+    one, two = (None if value is None else float(value) for value in values)
+    apart = None
+    if one is not None and two is not None and (two or not is_ratio):
+        apart = one / two if is_ratio else one - two
+    return Finding(name, unit, one, two, apart, None, None, is_ratio, None, why)
+
+
+def _counted(name: str, unit: str, of: str, counts: list[int], totals: list[int], more: str) -> Finding:
+    """Two Poisson counts, each of so many."""
+    four = counts[0], totals[0], counts[1], totals[1]
+    method = "{} of {} and {} of {} {} as two Poisson counts{}".format(*four, of, more)
+    return Finding(
+        name, unit, counts[0] / totals[0], counts[1] / totals[1], *rate_ratio(*four), True, poisson_rates(*four), method
+    )
+
+
+def _of_objects(decisions: NDArray[np.void], values: NDArray[Any]) -> dict[int, float]:
+    """The mean of the decisions' `values` for each object."""
+    objects, at = np.unique(decisions["object"], return_inverse=True)
+    return dict(zip(objects.tolist(), (np.bincount(at, weights=values) / np.maximum(np.bincount(at), 1)).tolist()))
+
+
+def _accuracy(first: Side, second: Side, paired: bool) -> Finding | None:
     values = [side.summary.get("accuracy") for side in (first, second)]
     sizes = [int(side.summary.get("objects") or 0) for side in (first, second)]
     if first.decisions is not None and second.decisions is not None:
-        shares = [_share_right(decisions) for decisions in (first.decisions, second.decisions)]
+        known = [rows[rows["truth"] >= 0] for rows in (first.decisions, second.decisions)]
+        shares = [_of_objects(rows, rows["label"] == rows["truth"]) for rows in known]
         if paired:
-            return [_paired_accuracy(shares[0], shares[1])]
+            return _paired_accuracy(*shares)
         sizes = [len(one) for one in shares]
         values = [sum(one.values()) / len(one) if one else None for one in shares]
     if None in values or not all(sizes):
-        return []
-    one, two = (float(value or 0.0) for value in values)
-    counts = round(one * sizes[0]), sizes[0], round(two * sizes[1]), sizes[1]
-    between = newcombe_difference(one * sizes[0], sizes[0], two * sizes[1], sizes[1])  # of the shares that are shown
-    method = f"two shares of {sizes[0]} and {sizes[1]} distinct objects, Fisher exact; interval by Newcombe"
-    return [Finding("accuracy", "share", one, two, *between, False, fisher_exact(*counts), method)]
+        return None
+    shares_ = [float(value or 0.0) for value in values]
+    method = f"two shares of {sizes[0]} and {sizes[1]} distinct objects"
+    return _two_shares("accuracy", shares_, [p * n for p, n in zip(shares_, sizes)], sizes, method)
+
+
+def _two_shares(name: str, shares: list[float], right: list[float], sizes: list[int], method: str) -> Finding:
+    between = newcombe_difference(right[0], sizes[0], right[1], sizes[1])  # of the shares that are shown
+    p = fisher_exact(round(right[0]), sizes[0], round(right[1]), sizes[1])
+    return Finding(name, "share", *shares, *between, False, p, f"{method}, Fisher exact; interval by Newcombe")
 
 
 def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Finding:
     common = sorted(first.keys() & second.keys())
     one, two = (np.array([shares[number] for number in common]) for shares in (first, second))
     better, worse = int((one > two).sum()), int((one < two).sum())
-    between = paired_difference(one, two)
     method = f"pairs of {len(common)} objects: {better} better in A, {worse} better in B, McNemar exact"
-    p = mcnemar_exact(better, worse)
+    between, p = paired_difference(one, two), mcnemar_exact(better, worse)
     return Finding("accuracy", "share", float(one.mean()), float(two.mean()), *between, False, p, method)
 
 
-def _abstained(first: Side, second: Side) -> list[Finding]:
-    counts, shares, sizes = [], [], []
+def _abstained(first: Side, second: Side) -> Iterator[Finding]:
+    shares, sizes = [], []
     for side in (first, second):
         abstained, decisions = (int(side.summary.get(name) or 0) for name in ("abstained", "decisions"))
-        trials = max(1, int(side.summary.get("trials") or 1))
         if not decisions:
-            return []
-        n = max(1, decisions // trials)
-        counts += [min(n, round(abstained / trials)), n]
+            return
+        sizes.append(max(1, decisions // max(1, int(side.summary.get("trials") or 1))))
         shares.append(abstained / decisions)
-        sizes.append(n)
-    if not any(shares):
-        return []
-    between = newcombe_difference(shares[0] * sizes[0], sizes[0], shares[1] * sizes[1], sizes[1])
-    method = "two shares, the trials of an object count once; Fisher exact; interval by Newcombe"
-    return [Finding("abstained", "share", shares[0], shares[1], *between, False, fisher_exact(*counts), method)]
+    if any(shares):
+        right = [share * n for share, n in zip(shares, sizes)]
+        yield _two_shares("abstained", shares, right, sizes, "two shares, the trials of an object count once")
 
 
-def _mean(first: Side, second: Side, name: str, unit: str) -> Finding:
-    values = [side.summary.get(name) for side in (first, second)]
-    if name == "illumination":
-        values = [side.summary.get("illumination_mean", side.summary.get(name)) for side in (first, second)]
-    one, two = (None if value is None else float(value) for value in values)
-    if name == "clicks_mean" and first.decisions is not None and second.decisions is not None:
-        means = [_clicks_of_objects(side.decisions) for side in (first, second)]
-        if min(map(len, means)) > 1:
-            return _clicks(means[0], means[1], unit)
-    difference = None if one is None or two is None else one - two
-    return Finding(name, unit, one, two, difference, None, None, False, None, "not tested")
+def _clicks(first: Side, second: Side) -> Finding:
+    unit = "clicks per decision"
+    if first.decisions is not None and second.decisions is not None:
+        one, two = (
+            np.array([*_of_objects(rows, rows["clicks"]).values()]) for rows in (first.decisions, second.decisions)
+        )
+        if min(len(one), len(two)) > 1:
+            apart = float(one.mean() - two.mean())
+            half = Z_95 * float(np.sqrt(one.var(ddof=1) / len(one) + two.var(ddof=1) / len(two)))
+            method = f"means of {len(one)} and {len(two)} objects; interval by their spread"
+            between = Interval(apart, apart - half, apart + half)
+            return Finding("clicks_mean", unit, float(one.mean()), float(two.mean()), *between, False, None, method)
+    return _untested("clicks_mean", unit, [side.summary.get("clicks_mean") for side in (first, second)])
 
 
-def _clicks_of_objects(decisions: NDArray[np.void] | None) -> F64:
-    assert decisions is not None
-    _, at = np.unique(decisions["object"], return_inverse=True)
-    return np.asarray(np.bincount(at, weights=decisions["clicks"]) / np.bincount(at), np.float64)
-
-
-def _clicks(first: F64, second: F64, unit: str) -> Finding:
-    difference = float(first.mean() - second.mean())
-    half = 1.959963984540054 * float(np.sqrt(first.var(ddof=1) / len(first) + second.var(ddof=1) / len(second)))
-    method = f"means of {len(first)} and {len(second)} objects; interval by their spread"
-    ends = difference - half, difference + half
-    return Finding(
-        "clicks_mean", unit, float(first.mean()), float(second.mean()), difference, *ends, False, None, method
-    )
-
-
-def _late_and_lost(first: Side, second: Side) -> list[Finding]:
-    found = []
-    for name, unit, of in (("late", "decisions", "decisions"), ("lost", "exposures", "exposures")):
-        counts = [int(side.summary.get(name) or 0) for side in (first, second)]
-        totals = [_total(side.summary, of) for side in (first, second)]
-        if not any(counts) or not all(totals):
-            continue
-        p = poisson_rates(counts[0], totals[0], counts[1], totals[1])
-        ratio = rate_ratio(counts[0], totals[0], counts[1], totals[1])
-        shares = [count / total for count, total in zip(counts, totals)]
-        method = f"{counts[0]} of {totals[0]} and {counts[1]} of {totals[1]} {unit} as two Poisson counts; bursts look surer than they are"
-        found.append(Finding(name, f"per {of[:-1]}", shares[0], shares[1], *ratio, True, p, method))
-    return found
-
-
-def _total(summary: Mapping[str, Any], name: str) -> int:
-    if name == "decisions":
-        return int(summary.get("decisions") or 0)
-    stream = summary.get("stream")
-    return int(stream.get("exposures") or 0) if isinstance(stream, Mapping) else 0
-
-
-def _dark(first: Side, second: Side) -> list[Finding]:
-    darks = [side.summary.get("dark") for side in (first, second)]
-    counts = [
-        (int(dark["clicks"]), int(dark["exposures"]))
-        for dark in darks
-        if isinstance(dark, Mapping) and dark.get("exposures")
-    ]
-    if len(counts) < 2:
-        return []
-    (clicks_1, n_1), (clicks_2, n_2) = counts
-    p, ratio = poisson_rates(clicks_1, n_1, clicks_2, n_2), rate_ratio(clicks_1, n_1, clicks_2, n_2)
-    method = f"{clicks_1} clicks in {n_1} and {clicks_2} in {n_2} dark exposures as two Poisson counts, exact"
-    return [Finding("dark_rate", "clicks per dark exposure", clicks_1 / n_1, clicks_2 / n_2, *ratio, True, p, method)]
-
-
-def _latencies(first: Side, second: Side) -> list[Finding]:
-    if first.latency_us is None or second.latency_us is None:
-        return _summed_latencies(first, second)
-    found = []
+def _latencies(first: Side, second: Side) -> Iterator[Finding]:
+    one, two = first.latency_us, second.latency_us
     for name, q in QUANTILES.items():
-        if min(len(first.latency_us), len(second.latency_us)) * (1 - q) < LEAST_BEYOND:
-            continue
-        if min(np.quantile(first.latency_us, q), np.quantile(second.latency_us, q)) < LEAST_US:
-            continue  # virtual time
-        one = quantile_ratio(first.latency_us, second.latency_us, q)
-        method = "interval by a bootstrap of stretches of consecutive decisions"
-        found.append(Finding(f"latency_{name}", "us", one.first, one.second, *one.ratio, True, None, method))
-    return found
-
-
-def _summed_latencies(first: Side, second: Side) -> list[Finding]:
-    found = []
-    for name, key in (("p50", "p50"), ("p99", "p99"), ("p99.9", "p999")):
-        values = [(side.summary.get("latency_us") or {}).get(key) for side in (first, second)]
-        if None not in values and min(float(value or 0) for value in values) >= LEAST_US:
-            one, two = (float(value or 0) for value in values)
-            ratio = one / two if two else None
-            found.append(
-                Finding(
-                    f"latency_{name}",
-                    "us",
-                    one,
-                    two,
-                    ratio,
-                    None,
-                    None,
-                    True,
-                    None,
-                    "not tested: no single latencies",
-                )
-            )
-    return found
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        if one is None or two is None:
+            values = [(side.summary.get("latency_us") or {}).get(name.replace(".", "")) for side in (first, second)]
+            if None not in values and min(map(float, values)) >= LEAST_US:
+                yield _untested(f"latency_{name}", "us", values, "not tested: no single latencies", is_ratio=True)
+        elif (
+            min(len(one), len(two)) * (1 - q) >= LEAST_BEYOND
+            and min(np.quantile(one, q), np.quantile(two, q)) >= LEAST_US
+        ):
+            found = quantile_ratio(one, two, q)  # but in virtual time
+            method = "interval by a bootstrap of stretches of consecutive decisions"
+            yield Finding(f"latency_{name}", "us", found.first, found.second, *found.ratio, True, None, method)

@@ -1,12 +1,19 @@
-"""A comparison in words: the lines for a terminal, and the rows and sentences that the page shares."""
+"""A comparison in words: the lines for a terminal, and the page."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
+from pans.runtime.pages.page import render
+from pans.runtime.pages.run import Decisions
+from pans.runtime.pages.timing import Durations, latency_chart
 from pans.runtime.safe_text import one_line
 
-from .comparison import ALPHA, Comparison, Finding
+from .comparison import ALPHA, Change, Comparison, Finding, Side
+
+SAME = "Bundle, profile, options and device are the same."
 
 NAMES = {
     "accuracy": "accuracy",
@@ -73,23 +80,81 @@ def conclusion(comparison: Comparison) -> str:
 
 
 def comparison_words(comparison: Comparison) -> str:
-    """Return all of it as lines for a terminal."""
+    """Return all of it as lines for a terminal: results first, then what was different about the runs."""
     first, second = comparison.first, comparison.second
     lines = [
         *(["SIMULATED"] if first.simulated or second.simulated else []),
         f"A  {one_line(first.path)}: {one_line(first.summary.get('verdict', 'cut, no summary'))}",
         f"B  {one_line(second.path)}: {one_line(second.summary.get('verdict', 'cut, no summary'))}",
         "",
-        "What changed:" if comparison.changes else "Bundle, profile, options and device are the same.",
-        *(
-            f"  {one_line(one.name)}: {one_line(one.first or '-', 60)} -> {one_line(one.second or '-', 60)}"
-            for one in comparison.changes
-        ),
-        "",
+        conclusion(comparison),
         f"Objects: {'paired' if comparison.paired else 'two samples'}; {one_line(comparison.why)}",
         "",
     ]
     for one in comparison.findings:
         sides = f"A {value_of(one, one.first)}, B {value_of(one, one.second)}"
         lines.append(f"  {NAMES.get(one.name, one.name):<26}{sides}; {difference_of(one)}; {verdict_of(one)}")
-    return "\n".join([*lines, "", conclusion(comparison)])
+    lines += ["", "What changed:" if comparison.changes else SAME]
+    for change in sorted(comparison.changes, key=_is_hash):
+        texts = (one_line(text or "-", 60) for text in (change.first, change.second))
+        lines.append(f"  {one_line(change.name)}: {' -> '.join(texts)}")
+    return "\n".join(lines)
+
+
+def _is_hash(change: Change) -> bool:
+    return "sha256" in change.name
+
+
+def comparison_page(comparison: Comparison) -> bytes:
+    """Return the page: results and their differences, curves of both sides, what was different about the runs, hashes at the end."""
+    sides = {"A": comparison.first, "B": comparison.second}
+    return render(
+        "compare.html",
+        simulated=any(side.simulated for side in sides.values()),
+        sides=sides,
+        comparison=comparison,
+        conclusion=conclusion(comparison),
+        rows=[
+            (
+                NAMES.get(one.name, one.name),
+                value_of(one, one.first),
+                value_of(one, one.second),
+                difference_of(one),
+                verdict_of(one),
+            )
+            for one in comparison.findings
+        ],
+        methods=[f"{NAMES.get(one.name, one.name)}: {one.method}." for one in comparison.findings],
+        charts=[drawn for name, side in sides.items() for drawn in _charts(name, side)],
+        facts=[(name, *(_facts(side)[name] for side in sides.values())) for name in _facts(comparison.first)],
+        changes=[(one.name, one.first or "-", one.second or "-") for one in sorted(comparison.changes, key=_is_hash)],
+        same=SAME,
+    )
+
+
+def _facts(side: Side) -> dict[str, str]:
+    made = side.summary.get("decisions", 0 if side.decisions is None else len(side.decisions))
+    return {
+        "run": str(side.path),
+        "date": str(side.header.get("created_utc", "unknown"))[:19].replace("T", " "),
+        "verdict": str(side.summary.get("verdict", "cut, no summary")),
+        "decisions": f"{made:,}",
+    }
+
+
+def _charts(name: str, side: Side) -> Iterator[tuple[Any, str]]:
+    """Yield the charts of one side with their captions: accuracy over time, latency unless time was virtual."""
+    if side.decisions is None or side.timings is None or not len(side.decisions):
+        return
+    numbers = Decisions(side.header["config"], len(side.decisions), first=int(side.decisions["index"][0]))
+    numbers.take(side.decisions)
+    drawn, _ = numbers.accuracy(max(int(side.decisions["truth"].max()) + 1, 2), f"{name}: accuracy over the run")
+    if drawn is not None:
+        yield drawn, f"{name}: share of right decisions over the run, with 95 % intervals."
+    durations = Durations()
+    durations.take(side.timings)
+    if durations.is_virtual():
+        return
+    deadline = side.summary.get("deadline_us")
+    drawn = latency_chart(durations, float(deadline) if deadline else None, f"{name}: latency")
+    yield drawn, f"{name}: share of decisions that took longer, whole and by stage."

@@ -1,7 +1,7 @@
 """HTML pages of runs, bundles, measurements and folders of runs: one file each, for any width, in light and dark, and on paper.
 
 What comes in are files of this project; what goes out is HTML. Structure and words stand in templates/ (Jinja2), charts.py draws
-(matplotlib), both of the extra `ui`. No page runs a script or loads anything. Start with run.py and templates/run.html.
+(matplotlib), both of the extra `plot`. No page runs a script or loads anything. Start with run.py and templates/run.html.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pans.runtime.report.verify import file_kind
 def page_of(path: str | Path) -> bytes:
     """Return the page of a recording, a bundle, a calibration or a registration.
 
-    UsageError for another kind of file, a missing one, and without the extra `ui`.
+    UsageError for another kind of file, a missing one, and without the extra `plot`.
     """
     from pans.runtime.record.parts import open_recording
 

@@ -1,4 +1,4 @@
-"""Charts of the pages: arrays in, inline SVG out, drawn by matplotlib (extra `ui`), which is loaded with the first of them.
+"""Charts of the pages: arrays in, inline SVG out, drawn by matplotlib (extra `plot`), which is loaded with the first of them.
 
 A chart is drawn once, so small that it can be read on a telephone, and scales with its column. Its colours are variables of the page's
 style, so that they follow light, dark and print.
@@ -45,11 +45,11 @@ _STYLE = {
 
 
 def needed(name: str, what: str = "a page") -> ModuleType:
-    """Return the module `name` of the extra `ui`; UsageError that says what needs it where it is not installed."""
+    """Return the module `name` of the extra `plot`; UsageError that says what needs it where it is not installed."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise missing_extra(what, name.partition(".")[0], "ui") from error
+        raise missing_extra(what, name.partition(".")[0], "plot") from error
 
 
 # ---- numbers on axes ----

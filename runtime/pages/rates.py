@@ -76,8 +76,8 @@ class Stretches:
 class Rates:
     """Clicks and exposures over time per pattern, channel or step of a walk ("clicks", "exposures") and in the dark ("dark clicks", ...).
 
-    Of an automaton also those of each state in the whole run, `state_clicks` and `state_exposures` (states,); of fixed patterns those of each
-    pattern and true class, `class_clicks` and `class_exposures` (channels, classes). A clock that went back adds to the first stretch.
+    Of an automaton also those of each state in the whole run, `state_clicks` and `state_exposures` (states,); of fixed patterns those of
+    each pattern and true class, `class_clicks` and `class_exposures` (channels, classes). A clock that went back adds to the first stretch.
     """
 
     def __init__(self, plan: Plan, n_classes: int = 0) -> None:

@@ -1,13 +1,13 @@
 """The page of a run: its recording is read once, block by block, while sums of bounded size add up; the rest is that of its summary.
 
-The messages are read for the rates, and the other blocks, as they come in between, go to who sums them up. Verdict, faults and figures are those
-that the run recorded; a recording that was cut has none, and says so.
+The messages are read for the rates; the blocks that come in between go to who sums them up. Only objects in flow need a second reading:
+their passages come from a replay. Verdict, faults and figures are those that the run recorded; a recording that was cut has none, and says so.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -30,13 +30,12 @@ from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, whole
 from .events import sentence_of
 from .page import points, render
 from .rates import BINS, Rates, Stretches
-from .timing import IN_HOST, Clock, Durations, latency_chart
+from .timing import Clock, Durations, latency_chart
 from .walks import Walks
 
 CONFUSION_MAX = 40  # classes
 ACCURACY_BINS, OBJECTS_PER_BIN = 60, 20
 SHOWN, OF_A_KIND = 200, 30  # events
-NO_TIME_US = 0.05  # p99 of the host's own time below this: virtual time
 F64 = NDArray[np.float64]
 # words of a fault (report/summary.py) -> what to do about it; the first that fits
 ADVICE = (
@@ -85,19 +84,17 @@ class Reading:
 class Decisions:
     """Sums over decisions: truth against decision, accuracy over time, outcomes and pulses of passing objects."""
 
-    def __init__(self, recording: Recording, bundle: Bundle | None) -> None:
-        config = recording.header["config"]
-        self.n, self._first = recording.n_decisions, first_decision(recording)
+    def __init__(self, config: Mapping[str, Any], n: int, classes: Sequence[str] = (), first: int = 0) -> None:
+        self.n, self._first = n, first  # decisions, and the number of the first one
         self._first_tick: int | None = None
         self._tick_hz = float(config["tick_hz"])
         self.known = self.right = 0
-        classes = () if bundle is None else bundle.classes
-        n = len(classes) if len(classes) <= CONFUSION_MAX else 0
-        self.confusion = np.zeros((n, n), np.int64)  # truth in rows, of those that have a label
+        shown = len(classes) if len(classes) <= CONFUSION_MAX else 0
+        self.confusion = np.zeros((shown, shown), np.int64)  # truth in rows, of those that have a label
         self.over = Stretches()
         gated = config["flow"]["settings"].get("gate_classes", ()) if "flow" in config else ()
         self._passing = "flow" in config
-        self._gated = [classes.index(name) for name in gated if name in classes]
+        self._gated = [list(classes).index(name) for name in gated if name in classes]
 
     def add(self, name: str, numbers: NDArray[Any] | list[int], weights: Any = None) -> None:
         """Add decisions by number to the sum `name`; those that the recording does not have are left out."""
@@ -218,7 +215,8 @@ def run_page(recording: Recording) -> bytes:
     """Return the page of `recording`; a cut one is shown as far as it goes."""
     bundle = recording.bundle() if recording.bundle_place else None
     plan, summary, config = recorded_plan(recording), recording.summary, recording.header["config"]
-    decisions = Decisions(recording, bundle)
+    classes = () if bundle is None else bundle.classes
+    decisions = Decisions(config, recording.n_decisions, classes, first_decision(recording))
     events, durations, clock = Events(decisions), Durations(), Clock(int(config["tick_hz"]))
     walks = Walks(plan.automaton) if plan.automaton is not None else None
 
@@ -228,13 +226,12 @@ def run_page(recording: Recording) -> bytes:
             walks.take(rows)
 
     takers = {Kind.DECISIONS: decided, Kind.TIMINGS: durations.take, Kind.CLOCK: clock.take, Kind.EVENTS: events.take}
-    rates = Rates(plan, 0 if bundle is None else bundle.n_classes)
+    rates = Rates(plan, len(classes))
     for item in iter_exposures(cast(Recording, Reading(recording, takers)), plan):
         rates.take(item)
     budget_us = summary.get("deadline_us") or config.get("deadline_us")
-    timed = durations.n > 0 and durations.quantiles(IN_HOST)[1] >= NO_TIME_US
-    n_classes = 0 if bundle is None else bundle.n_classes
-    accuracy, sizes = decisions.accuracy(n_classes) if n_classes > 1 and decisions.known else (None, [])
+    timed = not durations.is_virtual()
+    accuracy, sizes = decisions.accuracy(len(classes)) if len(classes) > 1 and decisions.known else (None, [])
     passing = _passing(recording, bundle, decisions)
     confusion = passing["confusion"] if passing else decisions.confusion
     return render(

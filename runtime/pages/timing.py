@@ -14,6 +14,7 @@ from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 from .charts import Axis, Curve, Mark, chart, extremes, percent, seconds, span
 
 LEAST_US = 1.0
+NO_TIME_US = 0.05  # p99 of the host's own time
 CLOCK_MAX = 1 << 15  # probes that the line is laid through
 IN_HOST = "in the host, to the decision"
 _CURVES = {  # name of a stage -> where it begins and ends
@@ -50,6 +51,10 @@ class Durations:
     def quantiles(self, name: str) -> list[float]:
         """Return p50, p99, p99.9 and the maximum of a stage in microseconds."""
         return list(self.stages[name].summary().values())
+
+    def is_virtual(self) -> bool:
+        """Whether the host took no time at all, as in virtual time: then latencies say nothing."""
+        return self.stages[IN_HOST].summary()["p99"] < NO_TIME_US
 
     def rows(self, summary: Mapping[str, Any]) -> list[tuple[str, list[float]]]:
         """Return name and quantiles of the whole and of each stage, as the run summed them up where it did."""
@@ -101,7 +106,7 @@ class Clock:
             self.samples = some[extremes((some["host_ns"] - some["host_ns"][0]) - ticks, CLOCK_MAX // 2)]
 
     def facts(self, summary: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Return the drift in words, that of the line, the probes that lie outside, and a chart; None of so short a run that nothing is known."""
+        """Return the drift in words, that of the line, the probes that lie outside, and a chart; None of a run too short for it."""
         some = self.samples
         if len(some) < 3 or some["tick"].min() == some["tick"].max():
             return None

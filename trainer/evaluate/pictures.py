@@ -17,8 +17,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.images import likeness
-from pans.runtime.outputs import make_folder, write_file
-from pans.runtime.report import figures as page_figures
+from pans.runtime.outputs import make_folder
 from pans.trainer.figures import new_figure, save_figure
 from pans.trainer.tasks.registry import Objects
 
@@ -27,6 +26,7 @@ from .walks import Walks, calibration_bins, confusion_of, measured_walks
 
 MAPPED_OBJECTS = 600
 SHOWN_PICTURES = 8
+PATTERNS_MAX = 64
 LEAST_SHARE = 1e-4  # of the decisions, for a point of the reliability diagram: exact expectations have bins of 1e-10
 PERPLEXITY = 30.0  # the default of van der Maaten and Hinton's code (2008)
 
@@ -54,8 +54,7 @@ def write_pictures(
     matrix = np.abs(bundle.analyser.matrix) if bundle.analyser is not None else bundle.patterns()
     unit = UNIT if bundle.analyser is None else "modulus of W"
     written = [folder / "patterns.png"]
-    drawn = page_figures.patterns(matrix.reshape(-1, *bundle.image_shape).astype(np.float64), unit)
-    write_file(written[0], drawn, force=force)
+    _patterns(written[0], matrix.reshape(-1, *bundle.image_shape).astype(np.float64), unit, force)
     rng = np.random.default_rng(seed)
     counts = light.counts(shots, rng)
     if bundle.picture_shape is not None:
@@ -75,11 +74,43 @@ def write_walk_pictures(folder: Path, bundle: Bundle, walks: Walks, *, force: bo
     table, measured = confusion_of(walks), measured_walks(walks)
     right, error = 100 * (measured.accuracy_mean or 0.0), 100 * (measured.expected_calibration_error or 0.0)
     written = [folder / "patterns.png", folder / "reliability.png"]
-    write_file(written[0], page_figures.patterns(pictures, UNIT), force=force)
+    _patterns(written[0], pictures, UNIT, force)
     title = f"{bundle.name}: expected calibration error {error:.2f} points (SIMULATED)"
-    write_file(written[1], page_figures.reliability(bins, title), force=force)
+    _reliability(written[1], bins, title, force)
     title = f"{bundle.name}: {right:.1f} % right, exact (SIMULATED)"
     return [*written, _shown_confusion(folder / "confusion.png", bundle, table, title, force)]
+
+
+def _patterns(path: Path, pictures: F64, unit: str, force: bool) -> None:
+    """Patterns (d_f, height, width) on one scale, at most PATTERNS_MAX of them; `unit` names what a pixel's value is."""
+    shown = pictures[:PATTERNS_MAX]
+    columns = min(8, len(shown))
+    rows = math.ceil(len(shown) / columns)
+    flatness = max(0.35, min(1.0, shown.shape[1] / shown.shape[2]))
+    figure, axes = new_figure(1.15 * columns + 1.0, 1.3 * rows * flatness + 0.5, columns, rows)
+    high = float(shown.max())
+    for number, axis in enumerate(np.ravel(axes)):
+        axis.set_axis_off()
+        if number < len(shown):
+            image = axis.imshow(shown[number], interpolation="nearest", cmap="magma", vmin=0.0, vmax=high)
+            axis.set_title(str(number), fontsize=7, pad=2)
+    figure.colorbar(image, ax=axes, label=unit, shrink=0.8)
+    save_figure(figure, path, force=force)
+
+
+def _reliability(path: Path, bins: Sequence[tuple[float, float, float]], title: str, force: bool) -> None:
+    """Accuracy against the probability that was stated, and how many decisions stated it: (probability, accuracy, share) per bin."""
+    figure, (upper, lower) = new_figure(5.0, 5.4, 1, 2)
+    upper.get_gridspec().set_height_ratios([3, 1])
+    probability, accuracy, share = np.array(bins).reshape(-1, 3).T
+    upper.plot([0, 1], [0, 1], color="0.6", lw=1, label="as sure as right")
+    upper.plot(probability, accuracy, "o-", color="C0", ms=4, label="decisions")
+    upper.set(xlim=(0, 1), ylim=(0, 1), ylabel="accuracy")
+    upper.set_title(title, fontsize=9)
+    upper.legend(fontsize=8)
+    lower.bar(probability, share, width=0.04, color="C0")
+    lower.set(xlim=(0, 1), xlabel="probability of the decision", ylabel="share")
+    save_figure(figure, path, force=force)
 
 
 def _confusion(
