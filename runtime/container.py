@@ -289,6 +289,19 @@ def read_block(file: BinaryIO, index: int, chain: int, limits: Mapping[int, int]
     return Block(index, kind, payload, file.tell(), payload_crc)
 
 
+def skim_blocks(file: BinaryIO, wanted: int, limits: Mapping[int, int]) -> Iterator[bytes]:
+    """Yield the payloads of the blocks of kind `wanted` after the prologue, as far as they seem to be blocks: nothing is checked."""
+    file.seek(FILE_PROLOGUE.size)
+    while len(head := file.read(_BLOCK_HEADER.size)) == _BLOCK_HEADER.size:
+        length, _, kind, _ = _BLOCK_HEADER.unpack(head)
+        if length > limits.get(kind, 0):
+            return
+        if kind == wanted:
+            yield file.read(length)
+            length = 0
+        file.seek(length + _CRC.size, 1)
+
+
 @contextmanager
 def watching_blocks(watcher: BlockWatcher) -> Iterator[None]:
     """Call `watcher` after every block that is read within the context: (file, number of the pass over it, bytes so far, size in bytes)."""

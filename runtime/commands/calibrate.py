@@ -146,7 +146,7 @@ def _register(args: argparse.Namespace) -> int:
     doubts += more
     found = measurement.take(second, core, known)
     if args.page is not None:
-        from pans.runtime.pages.registration import write_registration_page
+        from pans.runtime.pages.bundle import write_registration_page
 
         write_registration_page(args.page, measurement, found, simulated=bool(facts.get("simulated")), force=args.force)
     check_estimate(found, args.seconds, (args.precision_px, args.precision_deg))

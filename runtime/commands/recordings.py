@@ -19,6 +19,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit
 from pans.runtime.errors import UsageError
 from pans.runtime.operate.parquet import need_pyarrow, write_decisions
 from pans.runtime.operate.pattern_files import about, array_parts, head_with_facts, pattern_pngs
+from pans.runtime.operate.runs import runs_in
 from pans.runtime.outputs import check_outputs, make_folder, write_file
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
@@ -34,7 +35,6 @@ from pans.runtime.report.words import passage_words
 OF_RECORDINGS = ("csv", "photon-hdf5", "parquet")
 OF_BUNDLES = ("onnx", "npy", "png")
 FORMATS = (*OF_RECORDINGS, *OF_BUNDLES)
-EITHER = "a recording (file, or folder of its parts), or a bundle"
 
 
 def _configure_replay(parser: argparse.ArgumentParser) -> None:
@@ -118,7 +118,9 @@ REPLAY = Command(
 
 
 def _configure_export(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, metavar="FILE", help=EITHER)
+    parser.add_argument(
+        "recording", type=Path, metavar="FILE", help="a recording (file, or folder of its parts), or a bundle"
+    )
     form = "of a recording: csv (a folder), photon-hdf5, parquet (decisions); of a bundle: onnx, npy or png (a folder)"
     parser.add_argument("--format", required=True, choices=FORMATS, help=form)
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT", help="the folder, or the file")
@@ -209,7 +211,8 @@ EXPORT = Command(
 
 
 def _configure_report(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", type=Path, metavar="FILE", help=EITHER)
+    what = "a recording, a bundle, a calibration, a registration, or a folder of runs"
+    parser.add_argument("path", type=Path, metavar="FILE", help=what)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.html", help="the page to write")
     add_force(parser)
 
@@ -218,18 +221,24 @@ def _report(args: argparse.Namespace) -> int:
     check_outputs([args.out], inputs=[args.path], force=args.force)
     from pans.runtime.pages import page_of
 
-    page = page_of(args.path)
-    kind = file_kind(args.path)
+    if args.path.is_dir() and not any(args.path.glob("*.pansrec")):
+        from pans.runtime.pages.index import index_page
+
+        if not (runs := runs_in(args.path)):
+            raise UsageError(f"{args.path}: no runs are in this folder", remedy="name a folder of runs, as pans-runs")
+        kind, page = "runs", index_page(args.path, runs, args.out.resolve().parent)
+    else:
+        kind, page = file_kind(args.path), page_of(args.path)
     write_file(args.out, page, force=args.force)
     emit(args, {"report": str(args.out), "kind": kind, "bytes": len(page)}, str(args.out))
     return EXIT_FINE
 
 
 REPORT = Command(
-    "one self-contained page of a recording or a bundle",
+    "one self-contained page of a run, a bundle, or a folder of runs",
     _configure_report,
     _report,
-    examples=("pans report pans-runs/latest/run.pansrec -o run.html", "pans report my.pans -o bundle.html"),
+    examples=("pans report pans-runs/latest/run.pansrec -o run.html", "pans report pans-runs -o runs.html"),
 )
 
 

@@ -320,7 +320,9 @@ def _accuracy(first: Side, second: Side, paired: bool) -> Finding | None:
 def _two_shares(name: str, shares: list[float], right: list[float], sizes: list[int], method: str) -> Finding:
     between = newcombe_difference(right[0], sizes[0], right[1], sizes[1])  # of the shares that are shown
     p = fisher_exact(round(right[0]), sizes[0], round(right[1]), sizes[1])
-    return Finding(name, "share", *shares, *between, False, p, f"{method}, Fisher exact; interval by Newcombe")
+    return Finding(
+        name, "share", shares[0], shares[1], *between, False, p, f"{method}, Fisher exact; interval by Newcombe"
+    )
 
 
 def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Finding:
@@ -365,7 +367,7 @@ def _latencies(first: Side, second: Side) -> Iterator[Finding]:
     for name, q in QUANTILES.items():
         if one is None or two is None:
             values = [(side.summary.get("latency_us") or {}).get(name.replace(".", "")) for side in (first, second)]
-            if None not in values and min(map(float, values)) >= LEAST_US:
+            if None not in values and min(float(value or 0) for value in values) >= LEAST_US:
                 yield _untested(f"latency_{name}", "us", values, "not tested: no single latencies", is_ratio=True)
         elif (
             min(len(one), len(two)) * (1 - q) >= LEAST_BEYOND

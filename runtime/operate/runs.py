@@ -11,7 +11,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
@@ -49,10 +49,11 @@ class Run:
     simulated: bool
     locked: bool
     files: tuple[Path, ...] = field(repr=False)
+    summary: Mapping[str, Any] = field(repr=False, default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the facts but for the files, JSON-able."""
-        facts = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "files"}
+        """Return the facts but for files and summary, JSON-able."""
+        facts = {one.name: getattr(self, one.name) for one in fields(self) if one.name not in ("files", "summary")}
         return facts | {"folder": str(self.folder), "started": self.started.isoformat(timespec="seconds")}
 
 
@@ -93,6 +94,7 @@ def run_of(folder: Path) -> Run | None:
         simulated=bool(header.get("simulated") or summary.get("simulated")),
         locked=is_locked,
         files=files,
+        summary=summary,
     )
 
 

@@ -191,16 +191,15 @@ def chart(
         else:
             axes.grid(axis="y")
             axes.set_axisbelow(True)
-        for one in bars:
-            edges = np.asarray(one.edges, np.float64)
-            axes.bar(
-                edges[:-1], one.heights, np.diff(edges), one.base, align="edge", color=_INKS[one.kind], label=one.name
-            )
+        for bar in bars:
+            edges = np.asarray(bar.edges, np.float64)
+            where = {"align": "edge", "color": _INKS[bar.kind], "label": bar.name}
+            axes.bar(edges[:-1], bar.heights, np.diff(edges), bar.base, **where)
         for curve in curves:
             _curve(axes, curve)
         for mark in marks:
             _mark(axes, mark, x, y)
-        if len(names := [one.name for one in (*curves, *bars) if one.name]) > 1:
+        if len(names := [name for name in (*(one.name for one in curves), *(one.name for one in bars)) if name]) > 1:
             columns = 2 if max(map(len, names)) < 20 else 1
             figure.legend(loc="outside upper left", ncols=columns, frameon=False, handlelength=1.6, borderpad=0)
     return drawn()
@@ -276,13 +275,25 @@ def tree(label: str, nodes: Sequence[Node]) -> Any:
     return drawn()
 
 
+def spark(label: str, shares: Sequence[float]) -> Any:
+    """Return shares in their order as a line of text height, 0 at its foot and 1 at its top."""
+    with _figure(label, 24, 120, layout="none") as (figure, drawn):
+        axes = figure.add_axes((0, 0.05, 1, 0.9))
+        axes.set(ylim=(0, 1), xlim=(0, len(shares) - 1))
+        axes.set_axis_off()
+        axes.plot(shares, color=_INKS["a"], lw=1.5, clip_on=False)
+    return drawn()
+
+
 @contextmanager
-def _figure(label: str, height: int, layout: str = "constrained") -> Iterator[tuple[Any, Callable[[], Any]]]:
+def _figure(
+    label: str, height: int, width: int = WIDTH, layout: str = "constrained"
+) -> Iterator[tuple[Any, Callable[[], Any]]]:
     """Yield an empty figure and the function that returns it as markup, once it is drawn."""
     matplotlib, markup = needed("matplotlib"), needed("markupsafe").Markup
     stream = io.StringIO()
     with matplotlib.rc_context({**_STYLE, "svg.hashsalt": label}):
-        figure = needed("matplotlib.figure").Figure(figsize=(WIDTH / 72, height / 72), layout=layout)
+        figure = needed("matplotlib.figure").Figure(figsize=(width / 72, height / 72), layout=layout)
         yield figure, lambda: markup(_page_svg(stream.getvalue(), label))
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         figure.savefig(stream, format="svg", transparent=True, metadata=nothing)

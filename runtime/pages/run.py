@@ -1,7 +1,7 @@
 """The page of a run: its recording is read once, block by block, while sums of bounded size add up; the rest is that of its summary.
 
 The messages are read for the rates; the blocks that come in between go to who sums them up. Only objects in flow need a second reading:
-their passages come from a replay. Verdict, faults and figures are those that the run recorded; a recording that was cut has none, and says so.
+their passages come from a replay. Verdict, faults and figures are those that the run recorded; a cut recording has none, and says so.
 """
 
 from __future__ import annotations

@@ -1,0 +1,133 @@
+"""The page of a folder of runs: one line and a small picture each, and how accuracy, dark counts, light and lateness went over days.
+
+Runs come as `pans runs` lists them, with their summaries; of a recording its decision log alone is read, and none of a large one.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import quote
+
+import numpy as np
+
+from pans.runtime.container import open_regular, skim_blocks
+from pans.runtime.errors import DamagedFileError
+from pans.runtime.record.format import LIMITS, Kind
+from pans.runtime.record.log import LogReader
+
+from .charts import Axis, Curve, chart, percent, spark
+from .page import render
+from .run import accuracy_interval
+
+SPARKS, LOG_MAX_BYTES = 24, 1 << 26  # stretches of a small picture; of a larger recording there is none
+DAY_S = 86400.0
+
+
+class Run(Protocol):
+    """What the page shows of a run (operate/runs.py)."""
+
+    folder: Path
+    started: datetime
+    bundle: str
+    verdict: str
+    decisions: int | None
+    accuracy: float | None
+    simulated: bool
+    files: tuple[Path, ...]
+    summary: Mapping[str, Any]
+
+
+def index_page(root: Path, runs: Sequence[Run], beside: Path) -> bytes:
+    """Return the page of the runs in `root`, the newest first, with links from the folder `beside`."""
+    rows = [{"run": run, "summary": run.summary, "link": _link(run, beside), "spark": _spark(run)} for run in runs]
+    trends = [drawn for drawn in (_trend(runs, *one) for one in _TRENDS) if drawn is not None]
+    return render("index.html", root=root, rows=rows, trends=trends, simulated=any(run.simulated for run in runs))
+
+
+def _link(run: Run, beside: Path) -> str:
+    """The relative address of the run's page, of its summary, or of its recording."""
+    pages = sorted(run.folder.glob("*.html"))
+    best = [*pages, *(one for end in (".md", ".pansrec") for one in run.files if one.suffix == end)]
+    return quote(os.path.relpath(best[0] if best else run.folder, beside).replace(os.sep, "/"))
+
+
+def _spark(run: Run) -> Any:
+    """Accuracy over the run; "" where truth or decisions are not known."""
+    right = accuracy_over([path for path in run.files if path.suffix == ".pansrec"])
+    return spark(f"accuracy over the run of {run.started:%Y-%m-%d %H:%M}", right) if len(right) > 1 else ""
+
+
+def accuracy_over(recordings: Sequence[Path]) -> list[float]:
+    """Return the share of right decisions in stretches of a run; empty where it is not known or the recordings are large.
+
+    The blocks are not checked against the rest of their file.
+    """
+    if sum(path.stat().st_size for path in recordings) > LOG_MAX_BYTES:
+        return []
+    right: list[np.ndarray] = []
+    for path in recordings:
+        log = LogReader()
+        try:
+            with open_regular(path) as file:
+                for payload in skim_blocks(file, Kind.DECISIONS, LIMITS):
+                    rows = log.rows(payload, str(path))
+                    known = rows[rows["truth"] >= 0]
+                    right.append(known["label"] == known["truth"])
+        except (DamagedFileError, OSError, ValueError):
+            break
+    every = np.concatenate([np.zeros(0, np.bool_), *right])
+    return [float(one.mean()) for one in np.array_split(every, min(SPARKS, len(every) // 10 or 1)) if len(one)]
+
+
+# ---- trends ----
+
+Figure = Callable[[Mapping[str, Any]], tuple[float, float, float] | None]
+
+
+def _accuracy(summary: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    ends = accuracy_interval(summary)
+    return None if ends is None or summary.get("accuracy") is None else (summary["accuracy"], *ends)
+
+
+def _dark(summary: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    dark = summary.get("dark") or {}
+    return (dark["clicks"] / dark["exposures"], dark["low"], dark["high"]) if dark.get("exposures") else None
+
+
+def _alone(value: Any) -> tuple[float, float, float] | None:
+    return None if value is None else (float(value), float(value), float(value))
+
+
+_TRENDS: tuple[tuple[str, str, Figure], ...] = (
+    ("accuracy", "Accuracy of each run with its 95 % interval.", _accuracy),
+    ("dark clicks per dark exposure", "Dark rate of each run with its 95 % interval.", _dark),
+    (
+        "clicks per decision",
+        "Light level: clicks of a decision, on average.",
+        lambda one: _alone(one.get("clicks_mean")),
+    ),
+    (
+        "late decisions, share",
+        "Share of decisions that were late.",
+        lambda one: _alone(one["late"] / one["decisions"] if one.get("decisions") else None),
+    ),
+)
+
+
+def _trend(runs: Sequence[Run], title: str, words: str, figure: Figure) -> tuple[Any, str] | None:
+    """One figure of all runs over days; None where fewer than two know it."""
+    found = [(run.started.timestamp(), *values) for run in runs if (values := figure(run.summary)) is not None]
+    if len(found) < 2:
+        return None
+    when, value, low, high = np.array(sorted(found)).T
+    days = (when - when[0]) / DAY_S
+    first, top = datetime.fromtimestamp(when[0]).astimezone(), float(high.max())
+    share = title.startswith(("accuracy", "late"))
+    x = Axis(f"days since {first:%Y-%m-%d %H:%M}", -0.02 * days[-1], 1.02 * days[-1] or 1.0)
+    y = Axis(title, 0.0, 1.0 if title == "accuracy" else 1.1 * top or 1.0, **({"text": percent} if share else {}))
+    curve = Curve(days, value, low=low, high=high, dots=True)
+    return chart(f"{title} of {len(value)} runs", x, y, curves=[curve]), words
