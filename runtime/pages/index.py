@@ -23,7 +23,7 @@ from .charts import Axis, Curve, chart, percent, spark
 from .page import render
 from .run import accuracy_interval
 
-SPARKS, LOG_MAX_BYTES = 24, 1 << 26  # stretches of a small picture; of a larger recording there is none
+SPARKS, LOG_MAX_BYTES = 24, 1 << 24  # stretches of a small picture; of a larger recording there is none
 DAY_S = 86400.0
 
 

@@ -1,7 +1,8 @@
 """The page of a run: its recording is read once, block by block, while sums of bounded size add up; the rest is that of its summary.
 
-The messages are read for the rates; the blocks that come in between go to who sums them up. Only objects in flow need a second reading:
-their passages come from a replay. Verdict, faults and figures are those that the run recorded; a cut recording has none, and says so.
+Before that it was checked, and its commands were read for the plan. The messages are read for the rates; the blocks that come in between
+go to who sums them up. Only objects in flow need one reading more: their passages come from a replay. Verdict,
+faults and figures are those that the run recorded; a cut recording has none, and says so.
 """
 
 from __future__ import annotations
@@ -243,7 +244,7 @@ def run_page(recording: Recording) -> bytes:
         what=_what_was_run(recording, bundle),
         reasons=[(fault, advice_on(str(fault))) for fault in summary.get("faults", ())],
         agrees=_dark_agrees(summary.get("dark")),
-        tiles=list(_tiles(summary, timed)) if summary else [],
+        tiles=list(_tiles(summary, timed)) if "verdict" in summary else [],
         decisions=decisions,
         accuracy=accuracy,
         sizes=sizes,
@@ -261,7 +262,7 @@ def run_page(recording: Recording) -> bytes:
         noted=events.kinds,
         sentences=[sentence_of(event) for event in events.shown],
         records=[(e["kind"], ", ".join(f"{k} {v}" for k, v in e.items() if k != "kind")) for e in events.shown],
-        figures=figure_rows(summary) if summary else [],
+        figures=figure_rows(summary) if "verdict" in summary else [],
     )
 
 

@@ -134,7 +134,7 @@ def recorded_plan(recording: Recording) -> Plan:
     """Return the plan that the device was sent; DamagedFileError if the recording does not hold it whole."""
     try:
         config = recording.header["config"]
-        bundle = recording.bundle() if recording.bundle_data() else None
+        bundle = recording.bundle() if recording.bundle_place else None
         sent, automaton = sent_to_device(recording), automaton_of(config, bundle)
         largest = PHOTON_NUMBER.checked(config.get("photon_number_max", 1), "photon_number_max")
         return sent.plan(TICK_HZ.checked(config["tick_hz"], "tick_hz"), automaton, largest)

@@ -10,8 +10,8 @@ from automata import automaton_bundle
 from commands import words_of
 
 import pans
-from pans.runtime.images import read_grey_png
 from pans.runtime.html_card import html_card
+from pans.runtime.images import read_grey_png
 
 
 def card_of(thing: Any) -> str:

@@ -8,6 +8,7 @@ from argparse import Namespace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,10 +17,9 @@ from nasty import NASTY
 from pans.firmware_sim.testing import small_setup
 from pans.runtime import cli, safe_text
 from pans.runtime.errors import UsageError
-from pans.runtime.grey_png import png_bytes
 from pans.runtime.html_card import html_card
-from pans.runtime.pages.charts import Axis, Chart, Curve, Mark
-from pans.runtime.pages.page import Page, Picture
+from pans.runtime.pages.charts import Axis, Curve, Mark, chart
+from pans.runtime.pages.page import render
 
 nasty = pytest.mark.parametrize("text", NASTY, ids=lambda text: ascii(text)[1:30])
 
@@ -80,24 +80,26 @@ class Tags(HTMLParser):
 
 
 def tags_of(text: str) -> Tags:
-    page = Page(text, simulated=False)
-    page.text(text)
-    page.heading(text)
-    page.table([(text, text)], head=(text,))
-    page.facts({text: {"inner": [text]}})
-    page.verdict(text, "fail", [(text, "advice")])
-    page.tiles([(text, text, text)])
-    page.pictures([Picture(png_bytes(np.zeros((1, 2), np.uint8)), text, [text])], text)
-    page.confusion(np.eye(2, dtype=np.int64), (text, text), text)
-    page.sentences([text])
-    axis = Axis(text, 0.0, 1.0, text=lambda value: text)
-    curves = [Curve([0, 1], [0, 1], text), Curve([0, 1], [1, 0], text, "b")]
-    page.figure(Chart(text, axis, axis, curves=curves, marks=[Mark(0.5, text), Mark(0.5, text, True)]), text)
-    with page.folded(text):
-        page.text(text)
+    pytest.importorskip("jinja2", reason="needs the plot extra")
+    row = {"value": 1.0, "error": 1.0, "low": 0.0, "high": 2.0}
+    facts = {text: {"inner": [text]}, "kind": "x", "profile": {"name": text}, "clicks": text, "exposures": text}
+    facts |= {"chi2": 1.0, "degrees_of_freedom": 1, "p_value": 1.0}
+    shown = {"parameters": [(text, row, text)], "channels": [{text: text}], "pictures": [(text, "data:,", [text])]}
+    page = render("measured.html", facts=facts, **shown, charts=[("drawn", text)]).decode()
     tags = Tags()
-    tags.feed(page.html().decode() + html_card(text, {text: text}, [(text, b"png")]))
+    tags.feed(page + html_card(text, {text: text}, [(text, b"png")]))
     return tags
+
+
+def test_a_chart_is_an_image_whatever_its_words_are() -> None:
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
+    drawn = []
+    for words in (NASTY, ["plain"] * len(NASTY)):
+        curves, axis = [Curve([0, 1], [0, 1], text or "x") for text in words], Axis(words[-1], 0.0, 1.0)
+        drawn.append(chart(words[-2], axis, axis, curves=curves, marks=[Mark(0.5, text) for text in words]))
+    found, plain = ([one.tag for one in ElementTree.fromstring(str(svg)).iter()] for svg in drawn)
+    assert abs(found.count("text") - plain.count("text")) <= 2  # one empty name
+    assert not {*found} - {*plain}
 
 
 @nasty
@@ -112,8 +114,7 @@ def test_the_summary_page_of_a_run(text: str, tmp_path: Path) -> None:
     from dataclasses import replace
 
     import pans
-    from pans.runtime.report.words import write_markdown
-    from pans.runtime.report.words import closing_words
+    from pans.runtime.report.words import closing_words, write_markdown
 
     if not hasattr(test_the_summary_page_of_a_run, "done"):
         done = pans.run(small_setup()[1], "sim:ideal?scene=uniform&seed=1&pace=fast", decisions=2)

@@ -12,7 +12,7 @@ import pytest
 from plans import parallel, shot_major
 
 from pans.runtime.core.plan import Plan
-from pans.runtime.pages.rates import count_rates
+from pans.runtime.pages.rates import Rates
 from pans.runtime.record import exposures
 from pans.runtime.record.exposures import iter_exposures
 from pans.runtime.wire.framing import FrameDecoder, pack_body, unpack_body
@@ -158,9 +158,12 @@ def test_memory_for_the_rates_does_not_grow_with_the_messages(monkeypatch: pytes
     for n in (2_000, 8_000):
         recording = recording_of(bodies[:n])
         tracemalloc.start()
-        rates = count_rates(recording, plan, 3)
+        rates = Rates(plan, 3)
+        for item in iter_exposures(recording, plan):
+            rates.take(item)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-        assert rates.exposures.sum() > 4 * n
-        assert 0 < rates.class_exposures.sum() == rates.exposures.sum()
+        shown = rates.over.sums["exposures"].sum()
+        assert shown > 4 * n
+        assert 0 < rates.class_exposures.sum() == shown
     assert peaks[1] < 1.5 * peaks[0]

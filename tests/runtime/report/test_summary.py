@@ -11,8 +11,7 @@ from commands import fixed_run, json_of
 from mutated_sessions import Stage
 
 from pans.runtime.report.summary import Summary
-from pans.runtime.report.words import write_markdown
-from pans.runtime.report.words import closing_words
+from pans.runtime.report.words import closing_words, write_markdown
 
 MEASURED = ("armed_after_s", "realtime", "page_faults", "recording", "report")  # of this machine and this run
 
