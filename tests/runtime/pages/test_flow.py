@@ -1,16 +1,14 @@
 """Report pages and replays of runs in which objects passed by: whole, cut, and in parts."""
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from commands import Pans, page_of, words_of
 
 from pans.runtime.cli import main
-from pans.runtime.pages import flow
-from pans.runtime.pages.flow import BINS, _late_rows, _pulses, _span_of
+from pans.runtime.pages.rates import BINS
+from pans.runtime.pages.run import Decisions, Events
 from pans.runtime.record import read_recording
 
 
@@ -36,65 +34,34 @@ def test_the_page_says_what_the_run_said(run: Path, tmp_path: Path) -> None:
 
 def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> None:
     recording = read_recording(run)
-    bundle = recording.bundle()
-    asked = recording.decisions()["index"][recording.decisions()["label"] == 0].astype(int)
-
-    class Told:
-        header, path = recording.header, recording.path
-
-        def iter_decisions(self) -> Any:
-            return recording.iter_decisions()
-
-        def events(self) -> Any:
-            yield {"kind": "gate_refused", "decision": int(asked[0]), "text": "late"}
-            yield {"kind": "gate_refused", "command_id": 3}  # of no decision
-            yield {"kind": "gate_expired", "decision": int(asked[2])}
-            yield from ({"kind": "late", "decision": number, "latency_us": 2e3} for number in (3, 4, 9, 20))
-            yield {"kind": "blame", "what": "late", "cause": "link", "first_decision": 3, "last_decision": 4}
-            yield {"kind": "blame", "what": "late", "cause": "host", "first_decision": 9, "last_decision": 20}
-
-    told: Any = Told()
-    pulses = _pulses(told, bundle)
-    assert pulses["asked"].tolist() == asked.tolist()
-    assert (pulses["refused"].tolist(), pulses["expired"].tolist()) == ([asked[0]], [asked[2]])
-    assert len(pulses["done"]) == len(asked) - 2
-    bins = _bins_of(recording.decisions()["tick"])
-    assert {cause: counts.tolist() for cause, counts in _late_rows(told, _span_of(told)).items()} == {
-        cause: np.bincount(bins[list(numbers)], minlength=BINS).tolist()
-        for cause, numbers in (("link", (3, 4)), ("host", (9, 20)))
-    }
-
-
-def _bins_of(tick: np.ndarray) -> np.ndarray:
-    return np.minimum((tick - tick.min()).astype(float) * BINS / float(np.ptp(tick)), BINS - 1).astype(int)
-
-
-def test_every_decision_is_in_the_stretch_of_its_tick(run: Path) -> None:
-    decisions = read_recording(run).decisions()
-    decisions["tick"][200:] -= decisions["tick"][200] - decisions["tick"][50]  # a clock that began anew
-    for first in (0, 100):  # 100: a later part of a run, whose numbers go on
-        part = decisions[first:]
-        told: Any = SimpleNamespace(iter_decisions=lambda part=part: iter([part[:50], part[50:]]))
-        span, numbers = _span_of(told), part["index"].astype(np.int64)
-        assert span.bins(numbers).tolist() == _bins_of(part["tick"]).tolist()
-        assert span.bins(np.array([first - 1, numbers[-1] + 1])).tolist() == [-1, -1]
-
-
-def test_late_decisions_are_counted_once_however_many_events_are_held(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = read_recording(run)
-    events = [{"kind": "late", "decision": number} for number in range(300)]
-    for first in range(0, 300, 3):  # behind the third of its decisions
-        blame = {"kind": "blame", "what": "late", "first_decision": first, "last_decision": first + 1}
-        events.insert(4 * first // 3 + 3, blame | {"cause": "link" if first % 2 else "host"})
-    told: Any = SimpleNamespace(iter_decisions=recording.iter_decisions, events=lambda: iter(events))
-    span = _span_of(told)
-    whole = {cause: counts.tolist() for cause, counts in _late_rows(told, span).items()}
-    assert sum(map(sum, whole.values())) == 200
-    for held in (8, 20, 64):
-        monkeypatch.setattr(flow, "EVENTS_AT_ONCE", held)
-        assert {cause: counts.tolist() for cause, counts in _late_rows(told, span).items()} == whole
+    rows = recording.decisions()
+    asked = rows["index"][rows["label"] == 0].astype(int)
+    first = int(rows["index"][100])  # of a later part of a run, whose numbers go on
+    for start in (0, 100):
+        part = rows[start:]
+        n, mine = len(part), asked[asked >= int(part["index"][0])]
+        decisions = Decisions(recording.header["config"], n, recording.bundle().classes, int(part["index"][0]))
+        events = Events(decisions)
+        for block in (part[:50], part[50:]):
+            decisions.take(block)
+        events.take(
+            [
+                {"kind": "gate_refused", "decision": int(mine[0]), "text": "late"},
+                {"kind": "gate_refused", "command_id": 3},  # of no decision
+                {"kind": "gate_expired", "decision": int(mine[2])},
+                {"kind": "blame", "what": "late", "cause": "link", "decisions": 2, "first_decision": first, "why": "w"},
+                {"kind": "blame", "what": "late", "cause": "host", "decisions": 3, "first_decision": first + 9},
+                {"kind": "blame", "what": "missing", "cause": "link", "exposures": 7},
+                {"kind": "gate_expired", "decision": 1 << 62},  # that there is not
+            ]
+        )
+        assert decisions.pulses() == {"asked": len(mine), "done": len(mine) - 2, "refused": 1, "expired": 1}
+        assert events.causes() == [("link", 2, 7, "w"), ("host", 3, 0, "")]
+        over, place = decisions.over, first - int(part["index"][0])
+        assert over.sums["late link"].tolist() == np.bincount([place // over.width], [2], BINS).tolist()
+        assert over.sums["late host"].tolist() == np.bincount([(place + 9) // over.width], [3], BINS).tolist()
+        outcomes = [sums.sum() for name, sums in over.sums.items() if name.startswith("outcome ")]
+        assert sum(outcomes) == over.sums["decisions"].sum() == n
 
 
 def test_parts_of_a_flow_tell_of_their_passages(flow_folder: Path, tmp_path: Path, pans: Pans) -> None:

@@ -3,8 +3,6 @@
 import csv
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +11,10 @@ from commands import Pans
 
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
-from pans.runtime.pages.rates import count_rates
-from pans.runtime.pages.walks import _first_states, _sum_walks, _tree_of
+from pans.runtime.pages.rates import Rates
+from pans.runtime.pages.walks import Walks, first_states, tree_of
 from pans.runtime.record import Recording, read_recording
+from pans.runtime.record.exposures import iter_exposures
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.wire.messages import DARK_PATTERN, MessageType, decode_clicks, unpack_body
 
@@ -49,15 +48,16 @@ def test_the_tree_tells_what_was_shown_and_what_clicked(recording: Recording) ->
     plan = recorded_plan(recording)
     states = shown_states(recording)
     times, clicks = Counter(state for state, _ in states), Counter(state for state, bit in states if bit)
-    nodes = _first_states(plan.automaton)
-    tree = _tree_of(plan.automaton, nodes, count_rates(recording, plan))
-    assert [node.state for node in tree] == nodes.tolist()
-    assert tree[0].share == 1.0
-    for node in tree:
-        assert node.share == times[node.state] / times[0]
-        assert np.isnan(node.rate) if not times[node.state] else node.rate == clicks[node.state] / times[node.state]
+    nodes, rates = first_states(plan.automaton), Rates(plan)
+    for item in iter_exposures(recording, plan):
+        rates.take(item)
+    tree = tree_of(plan.automaton, nodes, recording.bundle(), rates)
+    assert len(tree) == len(nodes)
+    for state, node in zip(nodes.tolist(), tree):
+        rate = f"{100 * clicks[state] / times[state]:.0f} %" if times[state] else "never"
+        assert node.lines == (f"{100 * times[state] / times[0]:.0f} %", rate)
         for outcome, lead in enumerate(node.leads):
-            successor = int(plan.automaton.successors[node.state, outcome])
+            successor = int(plan.automaton.successors[state, outcome])
             assert lead == (nodes.tolist().index(successor) if successor in nodes else -1)
 
 
@@ -69,11 +69,12 @@ def test_reliability_is_that_of_the_decisions() -> None:
     rows["truth"][5] = -1
     rows["flags"][6:] = int(DecisionFlag.ABSTAINED), int(DecisionFlag.ABSTAINED | DecisionFlag.GAP)
     rows["exposures"], rows["clicks"] = [3, 4, 4, 4, 4, 4, 4, 2], [0, 1, 2, 3, 9, 1, 1, 0]
-    told: Any = SimpleNamespace(iter_decisions=lambda: iter([rows[:2], rows[2:]]))
-    walks = _sum_walks(told, random_automaton(4, slots=6, width=5))
+    walks = Walks(random_automaton(4, slots=6, width=5))
+    for part in (rows[:2], rows[2:]):
+        walks.take(part)
     assert walks.exposures.tolist() == [0, 0, 0, 1, 6, 0, 0]  # the last one came to no leaf
     assert walks.clicks.tolist() == [1, 3, 1, 1, 0, 0, 0, 0, 0, 1]
-    bins = walks.reliability
+    bins = walks.reliability()
     assert [round(share, 3) for _, _, share in bins] == [0.2, 0.6, 0.2]
     assert [accuracy for _, accuracy, _ in bins] == pytest.approx([0, 2 / 3, 1])
     assert bins[1][0] == pytest.approx(0.36)

@@ -77,7 +77,7 @@ def test_the_page_has_no_zero_that_was_not_measured(summary: Summary, tmp_path: 
     doubtful = seen(summary, 0.0, 0.0, 2345.0)
     write_markdown(tmp_path / "s.md", doubtful, {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
     rows = [line for line in (tmp_path / "s.md").read_text().splitlines() if line.startswith("| ")]
-    assert "| **exposure end to decision** | not resolved | not resolved | 3000 | 3000 |" in rows
+    assert "| exposure end to decision | not resolved | not resolved | 3000 | 3000 |" in rows
     assert "| link | not resolved | not resolved | 3000 | 3000 |" in rows
     assert "| decode | 0 | 0 | 3000 | 3000 |" in rows  # of the host's own clock
 
