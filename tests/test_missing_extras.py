@@ -10,7 +10,19 @@ from commands import fixed_run
 
 from pans.runtime.cli import main
 
-BLOCKED = ("torch", "onnx", "PIL", "optuna", "matplotlib", "sklearn", "h5py", "pyarrow", "prometheus_client", "ALP4")
+BLOCKED = (
+    "torch",
+    "onnx",
+    "PIL",
+    "optuna",
+    "matplotlib",
+    "jinja2",
+    "sklearn",
+    "h5py",
+    "pyarrow",
+    "prometheus_client",
+    "ALP4",
+)
 NEEDS = {  # command line: what it needs, and the extra that has it
     "train s.npz --features 2 -o new.pans": ("torch", "train"),
     "train s.npz --encoder automaton --photons 3 -o new.pans": ("torch", "train"),
@@ -21,10 +33,20 @@ NEEDS = {  # command line: what it needs, and the extra that has it
     "run fashion10 --device sim:ideal?pace=fast --decisions 3 --metrics 0 --out new": ("prometheus-client", "metrics"),
     "instrument --projector alp --counter tagger --profile alp-tagger": ("ALP4", "alp"),
     "bench decide --quick --plot new.png": ("matplotlib", "plot"),
+    "report r.pansrec -o new.html": ("matplotlib", "plot"),
+    "compare r.pansrec r.pansrec -o new.html": ("matplotlib", "plot"),
     "export r.pansrec --format parquet -o new.parquet": ("pyarrow", "parquet"),
     "evaluate fashion10 --task s.npz --objects 2 --pictures new": ("matplotlib", "plot"),
 }
-WORK_WITHOUT = ("", "help run", "profile list", "verify r.pansrec", "info fashion10", "replay r.pansrec")
+WORK_WITHOUT = (
+    "",
+    "help run",
+    "profile list",
+    "verify r.pansrec",
+    "info fashion10",
+    "replay r.pansrec",
+    "compare r.pansrec r.pansrec",
+)
 WORK_WITHOUT += ("evaluate fashion10 --task s.npz",)
 CHILD = """
 import contextlib, io, json, sys

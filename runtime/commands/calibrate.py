@@ -133,6 +133,10 @@ def _register(args: argparse.Namespace) -> int:
     from pans.runtime.registration.measure import Registration, check_estimate
     from pans.runtime.registration.target import BUILT_IN, built_in_target, read_target, target_sha256
 
+    if args.page is not None:
+        from pans.runtime.pages.charts import need_extra
+
+        need_extra()
     profile = load_profile(args.profile or profile_of(args.device))
     target = built_in_target() if args.target is None else read_target(args.target)
     measurement = Registration(profile, target, args.seconds, args.seed)

@@ -220,7 +220,9 @@ def _configure_report(parser: argparse.ArgumentParser) -> None:
 def _report(args: argparse.Namespace) -> int:
     check_outputs([args.out], inputs=[args.path], force=args.force)
     from pans.runtime.pages import page_of
+    from pans.runtime.pages.charts import need_extra
 
+    need_extra()
     if args.path.is_dir() and not any(args.path.glob("*.pansrec")):
         from pans.runtime.pages.index import index_page
 
@@ -253,8 +255,11 @@ def _configure_compare(parser: argparse.ArgumentParser) -> None:
 
 
 def _compare(args: argparse.Namespace) -> int:
+    from pans.runtime.pages.charts import need_extra
+
     if args.out is not None:
         check_outputs([args.out], inputs=[args.first, args.second], force=args.force)
+        need_extra()
     from pans.runtime.compare import compare, read_side
     from pans.runtime.compare.words import comparison_page, comparison_words
 

@@ -53,6 +53,12 @@ def needed(name: str, what: str = "a page") -> ModuleType:
         raise missing_extra(what, name.partition(".")[0], "plot") from error
 
 
+def need_extra() -> None:
+    """Raise the UsageError of `needed` where a page cannot be made, before anything is read or measured for it."""
+    for name in ("matplotlib", "jinja2", "PIL"):
+        needed(name)
+
+
 # ---- numbers on axes ----
 
 

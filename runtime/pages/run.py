@@ -234,6 +234,7 @@ def run_page(recording: Recording) -> bytes:
     timed = not durations.is_virtual()
     accuracy, sizes = decisions.accuracy(len(classes)) if len(classes) > 1 and decisions.known else (None, [])
     passing = _passing(recording, bundle, decisions)
+    shown = figure_rows(summary) if "verdict" in summary else []
     confusion = passing["confusion"] if passing else decisions.confusion
     return render(
         "run.html",
@@ -262,7 +263,7 @@ def run_page(recording: Recording) -> bytes:
         noted=events.kinds,
         sentences=[sentence_of(event) for event in events.shown],
         records=[(e["kind"], ", ".join(f"{k} {v}" for k, v in e.items() if k != "kind")) for e in events.shown],
-        figures=figure_rows(summary) if "verdict" in summary else [],
+        figures=[row for row in shown if not passing or row not in passing["rows"]],
     )
 
 
@@ -336,7 +337,11 @@ def _tiles(summary: Mapping[str, Any], timed: bool) -> Iterator[tuple[str, str, 
     if summary.get("accuracy") is not None:
         between = accuracy_interval(summary)
         more = "" if between is None else f"95 % interval {100 * between[0]:.2f} to {100 * between[1]:.2f} %, "
-        yield "accuracy", points(summary["accuracy"]), f"{more}of {summary.get('objects', 0):,} objects"
+        yield (
+            "accuracy",
+            points(summary["accuracy"]),
+            more + (f"of {summary['objects']:,} objects" if summary.get("objects") else "of objects that passed alone"),
+        )
     yield "decisions", f"{summary.get('decisions', 0):,}", f"{summary.get('abstained', 0):,} of them abstained"
     photons, clicks = (mean_words(summary.get(name)) for name in ("photons_mean", "clicks_mean"))
     light = mean_words(summary.get("illumination_mean", summary.get("illumination")))

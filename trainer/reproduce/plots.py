@@ -38,7 +38,7 @@ def curves(path: Path, rows: Rows, spec: Row) -> None:
     numbers: dict[str, int] = {}  # of the labels, for one colour and marker in all panels
     for axis, panel in zip(np.atleast_1d(axes).ravel(), panels):
         if "plane" in panel:
-            _plane(figure, axis, of_table(rows, panel["plane"]))
+            _plane(figure, axis, of_table(rows, panel["plane"]), spec)
         for line in panel.get("lines", ()):
             _lines(
                 axis, rows, numbers, {**spec.get("line", {}), **panel.get("line", {}), **line}, spec.get("families", {})
@@ -56,13 +56,12 @@ def curves(path: Path, rows: Rows, spec: Row) -> None:
     save_figure(figure, path)
 
 
-def _plane(figure: Any, axis: Any, points: Rows) -> None:
+def _plane(figure: Any, axis: Any, points: Rows, spec: Row) -> None:
     """Draw points by their photons and illumination, coloured by accuracy; ringed are those on the front."""
     if not points:
         return
-    kinds = {"automata": "o", "direct imaging": "s", "fixed patterns and masks": "^"}
-    for kind, marker in kinds.items():
-        mine = [row for row in points if _kind(row["way"]) == kind]
+    for marker, kind in spec["markers"].items():
+        mine = [row for row in points if _family(row["way"], spec["families"])[2] == marker]
         places = [[row[key] for row in mine] for key in ("photons", "illumination", "value")]
         rings = ["k" if row.get("front") else "none" for row in mine]
         drawn = axis.scatter(
@@ -72,10 +71,9 @@ def _plane(figure: Any, axis: Any, points: Rows) -> None:
     figure.colorbar(drawn, ax=axis, label="accuracy, %", extend="min")
 
 
-def _kind(way: str) -> str:
-    if "automaton" in way:
-        return "automata"
-    return "direct imaging" if way.startswith("direct") else "fixed patterns and masks"
+def _family(label: str, families: dict[str, list[str]]) -> list[str]:
+    """The colour, the name in the legend and the marker of the family of which `label` contains the word; of none "" and its own name."""
+    return next((families[word] for word in families if word in label), ["", label, ""])
 
 
 def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row, families: dict[str, list[str]]) -> None:
@@ -93,7 +91,7 @@ def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row, families: 
         number = numbers.setdefault(label, len(numbers))
         mine.sort(key=lambda row: float(row[x]))
         errors = [row.get(line["bars"]) or 0.0 for row in mine] if "bars" in line else None
-        colour, family = next((families[word] for word in families if word in label), ("", label))
+        colour, family, _ = _family(label, families)
         line_style = {
             "fmt": f"{'os^DvP*X<>'[number % 10 if colour else number // 10 % 4]}-",
             "color": colour or f"C{number % 10}",
