@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -19,26 +19,13 @@ from pans.runtime.errors import DamagedFileError
 from pans.runtime.record.format import LIMITS, Kind
 from pans.runtime.record.log import LogReader
 
-from .charts import Axis, Curve, chart, percent, spark
+from .charts import Axis, Curve, chart, number, percent, spark
 from .page import render
 from .run import accuracy_interval
 
 SPARKS, LOG_MAX_BYTES = 24, 1 << 24  # stretches of a small picture; of a larger recording there is none
 DAY_S = 86400.0
-
-
-class Run(Protocol):
-    """What the page shows of a run (operate/runs.py)."""
-
-    folder: Path
-    started: datetime
-    bundle: str
-    verdict: str
-    decisions: int | None
-    accuracy: float | None
-    simulated: bool
-    files: tuple[Path, ...]
-    summary: Mapping[str, Any]
+Run = Any  # of operate/runs.py, a package that comes later
 
 
 def index_page(root: Path, runs: Sequence[Run], beside: Path) -> bytes:
@@ -128,6 +115,6 @@ def _trend(runs: Sequence[Run], title: str, words: str, figure: Figure) -> tuple
     first, top = datetime.fromtimestamp(when[0]).astimezone(), float(high.max())
     share = title.startswith(("accuracy", "late"))
     x = Axis(f"days since {first:%Y-%m-%d %H:%M}", -0.02 * days[-1], 1.02 * days[-1] or 1.0)
-    y = Axis(title, 0.0, 1.0 if title == "accuracy" else 1.1 * top or 1.0, **({"text": percent} if share else {}))
+    y = Axis(title, 0.0, 1.0 if title == "accuracy" else 1.1 * top or 1.0, text=percent if share else number)
     curve = Curve(days, value, low=low, high=high, dots=True)
     return chart(f"{title} of {len(value)} runs", x, y, curves=[curve]), words

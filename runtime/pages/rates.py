@@ -142,7 +142,7 @@ class Rates:
             self.class_exposures += np.bincount(places, minlength=self.n * n).reshape(self.n, n)
 
     def _edges(self, over: Stretches) -> F64:
-        return np.arange(over.used + 1) * (over.width * self._plan.cycle_us * 1e-6)
+        return np.arange(over.used + 1, dtype=np.float64) * (over.width * self._plan.cycle_us * 1e-6)
 
     def heat(self) -> tuple[Any, float, int]:
         """Return clicks per exposure over time as shades, the largest rate, and how many stretches of the run are shown."""

@@ -67,6 +67,7 @@ class Reading:
     def messages(self) -> Iterator[tuple[int, bytes]]:
         """Yield the device's messages."""
         held: dict[Kind, list[Any]] = {kind: [] for kind in self._takers}
+        sizes = Counter[Kind]()
         for kind, content in self._recording.read(Kind.MESSAGES, *self._takers):
             if kind == Kind.MESSAGES:
                 yield from content
@@ -74,9 +75,10 @@ class Reading:
                 self._takers[kind](content)
             else:
                 held[kind].append(content)
-                if sum(map(len, held[kind])) >= ROWS_AT_ONCE:
+                sizes[kind] += len(content)
+                if sizes[kind] >= ROWS_AT_ONCE:
                     self._takers[kind](np.concatenate(held[kind]))
-                    held[kind] = []
+                    held[kind], sizes[kind] = [], 0
         for kind, rows in held.items():
             if rows:
                 self._takers[kind](np.concatenate(rows))
@@ -337,11 +339,8 @@ def _tiles(summary: Mapping[str, Any], timed: bool) -> Iterator[tuple[str, str, 
     if summary.get("accuracy") is not None:
         between = accuracy_interval(summary)
         more = "" if between is None else f"95 % interval {100 * between[0]:.2f} to {100 * between[1]:.2f} %, "
-        yield (
-            "accuracy",
-            points(summary["accuracy"]),
-            more + (f"of {summary['objects']:,} objects" if summary.get("objects") else "of objects that passed alone"),
-        )
+        objects = f"of {summary['objects']:,} objects" if summary.get("objects") else "of objects that passed alone"
+        yield "accuracy", points(summary["accuracy"]), more + objects
     yield "decisions", f"{summary.get('decisions', 0):,}", f"{summary.get('abstained', 0):,} of them abstained"
     photons, clicks = (mean_words(summary.get(name)) for name in ("photons_mean", "clicks_mean"))
     light = mean_words(summary.get("illumination_mean", summary.get("illumination")))
