@@ -169,6 +169,10 @@ def check_together(options: RunOptions) -> None:
         )
     part_limits(options)
     _check_address(options.serve, options.serve_public, "--serve")
+    if options.serve_control and (options.serve_public or not options.serve):
+        what = "has no effect without --serve" if not options.serve else "and --serve-public: there is no password"
+        remedy = "add --serve HOST:PORT, or leave it out" if not options.serve else "use a tunnel (docs/how-to/live-view.md)"
+        raise UsageError(f"--serve-control {what}", remedy=remedy)
     _check_address(options.metrics, options.metrics_public, "--metrics")
 
 
@@ -335,8 +339,9 @@ class _Run:
             exposure_tolerance_us=self.profile.exposure_tolerance_us(self.plan.exposure_us),
             trials=options.trials,
             illumination=self.bundle.illumination() * self.frames,
+            clicks_stated=self.dark.light.stated,
         )
-        monitor.begin(self.bundle, recorder, facts)
+        monitor.begin(self.bundle, recorder, facts, around.stop)
         with Watchers(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
 
             def prepared(run: LiveRun) -> None:
@@ -364,7 +369,9 @@ class _Run:
 
             observers = Observers(look, prepared, around.stop, acts=False)
             what = self.dark.profile, self.bundle, self.plan, self.core, self.options
-            return around.ending.enter_context(running(link, *what, recorder, recovery, observers))
+            result = around.ending.enter_context(running(link, *what, recorder, recovery, observers))
+            monitor.close_notes()
+            return result
 
     def _summary(self, options: RunOptions, result: RunResult) -> Summary:
         from pans.runtime.report.summary import summarise, walk_figures
@@ -490,7 +497,7 @@ def _monitor_of(options: RunOptions) -> Monitor:
     from pans.runtime.monitor import Monitor
 
     panel = options.display and not state.quiet and sys.stderr.isatty()
-    return Monitor(panel=panel, address=options.serve, lines=options.display)
+    return Monitor(panel=panel, address=options.serve, control=options.serve_control, lines=options.display)
 
 
 def process_start_ns() -> int:

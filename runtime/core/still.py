@@ -35,7 +35,7 @@ class Core(Follower):
         self.guard = guard  # of the dark counts; None: they are only added up
         self.windows = DecisionWindows(plan, decider.n_features, shots)
         self.shots = shots
-        self._decider = decider
+        self.decider = decider
         self._visits_before = 0  # in streams that have ended
         self._bulk: CoreState | None = None
         self._session_known = False  # to it
@@ -61,7 +61,7 @@ class Core(Follower):
         if not self.takes:
             return super().steps(session)
         if self._bulk is None:
-            self._bulk = CoreState(self, self.windows, self.plan, self._decider, self.shots)
+            self._bulk = CoreState(self, self.windows, self.plan, self.decider, self.shots)
         if not self._session_known:
             self._bulk.begin(session)
             self._session_known = True
@@ -159,7 +159,7 @@ class Core(Follower):
             flags |= DecisionFlag.ABSTAINED
         elif self.guard is not None:
             self.guard.take_object(window.counts, window.object_index)
-        decider = self._decider
+        decider = self.decider
         if self.guard is not None:
             flags |= self.guard.flags
             decider = self.guard.decider(decider)

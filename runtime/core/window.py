@@ -215,6 +215,7 @@ def sum_up(whole, radix, crc_table, crc):  # type: ignore[no-untyped-def]
 
 
 MAX_VISIT_EXPOSURES = 1 << 24
+WINDOWS_SEEN = 64
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
@@ -335,14 +336,12 @@ class DecisionWindows:
         known = 0 <= state < len(self.walks.successors) and self._seen[window, 0] == step
         return state if known else -1
 
-    def latest(self) -> tuple[list[int], int] | None:
-        """Return the clicks of the window of this visit that was settled last (of several channels the numbers), and its exposures with
-        light; None before the first.
+    def seen_now(self) -> I64:
+        """Return a copy of the clicks of the visit's first WINDOWS_SEEN windows as they are decided on, int64 (windows, d_f).
 
-        For a view beside the loop: it may be read in another thread, and is then of one moment or the next.
+        For a view beside the loop, in another thread: a row that the loop writes meanwhile is no window's, as its checksum shows.
         """
-        at = self._next_window - 1
-        return None if at < 0 else (self._counts[at].tolist(), int(self._seen[at, 0]))
+        return np.stack([self._clicks(at) for at in range(min(self.n_windows, WINDOWS_SEEN))])
 
     def _clicks(self, window: int) -> I64:
         """The counts of a window as they are decided on: of several channels bit t * channels + k is the click of channel k in slot t."""

@@ -88,6 +88,7 @@ class RunOptions:
         "", "show the run as a web page; a port alone: this machine only", metavar="HOST:PORT", group=LIVE_PAGE
     )
     serve_public: bool = option(False, "let other machines see the page; there is no password", group=LIVE_PAGE)
+    serve_control: bool = option(False, "let the page stop the run and put notes into the recording", group=LIVE_PAGE)
 
     osc: str = option(
         "",

@@ -1,64 +1,70 @@
 """The process that draws: it reads pictures from its input, one JSON object per line, and shows them until the input ends.
 
-`python -m pans.runtime.monitor.child [--panel] [--serve HOST:PORT]`; its first line of output says which port it serves, or why it cannot.
+`python -m pans.runtime.monitor.child [--panel] [--serve HOST:PORT [--control]]`; its first line of output says which port it serves, or why
+it cannot. With --control, what is asked for on the page follows, one JSON object per line.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import signal
+import socket
 import sys
-import time
-from collections.abc import Sequence
-from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 
 from pans.runtime.watch.metrics import parse_address
 
 from .history import History
 
-if TYPE_CHECKING:
-    from .server import LivePage
-    from .terminal import TerminalView
-
-LAST_LOOK_S = 0.6  # how long the page's last figures are offered after the run: a browser's round is 0.25 s
+NICE = 5  # the page may wait, the run may not
+BACKLOG = 64
 
 
 def main(words: Sequence[str]) -> int:
     """Draw until standard input ends; 1 where the address cannot be listened at."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    history, live_page = History(), None
+    history, listening = History(), None
     if "--serve" in words:
-        from .server import LivePage
-
-        host, port = parse_address(words[words.index("--serve") + 1], "--serve")
+        address = words[words.index("--serve") + 1]
         try:
-            live_page = LivePage(host, port, history)
+            listening = _listen(*parse_address(address, "--serve"))
         except OSError as error:
             print(json.dumps({"error": error.strerror or str(error)}), flush=True)
             return 1
-    print(json.dumps({"port": 0 if live_page is None else live_page.port}), flush=True)
+    print(json.dumps({"port": 0 if listening is None else listening.getsockname()[1]}), flush=True)
     with ExitStack() as open_views:
-        view = None
+        draw: Callable[[History], None] = lambda history: None
         if "--panel" in words:
             from .terminal import TerminalView
 
             view = TerminalView()
             open_views.callback(view.close)
-        _follow(history, view, live_page)
-    if live_page is not None:
-        time.sleep(LAST_LOOK_S)
-        live_page.close()
+            draw = view.draw
+        if listening is None:
+            for line in sys.stdin:
+                history.take(json.loads(line))
+                draw(history)
+        else:  # whoever has connected waits while Bokeh is loaded
+            with suppress(OSError, AttributeError):
+                os.nice(NICE)
+            from .live_page import serve
+
+            serve(listening, history, draw, address=address, control="--control" in words)
     return 0
 
 
-def _follow(history: History, view: TerminalView | None, live_page: LivePage | None) -> None:
-    for line in sys.stdin:
-        history.take(json.loads(line))
-        if view is not None:
-            view.draw(history)
-        if live_page is not None:
-            live_page.draw()
+def _listen(host: str, port: int) -> socket.socket:
+    family, *_, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    with ExitStack() as failed:
+        listening = failed.enter_context(socket.socket(family))
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(place)
+        listening.listen(BACKLOG)
+        listening.setblocking(False)
+        failed.pop_all()
+    return listening
 
 
 if __name__ == "__main__":

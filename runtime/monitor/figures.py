@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.safe_text import one_line
 
-from .history import Bin, History, quantile_us
+from .history import RECENT_S, History, quantile_us
 
 NAME_CHARACTERS = 40
 NO_LABEL = 0xFFFF  # of a decision that abstained (decide/verdict.py), which would load numpy
 CLASSES_SHOWN = 20
 DISK_LOW_S, DISK_SHORT_S = 3600.0, 86_400.0
+DISK_KNOWN_S = 10.0  # before, the recording is its header
 GIB, MIB = 1 << 30, 1 << 20
 LEVELS = {"notice": "note", "warning": "warn", "alarm": "bad"}
 
@@ -186,7 +187,7 @@ def _machine(history: History) -> list[Row]:
     if free is None:
         return []
     size, seconds = picture.get("recording_bytes", 0), max(float(picture["elapsed_s"]), 1.0)
-    left_s = free * seconds / size if size else float("inf")
+    left_s = free * seconds / size if size and seconds >= DISK_KNOWN_S else float("inf")
     level = "bad" if left_s < DISK_LOW_S else "warn" if left_s < DISK_SHORT_S else ""
     lasts = f", lasts {duration(left_s)}" if left_s < 1e10 else ""
     return [
@@ -207,22 +208,24 @@ def class_rows(history: History) -> list[tuple[str, int, int, int]]:
 
 
 def latest_rows(history: History) -> list[dict[str, Any]]:
-    """Return the latest decisions, the newest first: object, decision, probability, clicks, truth, level."""
+    """Return the latest decisions, the newest first, as `decision_row` has them."""
+    return [decision_row(history, facts) for facts in reversed(history.picture.get("latest", ()))]
+
+
+def decision_row(history: History, facts: list[Any]) -> dict[str, Any]:
+    """Return a decision in words: its number, object, decision, probability, clicks, truth, level."""
     names = history.begin.get("classes", ())
-    found = []
-    for _, number, label, probability, clicks, truth, _ in reversed(history.picture.get("latest", ())):
-        known = 0 <= truth < len(names)
-        found.append(
-            {
-                "object": number if number != 0xFFFFFFFF else "",
-                "decision": name_of(label, names),
-                "probability": f"{probability:.0%}" if label != NO_LABEL else "",
-                "clicks": clicks,
-                "truth": one_line(names[truth], NAME_CHARACTERS) if known else "unknown",
-                "level": "" if not known or label == NO_LABEL else "good" if truth == label else "bad",
-            }
-        )
-    return found
+    number, index, label, probability, clicks, truth, _ = facts
+    known = 0 <= truth < len(names)
+    return {
+        "number": number,
+        "object": index if index != 0xFFFFFFFF else "",
+        "decision": name_of(label, names),
+        "probability": f"{probability:.0%}" if label != NO_LABEL else "",
+        "clicks": clicks,
+        "truth": one_line(names[truth], NAME_CHARACTERS) if known else "unknown",
+        "level": "" if not known or label == NO_LABEL else "good" if truth == label else "bad",
+    }
 
 
 def name_of(label: int, classes: Any) -> str:
@@ -232,31 +235,31 @@ def name_of(label: int, classes: Any) -> str:
     return one_line(classes[label], NAME_CHARACTERS) if label < len(classes) else "picture"
 
 
-def series(history: History) -> dict[str, list[Any]]:
-    """Return the curves over time: one row per bin, None where nothing is known. Rates and shares, microseconds, ppm."""
-    rows = [_point(history, one) for one in history.bins if one.end_s > one.begin_s]
-    names = rows[0].keys() if rows else ()
-    return {name: [row[name] for row in rows] for name in names}
-
-
-def _point(history: History, one: Bin) -> dict[str, Any]:
-    found, sums = history.accuracy(one.sums), one.sums
-    dark = wilson_interval(sums["dark_clicks"], sums["dark_exposures"]) if sums["dark_exposures"] > 0 else (None, None)
-    return {
-        "s": round((one.begin_s + one.end_s) / 2, 2),
-        "accuracy": found and found[0],
-        "accuracy_low": found and found[1],
-        "accuracy_high": found and found[2],
-        "rate": sums["decisions"] / (one.end_s - one.begin_s),
-        "late": sums["late"],
-        "lost": sums["lost"],
-        "p50": quantile_us(one.latency, 0.5),
-        "p99": quantile_us(one.latency, 0.99),
-        "dark": sums["dark_clicks"] / sums["dark_exposures"] if sums["dark_exposures"] > 0 else None,
-        "dark_low": dark[0],
-        "dark_high": dark[1],
-        "drift": one.drift_ppm,
-    }
+def health(history: History) -> list[tuple[str, str, str]]:
+    """Return machine, link and detector, each as its name, a level, and one sentence with one number."""
+    picture, deadline = history.picture, float(history.begin.get("deadline_us", 0.0))
+    sums, latency = history.recent()
+    p99, late, lost = quantile_us(latency, 0.99), int(sums["late"]), int(sums["lost"])
+    disk = next((row for row in _machine(history) if row.level), None)
+    if disk is not None:
+        machine = disk.level, f"The disk of the recording has {disk.text}."
+    elif late:
+        machine = "bad", f"{late:,} decisions were late in the last minute."
+    elif p99 is None:
+        machine = "note", f"No decision was made in the last {RECENT_S:.0f} s."
+    elif not deadline:
+        machine = "good", f"99 % of the last minute's decisions took at most {p99:,.0f} us."
+    else:
+        machine = "good", f"99 % of the last minute's decisions took at most {p99 / deadline:.0%} of the time allowed."
+    unsure = f"The device's clock is known to {picture['clock_uncertainty_us']:,.0f} us, and nothing was lost of late."
+    link = ("bad", f"{lost:,} exposures were lost in the last minute.") if lost else ("good", unsure)
+    if picture["state"] != "running" and not picture["ended"]:
+        link = "bad", f"The run is: {picture['state']}, after {picture['elapsed_s']:,.0f} s."
+    dark, exposures = history.dark(sums)
+    words, level = _dark_state(picture)
+    rate = f"{dark / exposures:.2g} dark counts per exposure" if exposures else "No dark exposures yet"
+    detector = level or "note", f"{rate}{f': {words}' if words else ''}."
+    return [(name, *one) for name, one in zip(("machine", "link", "detector"), (machine, link, detector))]
 
 
 def duration(seconds: float) -> str:

@@ -1,7 +1,9 @@
-"""A run's figures over its whole time, from its pictures in their order, in bounded memory: sums per bin of time.
+"""A run's figures over its whole time, from its pictures in their order: sums per bin of time, at several resolutions.
 
-Whenever there are more than MAX_BINS, bins become twice as long. No numpy is loaded: the process that draws shall start at once and stay
-small.
+Memory is bounded: each of LEVELS keeps its last BINS bins, 3072 together. A bin holds a dozen sums and as many counts as there were
+different latencies (32 steps per octave), so that a month of history takes about 40 MB, and most of it is there after an hour. Sums and
+latency histograms merge exactly; what is older than six weeks is in the sums of the whole run alone. No numpy is loaded: a process that
+draws in the terminal shall start at once and stay small.
 """
 
 from __future__ import annotations
@@ -12,40 +14,34 @@ from typing import Any
 
 from pans.runtime.intervals import wilson_interval
 
-MAX_BINS = 240
-FIRST_BIN_S = 1.0
+LEVELS = (1.0, 5.0, 30.0, 180.0, 1200.0, 7200.0)  # seconds of a bin
+BINS = 512  # of a level: 8 minutes, 42 minutes, 4 hours, 1 day, 1 week, 6 weeks
 RATE_OVER_S = 5.0
+RECENT_S = 60.0
 SUMS = ("decisions", "known", "right", "abstained", "late", "lost", "dark_exposures", "dark_clicks", "exposures")
+SUMS += ("clicks", "photons", "photons_known")
 
 
 @dataclass(slots=True)
 class Bin:
-    """What came between `begin_s` and `end_s` of the run."""
+    """What came between `begin_s` and `end_s` of the run; `sums` are in the order of SUMS."""
 
     begin_s: float
     end_s: float
-    sums: Counter[str] = field(default_factory=Counter)
+    sums: list[float] = field(default_factory=lambda: [0] * len(SUMS))
     latency: Counter[int] = field(default_factory=Counter)
     drift_ppm: float | None = None
 
-    def absorb(self, later: Bin) -> None:
-        """Add the bin behind this one."""
-        self.end_s = later.end_s
-        self.sums.update(later.sums)
-        self.latency.update(later.latency)
-        self.drift_ppm = later.drift_ppm if later.drift_ppm is not None else self.drift_ppm
-
 
 class History:
-    """The latest picture, the sums of all, and those of each bin of time."""
+    """The latest picture, the sums of all, and those of each bin of time: `bins` by their length in seconds."""
 
     def __init__(self) -> None:
         self.begin: dict[str, Any] = {}
         self.picture: dict[str, Any] = {}
         self.latency: Counter[int] = Counter()
         self.pixels: dict[str, Any] = {}
-        self.bins: list[Bin] = []
-        self.bin_s = FIRST_BIN_S
+        self.bins: dict[float, deque[Bin]] = {level: deque(maxlen=BINS) for level in LEVELS}
         self.number = 0  # of pictures
         self._recent: deque[dict[str, Any]] = deque()
 
@@ -62,31 +58,21 @@ class History:
         self.pixels.update(picture.pop("pixels", {}))
         if "word" not in picture and "word" in self.picture:
             picture["word"] = self.picture["word"]
-        now_s = float(picture["elapsed_s"])
-        if not self.bins or now_s >= self.bins[-1].begin_s + self.bin_s:
-            self._new_bin(now_s)
-        here = self.bins[-1]
-        here.end_s = now_s
-        for name in SUMS:
-            here.sums[name] += picture.get(name, 0) - self.picture.get(name, 0)
-        here.latency.update(grown)
-        here.drift_ppm = picture.get("clock_drift_ppm", here.drift_ppm)
+        before, now_s = self.picture, float(picture["elapsed_s"])
+        sums = [picture.get(name, 0) - before.get(name, 0) for name in SUMS]
+        for level, bins in self.bins.items():
+            if not bins or now_s // level > bins[-1].end_s // level:
+                bins.append(Bin(float(before.get("elapsed_s", 0.0)), now_s))
+            here = bins[-1]
+            here.end_s = now_s
+            here.sums = [a + b for a, b in zip(here.sums, sums)]
+            here.latency.update(grown)
+            here.drift_ppm = picture.get("clock_drift_ppm", here.drift_ppm)
         self.latency.update(grown)
         self.picture = picture
         self._recent.append(picture)
         while len(self._recent) > 2 and now_s - float(self._recent[1]["elapsed_s"]) >= RATE_OVER_S:
             self._recent.popleft()
-
-    def _new_bin(self, now_s: float) -> None:
-        begin_s = self.bins[-1].end_s if self.bins else 0.0
-        if len(self.bins) >= MAX_BINS:
-            for first, second in zip(self.bins[::2], self.bins[1::2]):
-                first.absorb(second)
-            self.bins = self.bins[::2]
-            self.bin_s *= 2
-            if now_s < self.bins[-1].begin_s + self.bin_s:
-                return
-        self.bins.append(Bin(begin_s, now_s))
 
     def rate(self, name: str) -> float:
         """Return how much `name` grew per second of late."""
@@ -95,6 +81,20 @@ class History:
         first, last = self._recent[0], self._recent[-1]
         seconds = float(last["elapsed_s"]) - float(first["elapsed_s"])
         return (last.get(name, 0) - first.get(name, 0)) / seconds if seconds > 0 else 0.0
+
+    def recent(self) -> tuple[dict[str, float], Counter[int]]:
+        """Return the sums and the latencies of the last minute."""
+        sums, latency = dict.fromkeys(SUMS, 0.0), Counter[int]()
+        for one in self.bins[LEVELS[0]]:
+            if one.end_s > self.picture["elapsed_s"] - RECENT_S:
+                sums = {name: sums[name] + value for name, value in zip(SUMS, one.sums)}
+                latency.update(one.latency)
+        return sums, latency
+
+    def dark(self, sums: dict[str, float]) -> tuple[float, float]:
+        """Return the dark clicks and dark exposures of `sums`, those of the whole run where these hold none."""
+        some = sums if sums["dark_exposures"] > 0 else self.picture
+        return some["dark_clicks"], some["dark_exposures"]
 
     def accuracy(self, sums: dict[str, Any], objects: int | None = None) -> tuple[float, float, float] | None:
         """Return accuracy and its 95 % interval (Wilson), in which the trials of one visit and showings of one object count once."""

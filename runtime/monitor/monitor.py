@@ -13,21 +13,28 @@ import threading
 import time
 from collections import deque
 from contextlib import suppress
+from datetime import UTC, datetime
+from importlib.util import find_spec
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import IO, TYPE_CHECKING, Any, Self
 
 from pans.runtime.cli import say
 from pans.runtime.errors import UsageError
+from pans.runtime.live.continuous import INTERRUPTED
+from pans.runtime.safe_text import one_line
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.decision import Decision, Output
     from pans.runtime.live import LiveRun
+    from pans.runtime.live.continuous import Stop
     from pans.runtime.record import Recorder
 
     from .snapshot import Snapshots
 
 EVERY_S = 0.4
+NOTE_CHARACTERS, NOTES_WAITING = 200, 20
+KEPT_DECISIONS = 64
 LINE_EVERY_S = 5.0
 GOODBYE_S = 3.0
 
@@ -35,12 +42,14 @@ GOODBYE_S = 3.0
 class Monitor:
     """Shows one run: with `panel` in the terminal, with `address` (HOST:PORT) as a web page, else in plain lines unless not `lines`.
 
-    Enter it before anything long begins, so that the page is there and a busy port is refused at once (UsageError); `begin` before the run,
-    `prepared` when the run is there, `watch` after each block.
+    With `control` the page can stop the run and put notes into the recording. Enter it before anything long begins, so that the page is
+    there and a busy port is refused at once (UsageError); `begin` before the run, `prepared` when the run is there, `watch` after each
+    block, `close_notes` before the recording is closed.
     """
 
-    def __init__(self, *, panel: bool, address: str = "", lines: bool = True) -> None:
+    def __init__(self, *, panel: bool, address: str = "", control: bool = False, lines: bool = True) -> None:
         self._words = [*(["--panel"] if panel else []), *(["--serve", address] if address else [])]
+        self._words += ["--control"] if control else []
         self._address, self._lines = address, lines and not panel
         self._child: subprocess.Popen[str] | None = None
         self._snapshots: Snapshots | None = None
@@ -48,10 +57,16 @@ class Monitor:
         self._wanted: tuple[Bundle, Recorder | None] | None = None
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
-        self._latest: deque[Decision] = deque(maxlen=12)
+        self._latest: deque[Decision] = deque(maxlen=KEPT_DECISIONS)
+        self._notes: deque[dict[str, Any]] = deque(maxlen=NOTES_WAITING)
+        self._stop: Stop | None = None
+        self._run: LiveRun | None = None
         self.url = ""
 
     def __enter__(self) -> Self:
+        if self._address and any(find_spec(name) is None for name in ("bokeh", "jinja2")):
+            what = "--serve needs the package bokeh, which is not installed"
+            raise UsageError(what, remedy="pip install 'pans-runtime[ui]'")
         if self._words:
             command = [sys.executable, "-P", "-m", "pans.runtime.monitor.child", *self._words]
             self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -74,11 +89,12 @@ class Monitor:
         from pans.runtime.watch.metrics import parse_address  # the server's modules load slowly
 
         host = parse_address(self._address, "--serve")[0]
+        threading.Thread(target=self._listen, args=(self._child.stdout,), name="pans-page", daemon=True).start()
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{said['port']}/"
 
-    def begin(self, bundle: Bundle, recorder: Recorder | None, facts: dict[str, Any]) -> None:
+    def begin(self, bundle: Bundle, recorder: Recorder | None, facts: dict[str, Any], stop: Stop) -> None:
         """Start to take pictures, in a thread that inherits no privileges of the loop; `facts` are begin_facts'."""
-        self._wanted, self._facts = (bundle, recorder), facts
+        self._wanted, self._facts, self._stop = (bundle, recorder), facts, stop
         if self._child is None and not self._lines:
             return
         self._thread = threading.Thread(target=self._keep, name="pans-monitor", daemon=True)
@@ -89,11 +105,22 @@ class Monitor:
         from .snapshot import Snapshots
 
         assert self._wanted is not None
-        self._snapshots = Snapshots(run, *self._wanted, self._latest)
+        snapshots = Snapshots(run, *self._wanted, self._latest)
+        if self.url:
+            snapshots.tell_words()
+        self._run, self._snapshots = run, snapshots
 
     def watch(self, run: LiveRun, output: Output) -> None:
         """Take the decisions of a block."""
-        self._latest.extend(output.decisions[-(self._latest.maxlen or 0) :])
+        self._latest.extend(output.decisions[-KEPT_DECISIONS:])
+        if self._notes:
+            self.close_notes()
+
+    def close_notes(self) -> None:
+        """Note in the run's journal, and so in its recording, what was written on the page; called by the loop."""
+        while self._notes and (run := self._run) is not None:
+            tick = run.connection.known_clock().to_tick(run.now_ns())
+            run.journal.note("note", **self._notes.popleft(), tick=tick)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -128,6 +155,19 @@ class Monitor:
                     line_due_s = time.monotonic() + LINE_EVERY_S
                     say(f"{title_of(history)}: {headline(history)}")
 
+    def _listen(self, said: IO[str]) -> None:
+        """Take what is asked for on the page: a note, or the end of the run."""
+        with suppress(ValueError, OSError):  # the process is gone
+            for line in said:
+                asked = json.loads(line)
+                text = one_line(asked.get("note", ""), NOTE_CHARACTERS).strip()
+                utc = datetime.now(UTC).isoformat(timespec="milliseconds")
+                if text:
+                    self._notes.append({"text": text, "utc": utc})
+                elif asked.get("stop") is True and self._stop is not None:
+                    self._notes.append({"text": "stop was pressed on the live page", "utc": utc})
+                    self._stop.request(INTERRUPTED)
+
     def _tell(self, message: dict[str, Any]) -> bool:
         if self._child is None or self._child.stdin is None:
             return False
@@ -151,5 +191,5 @@ class Monitor:
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
-        if child.stdout is not None:
+        if child.stdout is not None and not self.url:  # else the thread that reads it ends with it
             child.stdout.close()

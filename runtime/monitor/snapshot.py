@@ -10,6 +10,7 @@ import base64
 import os
 import shutil
 import time
+import zlib
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,7 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.core.decision import DecisionFlag
+from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
+from pans.runtime.decide.verdict import log_evidence
 from pans.runtime.instrument.channel_health import LEVELS
 from pans.runtime.timing.ledger import upper_edge
 from pans.runtime.watch.state_file import state_of
@@ -31,6 +35,9 @@ if TYPE_CHECKING:
     from pans.runtime.record import Recorder
 
 LATEST = 12  # decisions
+LOOKS, LOOK_EVERY_S = 8, 0.003  # for a word that is whole
+SAME = 1e-3  # of two probabilities
+EVENTS_MAX = 50  # of one picture; what is left comes with the next
 PIXELS_MAX = 64  # of a side, as it is shown
 PATTERNS_MAX = 2048  # whose pixels are told in one run
 DISK_EVERY_S = 5.0
@@ -58,14 +65,24 @@ class Snapshots:
         self._began_s = time.monotonic()
         self._counts = np.zeros_like(run.timing.total.counts)
         self._told: set[int] = set()
+        self._told_events = 0
         automaton = run.plan.automaton
         self._light = None if automaton is None else bundle.light_of(automaton)  # of each state
         self._disk: dict[str, Any] = {}
         self._disk_due_s = 0.0
+        self._breathe: Callable[[float], None] = time.sleep
+        self._core: Core | None = None  # whose click words are told
+
+    def tell_words(self) -> None:
+        """Tell click words, too; called before arming, since what they need may have to be compiled."""
+        if isinstance(self._run.core, Core):
+            self._core = self._run.core
+            self._posterior(self._core, self._core.windows.seen_now()[0] * 0)
 
     def take(self, breathe: Callable[[float], None] = time.sleep) -> dict[str, Any]:
         """Return the run's figures as they are now; `breathe` is called between the parts."""
         picture: dict[str, Any] = {"kind": "picture", "elapsed_s": round(time.monotonic() - self._began_s, 3)}
+        self._breathe = breathe
         for part in (self._counters, self._latency, self._classes, self._decisions, self._dark, self._clock):
             picture |= part()
             breathe(BREATH_S)
@@ -113,36 +130,49 @@ class Snapshots:
         }
 
     def _decisions(self) -> dict[str, Any]:
-        rows = [
-            [row.number, row.object, row.label, round(row.probability, 4), row.clicks, row.truth, row.flags]
-            for row in tuple(self._latest)
-        ]
-        windows = getattr(self._run.core, "windows", None)
-        found = None if windows is None else windows.latest()
-        return {"latest": rows} | ({} if found is None else self._word(*found))
+        """The latest decisions, the click word of one of them, and the pixels of patterns that are new.
 
-    def _word(self, clicks: list[int], exposures: int) -> dict[str, Any]:
-        """The clicks of the latest decision with the patterns that they were clicks on, and the pixels of those that are new."""
-        automaton = self._run.plan.automaton
+        The loop may be ahead of the decisions that it has handed over. A word belongs to the decision whose checksum it has.
+        """
+        core, words = self._core, dict[int, NDArray[np.int64]]()
+        for look in range(0 if core is None else LOOKS):
+            if look:
+                self._breathe(LOOK_EVERY_S)
+            words |= {zlib.crc32(counts.tobytes()): counts for counts in core.windows.seen_now()}
+        latest = tuple(self._latest)
+        facts: dict[str, Any] = {"latest": [_facts_of(row) for row in latest[-LATEST:]]}
+        for row in reversed(latest):
+            if core is not None and row.counts_crc in words and not row.flags & DecisionFlag.GAP:
+                return facts | self._word(core, row, words[row.counts_crc])
+        return facts
+
+    def _word(self, core: Core, row: Decision, counts: NDArray[np.int64]) -> dict[str, Any]:
+        """A decision with its patterns, the clicks on each, and each class's probability where it is that of the decision."""
+        automaton, clicks = self._run.plan.automaton, counts.tolist()
         if automaton is None:
             shown = list(range(min(len(clicks), PIXELS_MAX)))
-            clicks = clicks[: len(shown)]
         else:
-            shown, node, words = [], 0, clicks[:exposures]
-            for word in words:
-                if not 0 <= node < automaton.n_states:
+            shown, node = [], 0
+            for outcome in (counts.reshape(-1, automaton.channels) << np.arange(automaton.channels)).sum(axis=1):
+                if node >= automaton.n_states:
                     break
                 shown += automaton.rows[node].tolist()
-                node = int(automaton.successors[node, word])
-            several = automaton.channels > 1
-            bits = (
-                [word >> channel & 1 for word in words for channel in range(automaton.channels)] if several else words
-            )
-            clicks = [int(bit > 0) for bit in bits[: len(shown)]]
+                node = int(automaton.successors[node, outcome])
         new = [number for number in dict.fromkeys(shown) if number not in self._told]
         new = new[: max(0, PATTERNS_MAX - len(self._told))]
         self._told.update(new)
-        return {"word": {"patterns": shown, "clicks": clicks}, "pixels": {str(n): self._pixels(n) for n in new}}
+        posterior = self._posterior(core, counts)
+        sure = len(posterior) and abs(float(posterior.max()) - row.probability) < SAME
+        word = {"decision": _facts_of(row), "patterns": shown, "clicks": clicks[: len(shown)]}
+        word |= {"posterior": [round(float(one), 4) for one in posterior] if sure else []}
+        return {"word": word, "pixels": {str(n): self._pixels(n) for n in new}}
+
+    def _posterior(self, core: Core, counts: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Each class's probability by a word, float64 (classes,); (0,) where there are no classes."""
+        if not core.decider.n_classes:
+            return np.zeros(0)
+        decider = core.decider if core.guard is None else core.guard.decider(core.decider)
+        return np.exp(log_evidence(decider.scores_batch(counts[None], core.shots), 1e-30)[0])
 
     def _pixels(self, number: int) -> dict[str, Any]:
         values = pattern_pixels(self._bundle, number)
@@ -175,11 +205,14 @@ class Snapshots:
         tells = self._run.connection.session.tells_exposed
         fit = None if clock is None else clock.fit
         trouble = self._run.journal.trouble
+        news = self._run.journal.events[self._told_events : self._told_events + EVENTS_MAX]
+        self._told_events += len(news)
         return {
             "clock_drift_ppm": None if fit is None else round(fit.drift_ppm, 4),
             "exposed": [told.exposures, told.start_error * tick_us, told.length_error * tick_us] if tells else None,
             "clock_uncertainty_us": self._run.timing.worst_uncertainty_ns / 1000,
-            "trouble": "" if trouble is None else _words_of(trouble),
+            "trouble": "" if trouble is None else _trouble_of(trouble),
+            "events": [[event["kind"], _words_of(event)] for event in news if event["kind"] != "late"],
         }
 
     def _disk_facts(self) -> dict[str, Any]:
@@ -197,9 +230,17 @@ class Snapshots:
 
 
 def _words_of(event: dict[str, Any]) -> str:
-    why = event.get("why") or event.get("reason") or event.get("message") or event.get("text") or ""
-    kind = "late or missing work" if event.get("kind") == "blame" else str(event.get("kind")).replace("_", " ")
-    return f"{kind}: {why}" if why else kind
+    found = next((str(event[key]) for key in ("why", "reason", "message", "text", "words") if event.get(key)), "")
+    return found or ", ".join(f"{key} {value}" for key, value in event.items() if key != "kind")
+
+
+def _trouble_of(event: dict[str, Any]) -> str:
+    kind = "late or missing work" if event["kind"] == "blame" else str(event["kind"]).replace("_", " ")
+    return f"{kind}: {_words_of(event)}"
+
+
+def _facts_of(row: Decision) -> list[Any]:
+    return [row.number, row.object, row.label, round(row.probability, 4), row.clicks, row.truth, row.flags]
 
 
 def pattern_pixels(bundle: Bundle, number: int) -> NDArray[np.float64]:
