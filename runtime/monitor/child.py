@@ -6,6 +6,7 @@ it cannot. With --control, what is asked for on the page follows, one JSON objec
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -35,23 +36,24 @@ def main(words: Sequence[str]) -> int:
             return 1
     print(json.dumps({"port": 0 if listening is None else listening.getsockname()[1]}), flush=True)
     with ExitStack() as open_views:
-        draw: Callable[[History], None] = lambda history: None
+        draws: list[Callable[[History], None]] = []
         if "--panel" in words:
             from .terminal import TerminalView
 
             view = TerminalView()
             open_views.callback(view.close)
-            draw = view.draw
+            draws.append(view.draw)
         if listening is None:
             for line in sys.stdin:
                 history.take(json.loads(line))
-                draw(history)
+                for draw in draws:
+                    draw(history)
         else:  # whoever has connected waits while Bokeh is loaded
             with suppress(OSError, AttributeError):
                 os.nice(NICE)
             from .live_page import serve
 
-            serve(listening, history, draw, address=address, control="--control" in words)
+            asyncio.run(serve(listening, history, draws, address=address, control="--control" in words))
     return 0
 
 
