@@ -22,6 +22,7 @@ BLOCKED = (
     "pyarrow",
     "prometheus_client",
     "ALP4",
+    "bokeh",
 )
 NEEDS = {  # command line: what it needs, and the extra that has it
     "train s.npz --features 2 -o new.pans": ("torch", "train"),
@@ -31,6 +32,7 @@ NEEDS = {  # command line: what it needs, and the extra that has it
     "reproduce alpha --collect --cache new -o out": ("torch", "train"),
     "export r.pansrec --format photon-hdf5 -o new.h5": ("h5py", "export"),
     "run fashion10 --device sim:ideal?pace=fast --decisions 3 --metrics 0 --out new": ("prometheus-client", "metrics"),
+    "run fashion10 --device sim:ideal?pace=fast --decisions 3 --serve 0 --out new": ("bokeh", "ui"),
     "instrument --projector alp --counter tagger --profile alp-tagger": ("ALP4", "alp"),
     "bench decide --quick --plot new.png": ("matplotlib", "plot"),
     "report r.pansrec -o new.html": ("matplotlib", "plot"),

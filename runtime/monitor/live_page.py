@@ -70,7 +70,7 @@ from .figures import (
 from .history import BINS, LEVELS, SUMS, Bin, History
 from .monitor import NOTE_CHARACTERS
 
-SESSIONS_MAX = 16
+SESSIONS_MAX = 12
 REFRESH_MS, LAST_LOOK_S = 1000, 0.6
 PER_ROW, ROW_HEIGHT = 8, 1.3  # patterns, and the height of a row with its text, in widths of a pattern
 SPANS = {"1 minute": 60, "10 minutes": 600, "1 hour": 3600, "6 hours": 21_600, "1 day": 86_400, "1 week": 604_800}

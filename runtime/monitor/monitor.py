@@ -64,7 +64,7 @@ class Monitor:
         self.url = ""
 
     def __enter__(self) -> Self:
-        if self._address and any(find_spec(name) is None for name in ("bokeh", "jinja2")):
+        if self._address and not all(map(_is_installed, ("bokeh", "jinja2"))):
             what = "--serve needs the package bokeh, which is not installed"
             raise UsageError(what, remedy="pip install 'pans-runtime[ui]'")
         if self._words:
@@ -193,3 +193,10 @@ class Monitor:
             child.wait()
         if child.stdout is not None and not self.url:  # else the thread that reads it ends with it
             child.stdout.close()
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False

@@ -20,6 +20,10 @@ import pytest
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync")
 FLAGS += ("--disable-background-networking", "--disable-component-update")
+# all elements of a page that match, those in shadow roots too
+DEEP = """const deep = (root, what) => [...root.querySelectorAll("*")].flatMap(
+  one => [...(one.matches(what) ? [one] : []), ...(one.shadowRoot ? deep(one.shadowRoot, what) : [])]);
+"""
 
 
 @contextmanager
@@ -63,9 +67,10 @@ def picture(driver: Any, path: Path) -> None:
 def clipped(driver: Any) -> list[str]:
     """Return the parts that are wider than the window, or whose text is cut, outside of regions that scroll."""
     found: list[str] = driver.execute_script(
-        """
+        DEEP
+        + """
         const bad = [], wide = document.documentElement.clientWidth;
-        for (const one of document.body.querySelectorAll("*")) {
+        for (const one of deep(document.body, "*")) {
           if (one.closest(".scroll") && !one.matches(".scroll")) continue;
           const box = one.getBoundingClientRect();
           if (box.width && (box.right > wide + 1 || box.left < -1))
@@ -120,14 +125,15 @@ def serious(driver: Any) -> list[str]:
 def unreachable(driver: Any) -> list[str]:
     """Return what can be used but is not reached with the Tab key, or does not show that it has the focus."""
     count: int = driver.execute_script(
-        """
+        DEEP
+        + """
         document.activeElement.blur();
         const usable = "a[href], button, summary, input, select, textarea, [tabindex='0']";
-        const seen = [...document.querySelectorAll(usable)].filter(one => one.checkVisibility() && !one.disabled);
+        const seen = deep(document, usable).filter(one => one.checkVisibility() && !one.disabled);
         window.waiting = new Set(seen);
         window.unseen = [];
         document.addEventListener("focusin", event => {
-          const one = event.target, style = getComputedStyle(one);
+          const one = event.composedPath()[0], style = getComputedStyle(one);
           window.waiting.delete(one);
           const unseen = style.outlineStyle === "none" && style.boxShadow === "none";
           if (unseen) window.unseen.push("no focus is seen: " + one.outerHTML.slice(0, 120));

@@ -1,158 +1,193 @@
-"""The live page: what the server sends and refuses, and the page in a real browser at both widths, in light and dark."""
+"""The live page: what the server lets through, what its curves say, and the page in a real browser at both widths, in light and dark."""
 
+import json
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
-from browser import browser, clipped, console, look, picture, serious, unreachable
+from browser import DEEP, browser, clipped, console, look, picture, serious, unreachable
 
-from pans.runtime.monitor.history import History
-from pans.runtime.monitor.server import LivePage, page
-from pans.runtime.watch.http import MAX_LISTENERS
+from pans.runtime.intervals import wilson_interval
+from pans.runtime.monitor.history import LEVELS, History
 
+live_page = pytest.importorskip("pans.runtime.monitor.live_page", reason="needs bokeh")
 NASTY = '<img src=x onerror="document.title=1">\x1b[2J'
 GREY = "AAECAwQFBgcICQoLDA0ODw=="  # 16 pixels
+PROGRAM = [sys.executable, "-P", "-m", "pans.runtime.monitor.child", "--serve", "127.0.0.1:0"]
 
 
-def a_history(pictures: int = 30) -> History:
-    history = History()
+def messages(n: int = 30, step_s: float = 20.0, hot: range = range(0)) -> Iterator[dict[str, Any]]:
+    """The pictures of a run; in those of `hot` the dark counts are 25 times as many."""
     classes = [NASTY, "T-shirt/top", "a rather long name of a class of objects", *map(str, range(7))]
     begin = {"bundle": NASTY, "title": f"{NASTY} on a device", "classes": classes, "expected": 1000}
-    history.take({"kind": "begin", "simulated": True, "deadline_us": 2000.0, "encoder": "automaton", **begin})
-    for k in range(1, pictures + 1):
-        facts: dict[str, Any] = {
+    yield {
+        "kind": "begin",
+        "simulated": True,
+        "deadline_us": 2000.0,
+        "encoder": "automaton",
+        "clicks_stated": 4.6,
+        **begin,
+    }
+    dark = 0
+    for k in range(1, n + 1):
+        dark += 25 if k in hot else 1
+        yield {
+            **{"kind": "picture", "elapsed_s": step_s * k, "state": "running", "ended": "", "walk_light": 7e3 * k},
             **dict.fromkeys(("lost", "gaps", "reconnects", "contradictions"), 0),
             **{name: 20 * k for name in ("decisions", "known", "objects", "photons_known")},
-            **{
-                "state": "running",
-                "ended": "",
-                "abstained": k,
-                "right": 15 * k,
-                "clicks": 90 * k,
-                "photons": 160.0 * k,
-            },
-            **{"walk_light": 7e3 * k, "exposures": 600 * k, "late": k // 10, "trouble": NASTY},
+            **{"abstained": k, "right": 15 * k, "clicks": 90 * k, "photons": 160.0 * k, "exposures": 600 * k},
+            **{"late": k // 10, "trouble": NASTY, "events": [["note", NASTY]] if k == 5 else []},
             **{"latency": [[300_000 + 10_000 * (k % 5), 18], [900_000, 2]], "latency_max_us": 1500.0},
-            "recording": "run.pansrec",
-            **{"dark_exposures": 50 * k, "dark_clicks": k, "dark_expected": 0.015, "dark_high": 0.02, "dark_words": ""},
+            **{"dark_exposures": 50 * k, "dark_clicks": dark, "dark_expected": 0.015, "dark_low": 0.014},
+            **{"dark_high": 0.02, "dark_words": "hot" if k in hot else "", "dark_level": "alarm" if k in hot else ""},
             **{"clock_drift_ppm": -20 + k % 3, "clock_uncertainty_us": 70.0, "disk_free_bytes": 1 << 36},
-            **{"recording_bytes": 1 << 22, "class_decided": list(range(10)), "class_truth": [10] * 10},
-            **{"class_right": [5] * 10, "latest": [[k, k, 0, 0.9, 4, 0, 0], [k, k, 1, 0.5, 2, 0, 0]]},
-            **{"word": {"patterns": list(range(32)), "clicks": [0, 1] * 16}},
-            **{"pixels": {str(n): {"shape": [4, 4], "grey": GREY} for n in range(32)}},
+            **{"recording": "run.pansrec", "recording_bytes": 1 << 22, "class_decided": list(range(10))},
+            **{"class_truth": [10] * 10, "class_right": [5] * 10, "latest": [[k, k, 1, 0.5, 2, 0, 0]]},
+            "word": {
+                **{"decision": [k, k, 0, 0.9, 16, 0, 0], "patterns": list(range(32)), "clicks": [0, 1] * 16},
+                "posterior": [0.9, *[0.1 / 9] * 9],
+            },
+            "pixels": {str(n): {"shape": [4, 4], "grey": GREY} for n in range(32)},
         }
-        history.take({"kind": "picture", "elapsed_s": 120.0 * k, **facts})
-    return history
 
 
-@pytest.fixture
-def served() -> Iterator[LivePage]:
-    live = LivePage("127.0.0.1", 0, a_history())
-    yield live
-    live.close()
+class Served:
+    """A page in a process of its own."""
+
+    def __init__(self, *more: str) -> None:
+        self.process = subprocess.Popen([*PROGRAM, *more], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.port = json.loads(self.process.stdout.readline())["port"]
+        self.url = f"http://127.0.0.1:{self.port}/"
+
+    def tell(self, *some: dict[str, Any]) -> None:
+        self.process.stdin.write("".join(json.dumps(one) + "\n" for one in some))
+        self.process.stdin.flush()
+
+    def ask(self, words: str, *headers: str) -> str:
+        with socket.create_connection(("127.0.0.1", self.port), timeout=30) as client:
+            client.sendall("\r\n".join((f"{words} HTTP/1.1", "Connection: close", *headers, "", "")).encode())
+            return b"".join(iter(lambda: client.recv(1 << 16), b"")).decode()
 
 
-def ask(live: LivePage, words: str) -> socket.socket:
-    client = socket.create_connection(("127.0.0.1", live.port), timeout=5)
-    client.sendall(f"{words} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
-    return client
+@contextmanager
+def page(*more: str) -> Iterator[Served]:
+    served = Served(*more)
+    try:
+        yield served
+    finally:
+        served.process.stdin.close()
+        assert served.process.wait(30) == 0
+        served.process.stdout.close()
 
 
-def until(client: socket.socket, mark: bytes) -> bytes:
-    data = b""
-    while mark not in data and (piece := client.recv(1 << 16)):
-        data += piece
-    return data
+def test_curves_are_those_of_the_decisions_that_a_point_takes() -> None:
+    history, rng, level, least = History(), np.random.default_rng(5), LEVELS[0], 40
+    steps, sums = [], dict.fromkeys(("decisions", "known", "right", "dark_exposures", "dark_clicks"), 0)
+    given = {"kind": "picture", "latency": [], "dark_low": 0.02, "dark_high": 0.03}
+    for k in range(1, 101):
+        made, dark, ns = int(rng.integers(0, 20)), int(rng.integers(0, 4)), int(rng.integers(1, 9)) * 100_000
+        grown = (made, made, int(rng.integers(0, made + 1)), 50, dark)
+        sums = {name: value + more for (name, value), more in zip(sums.items(), grown)}
+        history.take(given | sums | {"elapsed_s": float(k), "latency": [[ns, made]] if made else []})
+        steps.append((*grown, ns))
+    found = live_page.columns(history, level, least)
+    for at in range(len(found["s"])):
+        for wanted, of in ((least, 0), (live_page.LEAST_DARK, 4)):
+            first = at
+            while first and sum(step[of] for step in steps[first : at + 1]) < wanted:
+                first -= 1
+            some, known = steps[first : at + 1], sum(step[1] for step in steps[first : at + 1])
+            if not steps[at][0]:
+                assert np.isnan(found["accuracy"][at])
+            elif of == 0:
+                right, ns = sum(step[2] for step in some), sorted(step[5] for step in some for _ in range(step[0]))
+                curves = [found[name][at] / 100 for name in ("accuracy", "accuracy_low", "accuracy_high")]
+                assert curves == pytest.approx([right / known, *wilson_interval(right, known)])
+                assert found["p50"][at] == ns[-(-len(ns) // 2) - 1] / 1000
+                assert found["over"][at] == len(some)
+            elif dark := sum(step[4] for step in some):
+                assert found["dark"][at] == pytest.approx(dark / (50 * len(some)))
+                assert found["dark_high"][at] == pytest.approx(wilson_interval(dark, 50 * len(some))[1])
 
 
-def test_the_process_that_draws_loads_little() -> None:
-    loads = "import sys, pans.runtime.monitor.child, pans.runtime.monitor.server as s; print('numpy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", loads], capture_output=True, text=True).stdout == "False\n"
+def test_what_the_server_lets_through() -> None:
+    with page() as served:
+        head = served.ask("GET /", f"Host: localhost:{served.port}").partition("\r\n\r\n")[0]
+        assert " 200 " in head
+        assert "default-src 'none'; script-src 'self' 'sha256-" in head
+        assert "unsafe" not in head.partition("style-src")[0]
+        assert "unsafe-eval" not in head
+        assert "frame-ancestors 'none'" in head
+        assert " 403 " in served.ask("GET /", "Host: elsewhere.example")  # a name that was made to point here
+        here, upgrade = f"Host: 127.0.0.1:{served.port}", ("Upgrade: websocket", "Sec-WebSocket-Version: 13")
+        assert " 403 " in served.ask("GET /ws", here, *upgrade, "Origin: http://elsewhere.example")
+        for path in ("/metadata", "/autoload.js", "/x"):
+            assert " 404 " in served.ask(f"GET {path}", here)
 
 
-def test_the_page_is_one_small_file_that_loads_nothing() -> None:
-    text = page().decode()
-    assert len(text) < 100_000
-    assert "innerHTML" not in text
-    assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
-    assert "https://" not in text
-    assert text.count("<script>") == text.count("<style>") == 1
+def test_who_comes_when_the_page_is_full_is_told() -> None:
+    full = range(live_page.SESSIONS_MAX)
+    app = SimpleNamespace(get_sessions=lambda path: full, find_handler=lambda request, **more: "let in")
+    request = SimpleNamespace(
+        path="/", method="GET", host="10.0.0.1", host_name="10.0.0.1", headers={}, connection=None
+    )
+    door = live_page._Door(app, local=False)
+    assert door.find_handler(request) != "let in"
+    full = full[1:]
+    assert door.find_handler(request) == "let in"
+    assert live_page._Door(app, local=True).find_handler(request) != "let in"
 
 
-def test_the_policy_lets_nothing_else_run(served: LivePage) -> None:
-    with ask(served, "HEAD /") as client:
-        head = until(client, b"\r\n\r\n").decode()
-    assert "default-src 'none'; script-src 'sha256-" in head
-    assert "unsafe" not in head
-    assert "frame-ancestors 'none'" in head
-
-
-def test_more_than_a_few_followers_are_refused_and_a_gone_one_makes_room(served: LivePage) -> None:
-    held = [ask(served, "GET /events") for _ in range(MAX_LISTENERS)]
-    for client in held:
-        assert until(client, b"event: curves")[9:12] == b"200"
-    with ask(served, "GET /events") as client:
-        assert until(client, b"\n")[9:12] == b"503"
-    held.pop().close()
-    for _ in range(100):
-        held.append(ask(served, "GET /events"))
-        if until(held[-1], b"\n")[9:12] == b"200":
-            break
-        held.pop().close()
-        time.sleep(0.02)
-    assert len(held) == MAX_LISTENERS
-    for client in held:
-        client.close()
-
-
-def test_the_page_in_a_browser(served: LivePage, tmp_path: Path) -> None:
-    with browser(tmp_path) as driver:
-        look(driver, 1280)
-        driver.get(f"http://127.0.0.1:{served.port}/")
-        wait_for(driver, "return document.querySelectorAll('svg').length == 5")
+def test_the_page_in_a_browser(tmp_path: Path) -> None:
+    with browser(tmp_path) as driver, page("--control") as served:
+        served.tell(*messages(hot=range(12, 20)))
+        look(driver, 1400)
+        driver.get(served.url)
+        wait_for(driver, DEEP + "return deep(document, '.bk-canvas-events, .bk-events').length >= 8")
         assert driver.title == "running: SIMULATED · " + NASTY.replace("\x1b", "\\x1b") + " on a device"
-        words = driver.find_element("tag name", "body").text
-        for text in ("75.0%", "600 of 1,000", "SIMULATED", "0.02 per exposure", "<img src=x onerror="):
+        words = driver.execute_script(
+            DEEP + "return deep(document, '.bk-clearfix').map(one => one.innerText).join(' ')"
+        )
+        for text in ("75.0%", "600 of 1,000", "SIMULATED", "dark counts", "hot", "90.0", "○●○●", "<img src=x onerror="):
             assert text in words
-        for width in (1280, 390):
+        for width in (1400, 390):
             for dark in (False, True):
                 look(driver, width, dark=dark)
-                time.sleep(0.3)  # charts are drawn anew after a change of the width
+                time.sleep(0.5)  # figures are drawn anew after a change of the width
                 picture(driver, tmp_path / f"live-{width}-{dark}.png")
-                assert clipped(driver) == []
-        assert driver.execute_script("return document.querySelectorAll('#word canvas').length") == 32
-        assert driver.execute_script("return [...document.querySelectorAll('#word li.click')].length") == 16
-        assert unreachable(driver) == []
-        assert console(driver) == []
+                # what a figure draws is cut off at its frame
+                assert [one for one in clipped(driver) if "bk-GlyphRenderer" not in one] == []
         for dark in (False, True):
-            look(driver, 1280, dark=dark)
+            look(driver, 1400, dark=dark)
             assert serious(driver) == []
+        assert unreachable(driver) == []
+        press = DEEP + "deep(document, 'button').find(one => one.textContent == arguments[0]).click()"
+        driver.execute_script(press, "Mark this moment")
+        assert json.loads(served.process.stdout.readline()) == {"note": "marked"}
+        driver.execute_script(press, "Stop the run")
+        wait_for(driver, DEEP + "return deep(document, 'button').some(one => one.textContent == 'Press again to stop')")
+        time.sleep(1)  # nothing is taken more often
+        driver.execute_script(press, "Press again to stop")
+        assert json.loads(served.process.stdout.readline()) == {"stop": True}
+        last = [*messages(31)][-1]
+        served.tell(last | {"state": "stopped", "ended": "interrupted"})
+        said = "return deep(document, 'b').some(one => one.textContent == 'The run has ended: interrupted')"
+        assert console(driver) == []
+        served.process.stdin.close()
+        wait_for(driver, DEEP + said)
 
 
 def wait_for(driver: Any, script: str) -> None:
-    for _ in range(100):
+    for _ in range(200):
         if driver.execute_script(script):
             return
         time.sleep(0.05)
     pytest.fail(script)
-
-
-def test_the_page_says_when_the_run_is_over(tmp_path: Path) -> None:
-    history = a_history(3)
-    live = LivePage("127.0.0.1", 0, history)
-    with browser(tmp_path) as driver:
-        try:
-            driver.get(f"http://127.0.0.1:{live.port}/")
-            wait_for(driver, "return document.querySelector('#state').textContent == 'running'")
-            history.picture |= {"ended": "completed", "state": "stopped"}
-            live.draw()
-        finally:
-            live.close()
-        wait_for(driver, "return document.querySelector('#state').textContent == 'the run has ended'")
-        time.sleep(0.5)
-        assert driver.find_element("id", "state").text == "the run has ended"

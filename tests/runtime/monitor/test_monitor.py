@@ -1,6 +1,7 @@
 """The live view beside a run: pictures of it, their history in bounded memory, the terminal's panel and the plain lines."""
 
 import fcntl
+import io
 import json
 import os
 import pty
@@ -26,9 +27,12 @@ from pans.runtime.commands import one_run
 from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.monitor import History, Monitor
-from pans.runtime.monitor.figures import class_rows, headline, latest_rows, rows_of, series
-from pans.runtime.monitor.history import MAX_BINS, quantile_us
-from pans.runtime.monitor.snapshot import Snapshots, begin_facts
+from pans.runtime.monitor.alarms import Alarms
+from pans.runtime.monitor.figures import class_rows, headline, health, latest_rows, rows_of
+from pans.runtime.monitor.history import BINS, LEVELS, SUMS, quantile_us
+from pans.runtime.monitor.monitor import NOTE_CHARACTERS
+from pans.runtime.monitor.snapshot import Snapshots
+from pans.runtime.record import read_recording
 from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 
 NUMBERS = (
@@ -44,17 +48,65 @@ def picture(elapsed_s: float, **more: Any) -> dict[str, Any]:
     return {"kind": "picture", "elapsed_s": elapsed_s, "latency": [], **facts, **texts, **more}
 
 
-def test_a_month_takes_the_memory_of_an_hour_and_loses_no_decision() -> None:
-    history, n = History(), 10_000
+def test_a_month_takes_the_memory_of_an_hour_and_sums_are_exact() -> None:
+    history, n = History(), 40_000
     for step in range(1, n + 1):
         sums = {"decisions": 100 * step, "known": 100 * step, "right": 80 * step, "late": step // 1000}
-        history.take(picture(65.0 * step, **sums, latency=[[200, 100]]))
-    assert len(history.bins) <= MAX_BINS
-    assert sum(one.sums["decisions"] for one in history.bins) == 100 * n
-    assert sum(one.sums["late"] for one in history.bins) == n // 1000
-    assert sum((one.latency for one in history.bins), Counter()) == history.latency == Counter({200: 100 * n})
-    assert all(a.end_s == b.begin_s for a, b in zip(history.bins, history.bins[1:]))
-    assert set(series(history)["accuracy"]) == {0.8}
+        history.take(picture(65.0 * step, **sums, latency=[[200 + step % 2, 100]]))
+    for level, bins in history.bins.items():
+        assert len(bins) <= BINS
+        assert all(a.end_s == b.begin_s for a, b in zip(bins, list(bins)[1:]))
+        assert all(one.end_s - one.begin_s <= max(level, 65.0) + 65.0 for one in bins)
+        steps = round((bins[-1].end_s - bins[0].begin_s) / 65.0)
+        assert bins[-1].end_s == 65.0 * n
+        for name, more in (("decisions", 100 * steps), ("right", 80 * steps)):
+            assert sum(one.sums[SUMS.index(name)] for one in bins) == more
+        assert sum((one.latency for one in bins), Counter()).total() == 100 * steps
+    assert history.bins[LEVELS[-1]][0].begin_s == 0  # a month is there as a whole
+    assert history.latency == Counter({200: 50 * n, 201: 50 * n})
+
+
+def test_an_alarm_has_a_beginning_an_end_and_a_cause() -> None:
+    history, alarms = History(), Alarms()
+    history.take({"kind": "begin", "deadline_us": 100.0})
+    for k in range(1, 41):
+        facts = {"state": "device lost" if 5 <= k < 8 else "running", "late": min(max(k - 9, 0), 4)}
+        facts |= {"dark_exposures": k, "dark_clicks": k, "dark_words": "hot", "dark_level": "alarm"} if k >= 30 else {}
+        facts |= {"events": [["note", "lamp \x1b[2J moved"], ["session", ""]]} if k == 20 else {}
+        history.take(picture(float(k), **facts, **({"trouble": "the host slept"} if k > 9 else {})))
+        alarms.take(history)
+    history.take(picture(41.0, ended="completed", late=4, trouble=""))
+    alarms.take(history)
+    found = {one.name: one for one in alarms.all}
+    assert len(found) == len(alarms.all)
+    spans = {name: (one.begin_s, one.end_s, one.level) for name, one in found.items()}
+    assert spans == {
+        "state": (5, 8, "bad"),
+        "late": (10, 13, "bad"),
+        "note": (20, 20, "note"),
+        "dark counts": (30, 41, "bad"),
+    }
+    assert found["late"].cause == "4 decisions in the whole run; the host slept"
+    assert found["note"].cause == "lamp \\x1b[2J moved"
+
+
+@pytest.mark.parametrize(
+    ("facts", "levels", "words"),
+    [
+        ({}, ["good", "good", "note"], "takes at most"),
+        ({"late": 3}, ["bad", "good", "note"], "3 decisions were late in the last minute"),
+        ({"lost": 7, "gaps": 1}, ["good", "bad", "note"], "7 exposures were lost in the last minute"),
+        ({"state": "device lost"}, ["good", "bad", "note"], "device lost"),
+    ],
+)
+def test_health_is_a_sentence_with_a_number(facts: dict[str, Any], levels: list[str], words: str) -> None:
+    history = History()
+    history.take({"kind": "begin", "deadline_us": 100.0})
+    history.take(picture(1.0, decisions=10, latency=[[50_000, 10]], **facts))
+    found = health(history)
+    assert [name for name, _, _ in found] == ["machine", "link", "detector"]
+    assert [level for _, level, _ in found] == levels
+    assert words.replace("takes", "took") in " ".join(text for _, _, text in found)
 
 
 def test_quantiles_are_those_of_the_loop_s_histogram() -> None:
@@ -152,12 +204,15 @@ def test_the_alarm_comes_when_it_was_said_to_come(n_channels: int) -> None:
 class Watched(Monitor):
     """Takes a picture after every seventh decision and at the end, and draws nothing."""
 
-    def begin(self, bundle: Any, recorder: Any, facts: dict[str, Any]) -> None:
+    def begin(self, bundle: Any, recorder: Any, facts: dict[str, Any], stop: Any) -> None:
+        self._stop = stop
         self.bundle, self.history, self.pictures = bundle, History(), list[dict[str, Any]]()
         self.history.take(json.loads(json.dumps(facts)))
 
     def prepared(self, run: Any) -> None:
-        self.run, self.snapshots = run, Snapshots(run, self.bundle, None, self._latest)
+        self.run = self._run = run
+        self.snapshots = Snapshots(run, self.bundle, None, self._latest)
+        self.snapshots.tell_words()
 
     def watch(self, run: Any, output: Any) -> None:
         super().watch(run, output)
@@ -190,8 +245,12 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
     assert last["class_right"] == tally.confusion.diagonal().tolist()
     assert [row[0] for row in last["latest"]] == list(range(108, 120))
     bundle, _ = load_bundle(SHIPPED / "fashion10.pans")
-    assert last["word"]["patterns"] == list(range(bundle.n_patterns))
-    assert sum(last["word"]["clicks"]) == last["latest"][-1][4]
+    word = last["word"]
+    assert word["patterns"] == list(range(bundle.n_patterns))
+    assert word["decision"] == last["latest"][-1]
+    assert sum(word["clicks"]) == word["decision"][4]
+    assert max(word["posterior"]) == pytest.approx(word["decision"][3], abs=1e-3)
+    assert int(np.argmax(word["posterior"])) == word["decision"][2]
     assert set(history.pixels) == {str(number) for number in range(bundle.n_patterns)}
     text = " ".join(row.text for row in rows_of(history))
     assert f"{100 * tally.accuracy:.1f}%" in text
@@ -199,19 +258,53 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
     assert f"{tally.clicks / 120:.2f} clicks, {tally.photons / 120:.2f} photons" in text
 
 
-def test_a_walk_is_told_pattern_by_pattern(watched: Watched, tmp_path: Path) -> None:
-    # the host names each state: what is taken is settled at once, so that a word and the latest decision are of one moment
-    assert main(["demo", "--pace", "fast", "--drive", "host", "--seconds", "2", "--out", str(tmp_path / "run")]) == 0
-    automaton = watched.run.plan.automaton
-    assert len(watched.pictures) > 3
+@pytest.mark.parametrize("drive", ["device", "host"])
+def test_a_walk_is_told_beside_its_own_decision(watched: Watched, drive: str, tmp_path: Path) -> None:
+    assert main(["demo", "--pace", "fast", "--drive", drive, "--seconds", "2", "--out", str(tmp_path / "run")]) == 0
+    automaton, found = watched.run.plan.automaton, 0
+    rows = {int(row["index"]): row for row in read_recording(tmp_path / "run" / "run.pansrec").decisions()}
     for one in watched.pictures:
+        if "word" not in one:
+            continue
+        found += 1
         word, node = one["word"], 0
+        number, _, label, probability, clicks, *_ = word["decision"]
         for pattern, click in zip(word["patterns"], word["clicks"]):
             assert automaton.pattern[node] == pattern
             node = automaton.successors[node][click]
-        assert node >= automaton.n_states  # at a leaf
-        assert sum(word["clicks"]) == one["latest"][-1][4]
-    assert begin_facts(load_bundle(SHIPPED / "fashion-adaptive.pans")[0])["encoder"] == "automaton"
+        assert node >= automaton.n_states  # at a leaf, the decision's own
+        assert int(automaton.posteriors[node].argmax()) == label
+        assert max(word["posterior"]) == pytest.approx(probability, abs=1e-3)
+        assert sum(word["clicks"]) == clicks == rows[number]["clicks"]
+        assert len(word["clicks"]) == rows[number]["exposures"]
+    assert found > 3, found
+
+
+def test_what_is_asked_for_on_the_page_is_done_and_recorded(watched: Watched, tmp_path: Path) -> None:
+    asked = [{"note": "lamp\x1b moved " + "x" * 300}, {"note": " "}, {"stop": "yes"}]
+
+    class Asked(Watched):
+        def watch(self, run: Any, output: Any) -> None:
+            if run.tally.decisions >= 20 and asked:
+                self._listen(io.StringIO("".join(json.dumps(one) + "\n" for one in asked)))
+                asked.clear()
+            elif run.tally.decisions >= 40:
+                self._listen(io.StringIO('{"stop": true}\n'))
+            super().watch(run, output)
+
+    watched.__class__ = Asked
+    assert main([*fixed_run(600), "--out", str(tmp_path / "run")]) == 130
+    notes = [one for one in read_recording(tmp_path / "run" / "run.pansrec").events() if one["kind"] == "note"]
+    assert [one["text"][:14] for one in notes[:2]] == ["lamp\\x1b moved ", "stop was press"]
+    assert len(notes[0]["text"]) == NOTE_CHARACTERS
+    assert 0 < notes[0]["tick"] < notes[1]["tick"]
+    assert watched.run.ended == "interrupted"
+
+
+@pytest.mark.parametrize("words", ["--serve-control", "--serve 0.0.0.0:0 --serve-public --serve-control"])
+def test_controls_are_for_this_machine(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*fixed_run(3), *words.split()]) == 2
+    assert "--serve-control" in capsys.readouterr().err
 
 
 def test_without_a_terminal_there_are_plain_lines(
@@ -225,7 +318,7 @@ def test_without_a_terminal_there_are_plain_lines(
     facts = {"kind": "begin", "title": "a bundle on an instrument", "simulated": True, "expected": 500}
     with shown:
         assert shown._child is None
-        shown.begin(None, None, facts)  # type: ignore[arg-type]
+        shown.begin(None, None, facts, None)  # type: ignore[arg-type]
         shown._snapshots = SimpleNamespace(take=pictures.popleft)  # type: ignore[assignment]
         give_up_s = time.monotonic() + 30
         while len(pictures) > 9_990 and time.monotonic() < give_up_s:
@@ -271,7 +364,7 @@ def test_a_drawing_process_that_dies_ends_no_run(capfd: pytest.CaptureFixture[st
     shown = Monitor(panel=False, address="127.0.0.1:0", lines=False)
     with shown:
         with urllib.request.urlopen(shown.url, timeout=10) as answer:
-            assert b"EventSource" in answer.read()
+            assert b"bokeh" in answer.read()
         shown._child.kill()
         shown._child.wait()
         assert shown._tell(picture(1.0) | {"fill": "x" * (1 << 20)}) is False
