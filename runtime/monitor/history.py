@@ -18,7 +18,17 @@ LEVELS = (1.0, 5.0, 30.0, 180.0, 1200.0, 7200.0)  # seconds of a bin
 BINS = 512  # of a level: 8 minutes, 42 minutes, 4 hours, 1 day, 1 week, 6 weeks
 RATE_OVER_S = 5.0
 RECENT_S = 60.0
-SUMS = ("decisions", "known", "right", "abstained", "late", "lost", "dark_exposures", "dark_clicks", "exposures")
+SUMS: tuple[str, ...] = (
+    "decisions",
+    "known",
+    "right",
+    "abstained",
+    "late",
+    "lost",
+    "dark_exposures",
+    "dark_clicks",
+    "exposures",
+)
 SUMS += ("clicks", "photons", "photons_known")
 
 

@@ -29,6 +29,7 @@ SENTENCES = {
     "recording_deleted": "The recording was deleted during the run: {path}. The run ended.",
     "disk_nearly_full": "The run stopped before its disk was full: {free_bytes} bytes were free, {reserve_bytes} are kept.",
     "host_clock_step": "The computer's clock was set by {step_s} s; decisions and latencies do not depend on it.",
+    "note": "Noted at tick {tick}: {text}.",
     "show_refused": "The device refused to show a state: {text}.",
 }
 
