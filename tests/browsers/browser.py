@@ -132,12 +132,15 @@ def unreachable(driver: Any) -> list[str]:
         const seen = deep(document, usable).filter(one => one.checkVisibility() && !one.disabled);
         window.waiting = new Set(seen);
         window.unseen = [];
-        document.addEventListener("focusin", event => {
-          const one = event.composedPath()[0], style = getComputedStyle(one);
+        // events do not leave a shadow root in which the focus moves: it is looked for after each key
+        window.noted = () => {
+          let one = document.activeElement;
+          while (one?.shadowRoot?.activeElement) one = one.shadowRoot.activeElement;
+          if (!one) return;
           window.waiting.delete(one);
-          const unseen = style.outlineStyle === "none" && style.boxShadow === "none";
-          if (unseen) window.unseen.push("no focus is seen: " + one.outerHTML.slice(0, 120));
-        });
+          const style = getComputedStyle(one), unseen = style.outlineStyle === "none" && style.boxShadow === "none";
+          if (unseen && one !== document.body) window.unseen.push("no focus is seen: " + one.outerHTML.slice(0, 120));
+        };
         return window.waiting.size;
         """
     )
@@ -145,6 +148,7 @@ def unreachable(driver: Any) -> list[str]:
         for kind in ("rawKeyDown", "keyUp"):
             key = {"type": kind, "key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
             driver.execute_cdp_cmd("Input.dispatchKeyEvent", key)
+        driver.execute_script("window.noted()")
     found: list[str] = driver.execute_script(
         "return [...window.waiting].map(one => 'not reached: ' + one.outerHTML.slice(0, 120)).concat(window.unseen);"
     )
