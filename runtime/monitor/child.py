@@ -6,7 +6,6 @@ it cannot. With --control, what is asked for on the page follows, one JSON objec
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import signal
@@ -51,6 +50,8 @@ def main(words: Sequence[str]) -> int:
         else:  # whoever has connected waits while Bokeh is loaded
             with suppress(OSError, AttributeError):
                 os.nice(NICE)
+            import asyncio
+
             from .live_page import serve
 
             asyncio.run(serve(listening, history, draws, address=address, control="--control" in words))

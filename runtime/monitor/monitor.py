@@ -20,7 +20,6 @@ from typing import IO, TYPE_CHECKING, Any, Self
 
 from pans.runtime.cli import say
 from pans.runtime.errors import UsageError
-from pans.runtime.live.continuous import INTERRUPTED
 from pans.runtime.safe_text import one_line
 
 if TYPE_CHECKING:
@@ -157,6 +156,8 @@ class Monitor:
 
     def _listen(self, said: IO[str]) -> None:
         """Take what is asked for on the page: a note, or the end of the run."""
+        from pans.runtime.live.continuous import INTERRUPTED  # the process that draws loads nothing of it
+
         with suppress(ValueError, OSError):  # the process is gone
             for line in said:
                 asked = json.loads(line)

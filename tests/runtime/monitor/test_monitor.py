@@ -360,6 +360,11 @@ def _rest(handle: int) -> bytes:
         return b""
 
 
+def test_the_process_that_draws_loads_little_before_it_names_its_port() -> None:
+    loads = "import sys, pans.runtime.monitor.child; print({'numpy', 'bokeh', 'numba', 'asyncio'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", loads], capture_output=True, text=True).stdout == "set()\n"
+
+
 def test_a_drawing_process_that_dies_ends_no_run(capfd: pytest.CaptureFixture[str]) -> None:
     shown = Monitor(panel=False, address="127.0.0.1:0", lines=False)
     with shown:
