@@ -6,6 +6,7 @@ beginning is known to about two seconds.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from typing import Any, NamedTuple
@@ -154,10 +155,7 @@ def click_table(recording: Recording, plan: Plan, clicks: ClickList) -> Table:
 
 def frame_of(recording: Recording, table: str) -> Any:
     """Return a table as a pandas.DataFrame (`Recording.to_frame`)."""
-    try:
-        import pandas
-    except ImportError as error:
-        raise missing_extra("to_frame", "pandas", "frames") from error
+    pandas = _needed("pandas", "to_frame")
     columns, data, times = _timed(recording, table)
     found = {}
     for name, values in data.items():
@@ -175,10 +173,7 @@ def frame_of(recording: Recording, table: str) -> Any:
 
 def dataset_of(recording: Recording, table: str) -> Any:
     """Return a table as an xarray.Dataset (`Recording.to_xarray`)."""
-    try:
-        import xarray
-    except ImportError as error:
-        raise missing_extra("to_xarray", "xarray", "frames") from error
+    xarray = _needed("xarray", "to_xarray")
     columns, data, times = _timed(recording, table)
     found = {}
     for name, values in data.items():
@@ -190,6 +185,13 @@ def dataset_of(recording: Recording, table: str) -> Any:
         found[name] = ("time", filled, {key: value for key, value in said.items() if value})
     about = {key: int(value) if isinstance(value, bool) else value or "" for key, value in facts_of(recording).items()}
     return xarray.Dataset(found, {"time": ("time", times, {"long_name": "UTC"})}, about)
+
+
+def _needed(package: str, what: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise missing_extra(what, package, "frames") from error
 
 
 def _timed(recording: Recording, table: str) -> tuple[Mapping[str, Column], Table, NDArray[np.datetime64]]:
@@ -213,7 +215,7 @@ def _timed(recording: Recording, table: str) -> tuple[Mapping[str, Column], Tabl
         raise UsageError(f"table {table!r}: unknown", remedy="decisions or clicks")
     (decided,) = iter_decisions(recording, plan, [recording.decisions()])
     found = dict(decided)
-    # a cut file may lack the times of its last decisions: they get those of a row that no decision has
+    # a cut file may lack the times of its last decisions, and an outage those of one: they get a row that no decision has
     padded = np.append(timings, np.array([(2**64 - 1, 0, 0, 0, 0)], TIMING_DTYPE))
     rows = padded[np.searchsorted(timings["index"], found["decision"])]
     missing = rows["index"] != found["decision"]
