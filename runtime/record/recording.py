@@ -10,6 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -159,16 +160,12 @@ class Recording:
         >>> frame = pans.load_recording("run.pansrec").to_frame()  # doctest: +SKIP
         >>> frame.latency_us.resample("1min").quantile(0.99)  # doctest: +SKIP
         """
-        from .tables import frame_of
-
-        return frame_of(self, table)
+        return _tables().frame_of(self, table)
 
     def to_xarray(self, table: str = "decisions") -> Any:
         """Return the same as an xarray.Dataset along `time`; each variable has `units` and `long_name`, and says what stands for a
         missing value: -1, NaN or an empty text."""
-        from .tables import dataset_of
-
-        return dataset_of(self, table)
+        return _tables().dataset_of(self, table)
 
     def bundle_data(self) -> bytes:
         """Return the bytes of the bundle that the run used, b"" if it was not recorded."""
@@ -211,6 +208,10 @@ def _pairs(block: Block, path: Path) -> Iterator[tuple[int, bytes]]:
 def _events(block: Block, path: Path) -> Iterator[dict[str, Any]]:
     where = f"{path}: an event in block {block.index}"
     return (_checked_event(parse_json_object(line, where), where) for line in block.payload.splitlines())
+
+
+def _tables() -> Any:
+    return import_module(".tables", __package__)  # by name, and late: it is made of recordings itself
 
 
 def together(some: Iterable[NDArray[np.void]]) -> Iterator[NDArray[np.void]]:
