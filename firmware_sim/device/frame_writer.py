@@ -20,7 +20,7 @@ from pans.firmware_sim.scene.marks import (
     Stamp,
     no_marks,
 )
-from pans.runtime.wire.inner import njit
+from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.messages import BLOCK_HEADER_BYTES, NO_OBJECT
 from pans.runtime.wire.schema import HEADER, SCHEMA, MessageType
 from pans.runtime.wire.wire_kernels import crc32_span
@@ -64,7 +64,7 @@ def warm_up() -> None:
     write_messages(messages, words, 1, Stamp(0, 0, 1), SCHEMA, body, out, np.zeros(3, np.int64))
 
 
-@njit(cache=True, nogil=True)
+@outer
 def lay_out(plan, cycle, block, marks, start_tick, messages):  # type: ignore[no-untyped-def]
     """Fill messages int64 (n, N_COLUMNS) with blocks from `block` of `cycle` on and all `marks` (marks.py) among them, in order.
 
@@ -101,7 +101,7 @@ def lay_out(plan, cycle, block, marks, start_tick, messages):  # type: ignore[no
             cycle += 1
 
 
-@njit(cache=True, nogil=True)
+@outer
 def write_messages(messages, words, period_ticks, stamp, schema, body, out, ends):  # type: ignore[no-untyped-def]
     """Encode `messages` with their frames in words uint8 (exposures, bytes): frames to `out`, message k at ends[k]..ends[k + 1].
 
@@ -117,7 +117,7 @@ def write_messages(messages, words, period_ticks, stamp, schema, body, out, ends
         ends[k + 1] = _stuff(body, used + 4, out, ends[k])
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _block(body, message, words, sequence, drops, period_ticks):  # type: ignore[no-untyped-def]
     """Write a block or mark to `body`, but for the session and the CRC; return where it ends."""
     count = message[EXPOSURES]
@@ -147,7 +147,7 @@ def _block(body, message, words, sequence, drops, period_ticks):  # type: ignore
     return at
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _put(body, at, value, n_bytes):  # type: ignore[no-untyped-def]
     """Write a whole number, two's complement, least byte first."""
     bits = _U(value)
@@ -155,7 +155,7 @@ def _put(body, at, value, n_bytes):  # type: ignore[no-untyped-def]
         body[at + k] = (bits >> _U(8 * k)) & _U(0xFF)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _stuff(body, n_bytes, out, start):  # type: ignore[no-untyped-def]
     """Write the COBS string of body[:n_bytes] and a delimiter to out[start:]; return where they end.
 

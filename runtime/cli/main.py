@@ -32,10 +32,10 @@ _REMEDIES = {
     errno.ENOENT: "check the path",
     errno.EMFILE: "raise the limit of open files: ulimit -n 4096",
 }
-FIRST_AFTER_S = 0.35
+FIRST_AFTER_S = 0.2
 LOOK_EVERY_S = 0.05
 LOOK_FOR_S = 60.0  # a command that has not loaded numba by then does not wait for it
-COMPILING = "compiling kernels: once per machine, about 15 s"
+COMPILING = "compiling kernels: once per machine and version, about 10 s (pans doctor --warm compiles all)"
 _listening: list[Any] = []  # numba keeps listeners for good: one per process
 
 

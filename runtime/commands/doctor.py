@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from statistics import median
@@ -26,7 +29,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
 from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import UsageError
 from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
-from pans.runtime.timing.realtime import first_line, isolated_cores
+from pans.runtime.timing.realtime import FIFO_PRIORITY, GRANTED, first_line, isolated_cores
 
 if TYPE_CHECKING:
     from pans.runtime.timing.rehearsal import Rehearsal
@@ -39,6 +42,16 @@ CLOCK_READS, CLOCK_COARSE_NS = 2000, 1_000
 TRIAL_PATIENCE_S = 120.0  # compiling on a busy machine
 HELPS, HARMS = 0.9, 1.1  # ratio of quantiles, besides every round
 AWAY_MS_PER_S, AWAY_US = 1.0, 200.0  # a fifth of the shortest deadline (1 ms)
+OPEN_FILES = 15  # the port, the recording, the log and what Python and the loop have open; measured
+RECORDED = (("fashion-adaptive", "dmd-spad"), ("fashion10", "oled-qcmos"))
+NEEDED_OF_SYSTEM: Mapping[str, Callable[[], bool]] = {
+    "real-time priority (SCHED_FIFO)": lambda: hasattr(os, "sched_setscheduler"),
+    "locked memory (mlockall)": lambda: sys.platform == "linux",
+    "binding to a core (--core)": lambda: hasattr(os, "sched_setaffinity"),
+    "page faults by thread": lambda: sys.platform == "linux",
+    "pseudo-terminals": lambda: hasattr(os, "openpty"),
+    "systemd (pans service)": lambda: sys.platform == "linux",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,13 +150,16 @@ def check_python() -> Iterator[Finding]:
 def check_numba() -> Iterator[Finding]:
     """Compiled kernels load, and are kept between runs."""
     import numba
-    from numba.core import config
+
+    from pans.runtime.wire.inner import FOLDER, kernel_folder
 
     yield Finding("numba", True, f"numba {numba.__version__}", needed=True)
-    folder = Path(config.CACHE_DIR) if config.CACHE_DIR else Path(__file__).parent / "__pycache__"
-    ok = os.access(folder, os.W_OK) or (not folder.exists() and os.access(folder.parent, os.W_OK))
-    remedy = "export NUMBA_CACHE_DIR=~/.cache/pans: without a cache every start compiles for seconds"
-    yield Finding("numba cache", ok, str(folder), "" if ok else remedy)
+    folder = kernel_folder()
+    ok, found = FOLDER.fullmatch(folder.name) is not None, f"{folder}: {len(list(folder.glob('*.nbc')))} kernels"
+    remedy = (
+        "export NUMBA_CACHE_DIR=FOLDER, a folder of yours: without a cache every start compiles for some ten seconds"
+    )
+    yield Finding("numba cache", ok, found, "" if ok else remedy)
 
 
 def check_libusb() -> Iterator[Finding]:
@@ -192,10 +208,13 @@ with scheduled("SCHED_FIFO", FIFO_PRIORITY) as answer:
     print("sched_fifo=" + answer, flush=True)
 with locked_memory() as answer:
     print("mlockall=" + answer, flush=True)
+import resource
+print("resident=" + str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss), flush=True)
 """
 
 
-def _tried(*names: str) -> dict[str, str]:
+@cache
+def _tried() -> Mapping[str, str]:
     """Return what a child process answered for each name; for those without an answer, how it ended."""
     try:
         done = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=TRIAL_PATIENCE_S)
@@ -204,7 +223,7 @@ def _tried(*names: str) -> dict[str, str]:
     except subprocess.TimeoutExpired as error:
         printed, ended = (error.stdout or b"").decode(), f"no answer within {TRIAL_PATIENCE_S:.0f} s"
     answers = dict(line.split("=", 1) for line in printed.splitlines() if "=" in line)
-    return {name: answers.get(name, ended) for name in names}
+    return defaultdict(lambda: ended, answers)
 
 
 def check_processor() -> Iterator[Finding]:
@@ -213,7 +232,7 @@ def check_processor() -> Iterator[Finding]:
     import numba
     import onnxruntime
 
-    tried = _tried("compiled", "onnxruntime", "sched_fifo", "mlockall")
+    tried = _tried()
     host, chosen = llvmlite.binding.get_host_cpu_name(), numba.config.CPU_NAME
     right = tried["compiled"] == "right"
     found = f"announced {host}; works {tried['compiled']}; taken {chosen or host}"
@@ -237,8 +256,51 @@ def check_processor() -> Iterator[Finding]:
         ok, remedy = tried[key] == "granted", LIMITS.format(line=f"{user} - {name.lower()} {wanted}")
         if stated in ("root", "unlimited"):
             remedy += "; a container or virtual machine may refuse it all the same"
-        taken = "asked for by each run" if ok else "runs go on without it"
+        taken = "asked for by a run on a device" if ok else "runs go on without it"
         yield Finding(check, ok, f"announced {stated}; works {tried[key]}; taken: {taken}", "" if ok else remedy)
+
+
+def check_share() -> Iterator[Finding]:
+    """What a run takes from this machine, and what it leaves."""
+    tried = _tried()
+    resident = tried["resident"]
+    mib = int(resident) / (2**20 if sys.platform == "darwin" else 2**10) if resident.isdecimal() else math.nan
+    fifo = (
+        f"SCHED_FIFO {FIFO_PRIORITY}" if tried["sched_fifo"] == GRANTED else "ordinary priority, since none is granted"
+    )
+    locked = f"{mib:.0f} MiB" + " locked" * (tried["mlockall"] == GRANTED)
+    yield Finding("a run on a device", True, f"{fifo}, {locked}, one core at most, about {OPEN_FILES} open files")
+    found = (
+        f"a second process of {mib:.0f} MiB; both at ordinary priority without locked memory, unless --realtime asks"
+    )
+    yield Finding("a simulated device", True, found)
+    yield Finding("a live page (--serve)", True, "one more process at ordinary priority")
+    rates = [f"{disk_mib_per_hour(*one):.0f} MiB per hour ({one[0]} on {one[1]})" for one in RECORDED]
+    yield Finding("a recording", True, f"{'; '.join(rates)}; --rotate-mb and --keep-mb bound it")
+
+
+def disk_mib_per_hour(bundle_name: str, profile_name: str) -> float:
+    """Return how much a recording of a shipped bundle on a shipped profile grows: the bytes of its blocks, each with its stamp."""
+    from pans.runtime.bundle.model import load_bundle
+    from pans.runtime.core.plan import build_plan
+    from pans.runtime.instrument.profile import load_profile
+    from pans.runtime.record.format import MESSAGE
+    from pans.runtime.wire.messages import ClickBlock, encode_clicks
+
+    plan = build_plan(load_profile(profile_name), load_bundle(SHIPPED / f"{bundle_name}.pans")[0])
+    n = plan.block_exposures
+    block = ClickBlock(0, 0, 0, 0, 1, 0, np.ones(n, np.uint16), np.zeros(n, np.uint8))
+    blocks_hz = plan.slots_per_cycle / n / (plan.cycle_ticks * plan.tick_us * 1e-6)
+    return (len(encode_clicks(block, 1)) + MESSAGE.size) * blocks_hz * 3600 / 2**20
+
+
+def check_system() -> Iterator[Finding]:
+    """What this system does not have, named at once."""
+    missing = [what for what, is_there in NEEDED_OF_SYSTEM.items() if not is_there()]
+    found = f"{sys.platform}: tried on Linux only" if sys.platform != "linux" else "linux"
+    found += f"; not here: {', '.join(missing)}" if missing else ""
+    remedy = "runs do without, and deadlines of milliseconds are then not kept reliably: docs/how-to/real-time.md"
+    yield Finding("system", not missing, found, remedy if missing else "")
 
 
 def check_governor() -> Iterator[Finding]:
@@ -286,8 +348,8 @@ def check_others() -> Iterator[Finding]:
 
 
 Check = Callable[[], Iterator[Finding]]
-LIBRARIES: tuple[Check, ...] = (check_python, check_numba, check_libusb, check_clock, check_processor)
-CHECKS = (*LIBRARIES, check_governor, check_udev, check_ports, check_others)
+LIBRARIES: tuple[Check, ...] = (check_python, check_system, check_numba, check_libusb, check_clock, check_processor)
+CHECKS = (*LIBRARIES, check_share, check_governor, check_udev, check_ports, check_others)
 
 
 def examine(checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
@@ -477,8 +539,9 @@ def _realtime(payload: dict[str, Any]) -> str:
 def _warm(args: argparse.Namespace) -> int:
     from pans.runtime.operate.warm import warm, words_of
 
-    say("pans: compiling the kernels of a run: once per machine and version")
-    found = warm()
+    say("pans: compiling all kernels of runs: once per machine and version; half a minute on two idle cores")
+    with progress_bar("kernels", 1.0) as report:
+        found = warm(report)
     emit(args, {"warm": found}, words_of(found))
     return EXIT_FINE if all(row["ok"] for row in found["jobs"]) else EXIT_ALERT
 
