@@ -1,18 +1,26 @@
 """Pictures of a user as 8-bit grey (`read_grey`), labelled sets of them (`read_labelled`), how alike two pictures are (`likeness`), and
 patterns as PNG and back (`levels_png`, `read_grey_png`).
 
-Nothing is resized and no contrast stretched. Full scale of 8-bit and 1-bit pictures is white, of 16-bit ones 65535 (a 12-bit camera's file
-stays dark: scale it before), of floating-point ones 1.0; colours become luminance (ITU-R 601), transparency is ignored. Pillow is loaded
-only for a picture. SSIM is that of the paper's release: 11 x 11 Gaussian window, sigma 1.5, zeros outside, C1 = 1e-4, C2 = 9e-4, data
-range 1, mean over all pixels.
+No contrast is stretched. Full scale of 8-bit and 1-bit pictures is white, of 16-bit ones 65535 (a 12-bit camera's file stays dark: scale it
+before), of floating-point ones 1.0; colours become luminance (ITU-R 601), what is transparent becomes black, and pictures are turned as
+their EXIF data say. A folder of photos of any size becomes images of one (`Reading`): the mean over each pixel's area where they shrink,
+bilinear where they grow, the aspect ratio kept. One picture at a time is held at its full size. Pillow is loaded only to read a picture.
+SSIM is that of the paper's release: 11 x 11 Gaussian window, sigma 1.5, zeros outside, C1 = 1e-4, C2 = 9e-4, data range 1, mean over all
+pixels.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
+import math
 import struct
+import warnings
 import zlib
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,115 +39,261 @@ C1, C2 = 1e-4, 9e-4
 F64 = NDArray[np.float64]
 FULL_SCALE_16 = 65535
 LABELLED_MAX_BYTES = 1024 * MIB
+PICTURE_PIXELS_MAX = 1 << 26  # of one picture, 67 million: a larger one would fill the memory as it is unpacked
+SIDE_PX = 32  # longer side of images that are made from photos, unless another is asked for
+LEAST_CUT = 0.01  # of the area: less is rounding to whole pixels, and is not told
+SMALL_SIDE_PX = 64  # pictures of one size that is no larger stay as they are
 FAULTS_SHOWN = 5  # of each kind in a folder; the rest is counted
 # kinds of fault, in the order in which they are reported: damaged files are the fewest
-KINDS_OF_FAULT = ("cannot be read", "hold what is not accepted", "have another size", "are in the wrong place")
-DAMAGED, STRANGE, SIZE, PLACE = KINDS_OF_FAULT
+DAMAGED, STRANGE, TWICE = "cannot be read", "hold what is not accepted", "stand in two classes"
+SIZE, PLACE = "have another size", "are in the wrong place"
+KINDS_OF_FAULT = (DAMAGED, STRANGE, TWICE, SIZE, PLACE)
+SKIPPED = (DAMAGED, STRANGE, TWICE)  # faults of single files
 PILLOW_REMEDY = "pip install pillow"
-PNG_END, PNG_SIDE_MAX, PNG_TOPS = (
-    b"IEND\xaeB`\x82",
-    1 << 14,
-    {"L": 255, "I;16B": 65535},
-)  # how Pillow calls 8 and 16 bits
+PNG_END, PNG_SIDE_MAX = b"IEND\xaeB`\x82", 1 << 14
+PNG_TOPS = {"L": 255, "I;16B": 65535}  # how Pillow calls 8 and 16 bits
 LITTER = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx"))
 PICTURE_SUFFIXES = frozenset((".png", ".tif", ".tiff", ".pgm", ".jpg", ".jpeg", ".bmp"))
+EXIF_ORIENTATION, EXIF_ON_ITS_SIDE = 0x0112, 5  # a tag, and its values from which on width and height change places
+# what was done to pictures, as it is told
+GREYED, BLACKENED, SCALED, TURNED, ENLARGED, CUT, PADDED = (
+    *("from colour to grey", "with transparent parts, now black", "of 16 bits or more, scaled by their full scale"),
+    *("turned as their EXIF data say", "enlarged", "cut at the edges", "padded with black"),
+)
 
 
 class LabelledPictures(NamedTuple):
-    """images uint8 (n, height, width), labels int64 (n,) into `classes`, and the SHA-256 of all pixels in their order."""
+    """images uint8 (n, height, width), labels int64 (n,) into `classes`, and the SHA-256 of all pixels in their order.
+
+    `account` tells what was read from a folder.
+    """
 
     images: NDArray[np.uint8]
     labels: NDArray[np.int64]
     classes: tuple[str, ...]
     sha256: str
+    account: Account | None = None
 
 
-def read_class_folder(folder: Path, pixels_max: int) -> LabelledPictures:
-    """Return the pictures of `folder`: one folder per class, pictures of one size inside.
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """How photos of a folder become images of one size.
+
+    `side` is that of the longer side in pixels; 0 leaves pictures of one size as they are, and None does so where they are small, else
+    takes 32. The aspect ratio is the mean one of the pictures: what lies beyond is cut, or with `pad` all is kept before black. With
+    `skip_bad` files that cannot be taken are passed over. A picture that is there twice is taken once.
+    """
+
+    side: int | None = None
+    pad: bool = False
+    skip_bad: bool = False
+
+
+@dataclass(slots=True)
+class Account:
+    """What was read from a folder: numbers of files by class, reasons by file, and what was done to the pictures."""
+
+    size: str = ""  # of the images, and where it is from
+    classes: dict[str, Counter[str]] = field(default_factory=dict)  # files, taken, resized, duplicates, refused
+    refused: dict[str, str] = field(default_factory=dict)  # path: why
+    duplicates: dict[str, str] = field(default_factory=dict)  # path: of which
+    done: Counter[str] = field(default_factory=Counter)
+    cut: list[float] = field(default_factory=list)  # share of its area that was cut, of each cut picture
+
+    def lines(self) -> list[str]:
+        """Return the account as a table of the classes, and sentences."""
+        columns = "files", "taken", "resized", "duplicates", "refused"
+        width = min(30, max(5, *(len(name) for name in self.classes)))
+        lines = [f"  {'class':<{width}}" + "".join(f"{name:>12}" for name in columns)]
+        for name, counts in self.classes.items():
+            lines.append(f"  {name[:30]:<{width}}" + "".join(f"{counts[column]:>12}" for column in columns))
+        done = [f"{number} {what}" for what, number in self.done.items()]
+        if self.cut:
+            done.append(
+                f"of those cut {sum(self.cut) / len(self.cut):.0%} of the area on average, at most {max(self.cut):.0%}"
+            )
+        lines += [f"  {line}" for line in (self.size, "; ".join(done)) if line]
+        for what, found in (("refused", self.refused), ("duplicate", self.duplicates)):
+            lines += [f"  {what}: {path}: {why}" for path, why in list(found.items())[:FAULTS_SHOWN]]
+            lines += [f"  and {len(found) - FAULTS_SHOWN} more {what}"] if len(found) > FAULTS_SHOWN else []
+        return lines
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the account as plain values."""
+        classes = {name: dict(counts) for name, counts in self.classes.items()}
+        return {
+            "size": self.size,
+            "classes": classes,
+            "refused": self.refused,
+            "duplicates": self.duplicates,
+            "done": dict(self.done),
+        }
+
+
+def read_class_folder(folder: Path, pixels_max: int, reading: Reading | None = None) -> LabelledPictures:
+    """Return the pictures of `folder`: one folder per class, pictures of one size inside, or of any that `reading` makes one.
 
     What systems leave behind (names that begin with a dot, Thumbs.db, desktop.ini, __MACOSX) is passed over. UsageError, which lists
     all faults at once: a class without pictures, folders within a class, pictures beside the class folders, pictures of different sizes,
-    files that are no pictures (see `read_grey`), or more than `pixels_max` pixels in all.
+    files that are no pictures (see `read_grey`), one picture in two classes, or more than `pixels_max` pixels in all.
     """
     entries = _entries(folder)
     classes = [entry.name for entry in entries if entry.is_dir()]
-    found = _Found(pixels_max)
+    found = _Found(folder, pixels_max, reading)
     beside = [entry for entry in entries if entry.is_file() and entry.suffix.lower() in PICTURE_SUFFIXES]
     if classes:
         remedy = "move it into its class's folder"
         for one in beside:
             found.fault(PLACE, UsageError(f"{one}: a picture beside the class folders", remedy=remedy))
-    for label, name in enumerate(classes):
-        found.take_class(folder / name, label)
-    if not found.images and not found.faults:
+    files = [(path, label) for label, name in enumerate(classes) for path in found.files_of(folder / name)]
+    found.take(files, classes)
+    skipping = reading is not None and reading.skip_bad
+    faults = {kind: of for kind, of in found.faults.items() if not (skipping and kind in SKIPPED)}
+    if not found.images and not faults:
         raise UsageError(f"{folder}: no images in class folders", remedy="put the images of each class into a folder")
-    if found.faults:
-        raise _all_of(folder, found.faults)
-    return LabelledPictures(np.stack(found.images), np.array(found.labels), tuple(classes), found.digest.hexdigest())
+    if faults:
+        raise _all_of(folder, faults, can_skip=reading is not None)
+    images, labels = np.stack(found.images), np.array(found.labels)
+    digest = hashlib.sha256(images.data).hexdigest()
+    return LabelledPictures(images, labels, tuple(classes), digest, found.account)
 
 
 class _Found:
     """The pictures of a folder as they are read, and what is wrong with it."""
 
-    def __init__(self, pixels_max: int) -> None:
+    def __init__(self, folder: Path, pixels_max: int, reading: Reading | None) -> None:
         self.images: list[NDArray[np.uint8]] = []
         self.labels: list[int] = []
         self.faults: dict[str, list[PansError]] = {}  # by kind
-        self.digest = hashlib.sha256()
-        self._pixels_left = pixels_max
+        self.account = Account()
+        self._folder, self._pixels_left, self._reading = folder, pixels_max, reading
         self._first = ""  # the picture whose size all others must have
+        self._seen: dict[bytes, tuple[Path, int]] = {}  # by content
+        self._doubtful: dict[bytes, list[int]] = {}  # classes of contents that stand in several
 
-    def fault(self, kind: str, error: PansError) -> None:
-        """Keep one fault."""
+    def fault(self, kind: str, error: PansError, path: Path | None = None) -> None:
+        """Keep one fault, of the file at `path` or of the folder."""
         self.faults.setdefault(kind, []).append(error)
+        if path is not None:
+            self.account.refused[str(path.relative_to(self._folder))] = error.message.removeprefix(f"{path}: ")
 
-    def take_class(self, folder: Path, label: int) -> None:
-        """Read the pictures of one class."""
+    def files_of(self, folder: Path) -> list[Path]:
+        """Return the files of one class."""
         inside = _entries(folder)
         remedy = "one folder per class, the pictures directly inside: flatten it, or name the folder above the classes"
-        nested = [entry for entry in inside if entry.is_dir()]
-        for one in nested:
+        for one in (entry for entry in inside if entry.is_dir()):
             self.fault(PLACE, UsageError(f"{one}: a folder within the class folder {folder.name!r}", remedy=remedy))
         if not inside:
             remedy = "remove it, or put the class's pictures in"
             self.fault(PLACE, UsageError(f"{folder}: a class folder without pictures", remedy=remedy))
-        for path in inside:
-            if not path.is_dir():
-                self._take(path, label)
+        return [path for path in inside if not path.is_dir()]
 
-    def _take(self, path: Path, label: int) -> None:
-        try:
-            image = read_grey(path, self._pixels_left)
-        except PansError as error:
-            if error.remedy == PILLOW_REMEDY:  # it holds for all of them
-                raise
-            self.fault(DAMAGED if isinstance(error, DamagedFileError) else STRANGE, error)
-            return
-        self._pixels_left -= image.size
-        if self.images and image.shape != self.images[0].shape:
-            size, first = (f"{one.shape[1]} x {one.shape[0]}" for one in (image, self.images[0]))
-            words = f"{path}: {size} pixels, the first image ({self._first}) has {first}"
-            self.fault(SIZE, UsageError(words, remedy="all images of a task have one size: resize them"))
-            return
-        self._first = self._first or path.name
-        self.digest.update(image.tobytes())
-        self.images.append(image)
-        self.labels.append(label)
+    def take(self, files: list[tuple[Path, int]], classes: list[str]) -> None:
+        """Read the pictures, with their classes."""
+        self.account.classes = {name: Counter() for name in classes}
+        target = self._target(files)
+        digests = []
+        for path, label in files:
+            counts = self.account.classes[classes[label]]
+            counts["files"] += 1
+            try:
+                image, digest, done = _read(path, self._pixels_left, target, self._reading)
+            except PansError as error:
+                if error.remedy == PILLOW_REMEDY:  # it holds for all of them
+                    raise
+                counts["refused"] += 1
+                self.fault(DAMAGED if isinstance(error, DamagedFileError) else STRANGE, error, path)
+                continue
+            if self._again(path, label, digest, classes, counts):
+                continue
+            self._pixels_left -= image.size
+            if self.images and image.shape != self.images[0].shape:
+                size, first = (f"{one.shape[1]} x {one.shape[0]}" for one in (image, self.images[0]))
+                words = f"{path}: {size} pixels, the first image ({self._first}) has {first}"
+                remedy = f"make them one size: `pans data scene {self._folder} --resize {SIDE_PX} -o FILE.npz`"
+                self.fault(SIZE, UsageError(words, remedy=remedy))
+                continue
+            self._first = self._first or path.name
+            self.images.append(image)
+            self.labels.append(label)
+            digests.append(digest)
+            counts["taken"] += 1
+            counts["resized"] += RESIZED in done
+            self.account.cut += [share for share in done.values() if share]
+            self.account.done.update(what for what in done if what != RESIZED)
+        for place in reversed([i for i, digest in enumerate(digests) if digest in self._doubtful]):
+            counts = self.account.classes[classes[self.labels[place]]]
+            counts.update(taken=-1, refused=1)
+            del self.images[place], self.labels[place]
+
+    def _again(self, path: Path, label: int, digest: bytes, classes: list[str], counts: Counter[str]) -> bool:
+        """Return whether this content was there before, and note it."""
+        if self._reading is None:
+            return False
+        first, before = self._seen.setdefault(digest, (path, label))
+        if first == path:
+            return False
+        if before == label:
+            counts["duplicates"] += 1
+            self.account.duplicates[str(path.relative_to(self._folder))] = str(first.relative_to(self._folder))
+            return True
+        counts["refused"] += 1
+        remedy = "leave it in the class it belongs to"
+        self.fault(TWICE, UsageError(f"{path}: the same picture as {first}, of another class", remedy=remedy), path)
+        self.account.refused[str(first.relative_to(self._folder))] = f"the same picture as {path}, of another class"
+        self._doubtful.setdefault(digest, []).append(label)
+        return True
+
+    def _target(self, files: list[tuple[Path, int]]) -> tuple[int, int] | None:
+        """Return height and width of the images, None where pictures stay as they are; from the headers of the files alone."""
+        reading = self._reading
+        if reading is None:
+            return None
+        sizes: Counter[tuple[int, int]] = Counter()
+        for path, _ in files:
+            try:
+                with _opened(path) as picture:
+                    sizes[_turned_size(picture)] += 1
+            except PansError as error:
+                if error.remedy == PILLOW_REMEDY:
+                    raise
+        largest = max((max(size) for size in sizes), default=0)
+        if reading.side == 0 or (reading.side is None and len(sizes) == 1 and largest <= SMALL_SIDE_PX) or not sizes:
+            return None
+        side = reading.side or SIDE_PX
+        aspect = sum(number * math.log(w / h) for (h, w), number in sizes.items()) / sizes.total()
+        height, width = (max(1, round(side * math.exp(min(0.0, way)))) for way in (-aspect, aspect))
+        which = f"--resize {side}" if reading.side else f"by default; --resize N for another, up to {largest}"
+        rest = "as all pictures have it" if len(sizes) == 1 else "which is the mean one of the pictures"
+        rest += (
+            ", what lies beyond is " + ("not cut but padded" if reading.pad else "cut (--fit pad keeps it)")
+            if len(sizes) > 1
+            else ""
+        )
+        self.account.size = f"images of {width} x {height} pixels ({which}) from {_span(sizes)}; aspect ratio {rest}"
+        return height, width
 
 
-def _all_of(folder: Path, faults: dict[str, list[PansError]]) -> PansError:
+def _span(sizes: Counter[tuple[int, int]]) -> str:
+    """The smallest and the largest size, by area, in words."""
+    ends = [f"{w} x {h}" for h, w in (pick(sizes, key=math.prod) for pick in (min, max))]
+    return ends[0] if len(sizes) == 1 else f"{ends[0]} to {ends[1]}"
+
+
+def _all_of(folder: Path, faults: dict[str, list[PansError]], *, can_skip: bool) -> PansError:
     """Return one error: a table of the kinds of fault with their counts, then some faults of each kind."""
     of_kind = {kind: faults[kind] for kind in KINDS_OF_FAULT if kind in faults}
     every = [fault for found in of_kind.values() for fault in found]
+    skip = ["--skip-bad passes over such files"] if can_skip and any(kind in SKIPPED for kind in of_kind) else []
+    remedies = "; ".join(dict.fromkeys([*(fault.remedy for fault in every if fault.remedy), *skip]))
     if len(every) == 1:
-        return every[0]
+        return type(every[0])(every[0].message, remedy=remedies)
     lines = [f"{folder}: {len(every)} faults"]
     if len(of_kind) > 1:
         lines += [f"{len(found):>7}  {kind}" for kind, found in of_kind.items()]
     for kind, found in of_kind.items():
         lines += [f"{kind}:", *(f"  {fault.message}" for fault in found[:FAULTS_SHOWN])]
         lines += [f"  and {len(found) - FAULTS_SHOWN} more"] if len(found) > FAULTS_SHOWN else []
-    remedies = "; ".join(dict.fromkeys(fault.remedy for fault in every if fault.remedy))
     return UsageError("\n".join(lines), remedy=remedies)
 
 
@@ -154,18 +308,22 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
     UsageError for more than `pixels_max` pixels, several frames, or values outside the full scale; DamagedFileError for a
     file that is no picture.
     """
+    return _read(path, pixels_max, None, None)[0]
+
+
+RESIZED = "resized"
+_Done = dict[str, float]  # what was done to a picture; of a cut the share of its area, else 0
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Yield the picture of Pillow at `path`, its pixels not yet unpacked; errors of the decoders become ours."""
     Image = _pillow(f"{path}: pictures need")
     try:
-        with open_regular(path) as file, Image.open(file) as picture:
-            if picture.width * picture.height > pixels_max:
-                size = f"{picture.width} x {picture.height} pixels, more than the {pixels_max} allowed"
-                raise UsageError(f"{path}: {size}", remedy="make the images smaller, or fewer")
-            frames = getattr(picture, "n_frames", 1)
-            if frames != 1:
-                raise UsageError(f"{path}: {frames} frames", remedy="one picture per file: save the frames apart")
-            if picture.mode.startswith("I") or picture.mode == "F":
-                return to_8_bits(path, np.asarray(picture), 1.0 if picture.mode == "F" else float(FULL_SCALE_16))
-            return np.asarray(picture.convert("L"), dtype=np.uint8)
+        with open_regular(path) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is lower
+            with Image.open(file) as picture:
+                yield picture
     except Image.DecompressionBombError as error:
         raise UsageError(f"{path}: {error}", remedy="make the image smaller") from error
     except (OSError, SyntaxError, ValueError) as error:  # what damaged files make the decoders raise
@@ -179,6 +337,118 @@ def _pillow(what: str = "a picture needs") -> Any:
     except ModuleNotFoundError as error:
         raise UsageError(f"{what} the package pillow", remedy=PILLOW_REMEDY) from error
     return Image
+
+
+def _turned_size(picture: Any) -> tuple[int, int]:
+    """Height and width of a picture of Pillow, turned as its EXIF data say."""
+    on_its_side = picture.getexif().get(EXIF_ORIENTATION, 1) >= EXIF_ON_ITS_SIDE
+    return (picture.width, picture.height) if on_its_side else (picture.height, picture.width)
+
+
+def _read(
+    path: Path, pixels_max: int, target: tuple[int, int] | None, reading: Reading | None
+) -> tuple[NDArray[np.uint8], bytes, _Done]:
+    """Return a picture as 8-bit grey of the size `target` (height, width; None: as it is), the digest of its content, and what was done."""
+    most = min(pixels_max, PICTURE_PIXELS_MAX) if target is None else PICTURE_PIXELS_MAX
+    with _opened(path) as picture:
+        if picture.width * picture.height > most:
+            size = f"{picture.width} x {picture.height} pixels, more than the {most} allowed"
+            raise UsageError(f"{path}: {size}", remedy="make the images smaller, or fewer")
+        frames = getattr(picture, "n_frames", 1)
+        if frames != 1:
+            raise UsageError(f"{path}: {frames} frames", remedy="one picture per file: save the frames apart")
+        done: _Done = {}
+        grey = _turned(picture.getexif().get(EXIF_ORIENTATION, 1), _grey(path, picture, target, done), done)
+        digest = hashlib.sha256(f"{grey.mode} {grey.size}".encode() + grey.tobytes()).digest()
+        if target is not None and grey.size != target[::-1]:
+            if target[0] * target[1] > pixels_max:
+                raise UsageError(
+                    f"{path}: too many images for the memory allowed", remedy="a smaller --resize, or fewer"
+                )
+            grey = _fitted(grey, target, pad=reading is not None and reading.pad, done=done)
+        return np.asarray(np.rint(np.asarray(grey)), dtype=np.uint8), digest, done
+
+
+def _grey(path: Path, picture: Any, target: tuple[int, int] | None, done: _Done) -> Any:
+    """A picture of Pillow as grey, 0 to 255: of mode L, or F where it has more levels."""
+    from PIL import Image, ImageChops
+
+    if picture.mode.startswith("I") or picture.mode == "F":
+        full_scale = 1.0 if picture.mode == "F" else float(FULL_SCALE_16)
+        values = np.asarray(picture)
+        _demand_within(path, values, full_scale)
+        done[SCALED] = 0.0
+        return Image.fromarray((values * (255 / full_scale)).astype(np.float32))
+    if picture.mode not in ("1", "L", "LA", "La"):
+        done[GREYED] = 0.0
+    if (
+        target is not None and picture.mode == "RGB"
+    ):  # a JPEG is then unpacked as grey, at a part of its size that is still larger
+        picture.draft("L", (4 * target[1], 4 * target[0]))
+    if not picture.has_transparency_data:
+        return picture.convert("L")
+    grey, clear = picture.convert("RGBA").convert("LA").split()
+    if clear.getextrema()[0] == 255:
+        return grey
+    done[BLACKENED] = 0.0
+    return ImageChops.multiply(grey, clear)
+
+
+def _turned(orientation: int, grey: Any, done: _Done) -> Any:
+    """A picture of Pillow turned by the EXIF `orientation`."""
+    from PIL.Image import Transpose as Way
+
+    ways = (
+        Way.FLIP_LEFT_RIGHT,
+        Way.ROTATE_180,
+        Way.FLIP_TOP_BOTTOM,
+        Way.TRANSPOSE,
+        Way.ROTATE_270,
+        Way.TRANSVERSE,
+        Way.ROTATE_90,
+    )
+    if orientation - 2 not in range(len(ways)):
+        return grey
+    done[TURNED] = 0.0
+    return grey.transpose(ways[orientation - 2])
+
+
+def _fitted(grey: Any, target: tuple[int, int], *, pad: bool, done: _Done) -> Any:
+    """A picture of Pillow at the size `target` (height, width): its middle, or with `pad` all of it before black."""
+    from PIL import Image
+
+    (height, width), (w, h) = target, grey.size
+    scale = (min if pad else max)(width / w, height / h)
+    size = max(1, min(width, round(w * scale))), max(1, min(height, round(h * scale)))
+    box_w, box_h = (w, h) if pad else (min(w, width / scale), min(h, height / scale))
+    left, top = (w - box_w) / 2, (h - box_h) / 2
+    way = Image.Resampling.BOX if scale <= 1 else Image.Resampling.BILINEAR
+    fitted = grey.resize(size, way, box=(left, top, left + box_w, top + box_h))
+    done[RESIZED] = 0.0
+    if scale > 1:
+        done[ENLARGED] = 0.0
+    if pad and size != (width, height):
+        done[PADDED] = 0.0
+        whole = Image.new(grey.mode, (width, height), 0)
+        whole.paste(fitted, ((width - size[0]) // 2, (height - size[1]) // 2))
+        return whole
+    if (share := 1 - box_w * box_h / (w * h)) > LEAST_CUT:
+        done[CUT] = share
+    return fitted
+
+
+def _demand_within(where: Path, values: NDArray[Any], full_scale: float) -> None:
+    """Raise UsageError for values beyond 0 to `full_scale`, or not finite."""
+    low, high = float(values.min()), float(values.max())
+    if not (low >= 0 and high <= full_scale):  # NaN fails it too
+        found = f"{where}: values from {low:g} to {high:g}, allowed: 0 to {full_scale:g}"
+        raise UsageError(found, remedy="scale them, or save 8 bits")
+
+
+def to_8_bits(where: Path, values: NDArray[Any], full_scale: float) -> NDArray[np.uint8]:
+    """Return `values` (any shape), 0 to `full_scale`, as nearest of 256 grey levels; UsageError for any beyond, or not finite."""
+    _demand_within(where, values, full_scale)
+    return np.asarray(np.rint(values.astype(np.float64) * (255 / full_scale)), dtype=np.uint8)
 
 
 # ---- patterns as PNG ----
@@ -224,15 +494,6 @@ def read_grey_png(data: bytes, where: str) -> NDArray[np.float64]:
     ) as error:
         remedy = "save it as 8-bit or 16-bit grey, without transparency"
         raise DamagedFileError(f"{where}: not a readable grey PNG: {error}", remedy=remedy) from error
-
-
-def to_8_bits(where: Path, values: NDArray[Any], full_scale: float) -> NDArray[np.uint8]:
-    """Return `values` (any shape), 0 to `full_scale`, as nearest of 256 grey levels; UsageError for any beyond, or not finite."""
-    low, high = float(values.min()), float(values.max())
-    if not (low >= 0 and high <= full_scale):  # NaN fails it too
-        found = f"{where}: values from {low:g} to {high:g}, allowed: 0 to {full_scale:g}"
-        raise UsageError(found, remedy="scale them, or save 8 bits")
-    return np.asarray(np.rint(values.astype(np.float64) * (255 / full_scale)), dtype=np.uint8)
 
 
 def shipped_scene(name: str) -> Path | None:

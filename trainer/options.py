@@ -14,7 +14,7 @@ from pans.runtime.bundle.automaton import CHANNELS_MAX, CONFIDENCE_RANGE, SLOTS_
 from pans.runtime.cli.option_fields import add_options, option, option_fields
 from pans.runtime.cli.option_fields import check_options as check_ranges
 from pans.runtime.errors import PlanError, UsageError, as_usage_error
-from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of, tolerance_of
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, Tolerance, bleaching_of, tolerance_of
 from pans.runtime.instrument.click_law import OUTCOMES_MAX, cannot_count
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.ranges import Range
@@ -306,6 +306,14 @@ def add_unset_options(parser: Any, kind: type[Any], omit: Collection[str] = ()) 
 def flag_of(name: str) -> str:
     """Return the option that fills the field `name`."""
     return "--" + name.replace("_", "-")
+
+
+def stated_tolerance(profile: Profile) -> str | None:
+    """Return the tolerance that `profile` states for its optics, as `--optics` spells it; None where it states perfect ones."""
+    if profile.optics is None:
+        return None
+    tolerance = profile.optics.tolerance()
+    return None if tolerance == Tolerance() else tolerance.spelled()
 
 
 def check_options(options: Options, profile: Profile) -> None:

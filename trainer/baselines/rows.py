@@ -65,7 +65,7 @@ def _equal_trials(task: Task) -> int:
 
 def at_equal_light(
     task: Task, photons: float, illumination: float, report: Report, *, seed: int = 0
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, Trials]:
     """Return what the exact posterior of direct imaging decides on as much light as a decision takes, detected and sent.
 
     Keys as in the answers of commands: `direct_imaging` at equal photons, `direct_imaging_as_illuminated` at equal illumination. One
@@ -77,13 +77,19 @@ def at_equal_light(
         "direct_imaging": Light("photons", photons),
         "direct_imaging_as_illuminated": Light("illumination", illumination),
     }
-    wanted = "accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination", "objects", "trials"
     return {
-        name: {key: row[key] for key in wanted}
+        name: done
         for name, level in levels.items()
         if level.photons(camera) >= LEAST_PHOTONS
-        for row in baseline_rows(task, options, [level], report)
+        for _, _, done, _ in _by_level(task, options, [level], report)
     }
+
+
+def equal_light_figures(done: Trials) -> dict[str, Any]:
+    """Return the figures of such a comparison as commands answer them."""
+    wanted = "accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination", "objects", "trials"
+    figures = row_of(done.measured())
+    return {key: figures[key] for key in wanted}
 
 
 Level = tuple[Light, int, Trials, dict[str, Any]]  # asked for, readouts per object, what was decided, facts

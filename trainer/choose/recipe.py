@@ -22,7 +22,8 @@ from pans.trainer.baselines.common import detect, measure
 from pans.trainer.tasks.changes import Variation, enlarged, varied
 from pans.trainer.tasks.registry import Objects, Task
 
-OBJECTS = 8000  # training images with their varied copies: more took longer and gained little
+OBJECTS = 8000  # training images with their varied copies, at most: more took longer and gained little
+OBJECTS_PER_IMAGE = 16  # and of few images as many
 PIXELS_MAX = 1 << 24  # of all of them: what trains within minutes on one core
 PHOTONS = 10.0  # what a camera detects of a decision's budget of light, where none is asked for
 LEAST_GREY = 1e-3  # mean transmission: of darker images the budget would be without bound
@@ -83,7 +84,7 @@ def choose_training(task: Task, variation: Variation, encoder: str) -> Recipe:
     """Return the training of `encoder` for a user's own images; what the user asks for takes the place of what is here."""
     n, pixels = len(task.train), math.prod(task.image_shape)
     kept = max(1, n // KEPT_PART)
-    objects = n if variation == Variation() else max(n, min(OBJECTS, PIXELS_MAX // pixels))
+    objects = n if variation == Variation() else max(n, min(OBJECTS, OBJECTS_PER_IMAGE * n, PIXELS_MAX // pixels))
     light = PHOTONS, float(f"{PHOTONS / max(task.train.images.mean() / 255, LEAST_GREY):.2g}")
     batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
     reasons = [f"{objects} training images from {n}: {variation}; these changes made left-out images more likely"]
@@ -105,7 +106,8 @@ def as_trained_on(task: Task, provenance: Mapping[str, Any]) -> Task:
     sizes = {name: found[name] for name, tried in TRIES.items() if found.get(name) in tried}
     variation = Variation(**sizes)
     recipe = choose_training(task, variation, "automaton")  # of whose size here nothing depends on the encoder
-    return enlarged(task, variation, recipe.objects, recipe.kept, int(options["seed"]))
+    equal = provenance.get("equal_classes") is True
+    return enlarged(task, variation, recipe.objects, recipe.kept, int(options["seed"]), equal=equal)
 
 
 def warnings_of(task: Task, profile: Profile, recipe: Recipe, clicks: float | None) -> Iterator[str]:
@@ -131,8 +133,8 @@ def class_warnings(task: Task) -> Iterator[str]:
         )
     if counts[most] > UNEQUAL * counts[fewest]:
         yield (
-            f"class {task.classes[most]!r} has {counts[most]} training images, {task.classes[fewest]!r} has {counts[fewest]}: the "
-            "sensor prefers the larger class, so give classes the shares that they have in use"
+            f"class {task.classes[most]!r} has {counts[most]} training images, {task.classes[fewest]!r} has {counts[fewest]}: every class "
+            "counts the same in training unless --keep-shares is given, so look at the balanced accuracy"
         )
     error = 0.5 / math.sqrt(len(task.test))
     if error > 0.05:
@@ -188,6 +190,7 @@ class _Judge:
         light = np.repeat(measured.photoelectrons(measured.test, FRAME_PHOTONS), self.frames, axis=0)
         frames = detect(light, "counting", np.random.default_rng([self.seed, 3]))
         joint = log_joint(measured, frames, FRAME_PHOTONS, "counting", floor=FLOOR)
+        joint -= np.log(np.maximum(1, np.bincount(world.labels, minlength=joint.shape[1])))  # every class is as likely
         joint -= np.logaddexp.reduce(joint, axis=1, keepdims=True)
         losses = -joint[np.arange(len(frames)), np.repeat(self.out.labels, self.frames)]
         return np.minimum(losses, LOSS_MAX).reshape(-1, self.frames).mean(axis=1)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import say, warn
 from pans.runtime.errors import UsageError
-from pans.runtime.imaging import Tolerance
+from pans.runtime.images import SIDE_PX, Reading
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.ranges import Range
 
@@ -30,6 +30,21 @@ Show = Callable[[str, float, int, int, bool], None]  # words, value of the curve
 def add_data_dir(parser: argparse.ArgumentParser) -> None:
     """Add --data-dir to a command that may need a public set."""
     parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how the photos of a folder become images of one size."""
+    group = parser.add_argument_group("of a folder of photos")
+    words = f"longer side of the images in pixels (default {SIDE_PX}; small pictures of one size stay as they are)"
+    group.add_argument("--resize", type=Range(4, 1024, whole=True).option, metavar="N", help=words)
+    words = "where aspect ratios differ: cut what lies beyond the mean one (default), or pad with black"
+    group.add_argument("--fit", choices=("crop", "pad"), default="crop", help=words)
+    group.add_argument("--skip-bad", action="store_true", help="pass over files that cannot be taken, and say why")
+
+
+def reading_from(args: argparse.Namespace) -> Reading:
+    """Return what the options of `add_reading` ask for."""
+    return Reading(args.resize, args.fit == "pad", args.skip_bad)
 
 
 def add_threads(parser: argparse.ArgumentParser, consequence: str = "; changes the rounding") -> None:
@@ -68,14 +83,6 @@ def torch_with(threads: int, what: str = "training") -> Any:
         import pans.trainer.device  # noqa: F401  # it sets what torch needs on this processor
     torch.set_num_threads(threads)
     return torch
-
-
-def stated_tolerance(profile: Profile) -> str | None:
-    """Return the tolerance that `profile` states for its optics, as `--optics` spells it; None where it states perfect ones."""
-    if profile.optics is None:
-        return None
-    tolerance = profile.optics.tolerance()
-    return None if tolerance == Tolerance() else tolerance.spelled()
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from pans.trainer.tasks.generators import GENERATORS
 from pans.trainer.tasks.public_sets import PUBLIC_SETS, check_pinned, data_folder, fetch
 from pans.trainer.tasks.registry import FIBRE_TASKS, Objects, draw_task, load_task
 
-from .arguments import add_data_dir
+from .arguments import add_data_dir, add_reading, reading_from
 
 PARTS = ("test", "train")
 
@@ -31,6 +31,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", type=int, metavar="N", help="the first N objects of the part (default: all)")
     parser.add_argument("--part", choices=PARTS, default="test", help="which objects (default: held out, test)")
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of drawn tasks (default 0)")
+    add_reading(parser)
     add_force(parser)
     add_data_dir(parser)
 
@@ -63,7 +64,9 @@ def _objects(name: str, args: argparse.Namespace) -> tuple[tuple[str, ...], Obje
         wanted = {f"n_{part}": args.objects if part == args.part else 1 for part in PARTS}
         task = draw_task(name, args.data_seed, **wanted)
     else:
-        task = load_task(name, args.data_dir)
+        task = load_task(name, args.data_dir, reading=reading_from(args))
+        for line in task.account.lines() if task.account else ():
+            say(line)
     return task.classes, task.test if args.part == "test" else task.train
 
 

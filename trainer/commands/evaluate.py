@@ -196,11 +196,12 @@ def direct_imaging(task: Task, figures: Mapping[str, Any], seed: int) -> tuple[d
     """Return what direct imaging decides on the test objects of `task` with the light of `figures`, as JSON and in lines."""
     if task.light != "transmission" or figures["photons_mean"] < LEAST_PHOTONS:
         return {}, []
-    from pans.trainer.baselines.rows import at_equal_light
+    from pans.trainer.baselines.rows import at_equal_light, equal_light_figures
 
     with displayed_parts() as report:
         report("direct imaging with as much light", 0.0)
-        found = at_equal_light(task, figures["photons_mean"], figures["illumination"], report, seed=seed)
+        done = at_equal_light(task, figures["photons_mean"], figures["illumination"], report, seed=seed)
+    found = {name: equal_light_figures(one) for name, one in done.items()}
     same = {"direct_imaging": "photons", "direct_imaging_as_illuminated": "illumination"}
     lines = [
         f"  at equal {same[name]:13s}{_percent(one['accuracy_mean'])} %  (error from the objects "

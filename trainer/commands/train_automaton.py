@@ -20,11 +20,11 @@ from pans.trainer.device import keep_freed_memory
 from pans.trainer.evaluate.held_out import trained_bleaching
 from pans.trainer.evaluate.walks import MeasuredWalks
 from pans.trainer.export.automaton import export_automaton
-from pans.trainer.options import AutomatonOptions, flag_of, option_names
+from pans.trainer.options import AutomatonOptions, flag_of, option_names, stated_tolerance
 from pans.trainer.tasks.registry import Task
 from pans.trainer.train.history import write_course
 
-from .arguments import Show, stated_tolerance
+from .arguments import Show
 from .evaluate import words_of
 
 BUDGET_TOLERANCE = 0.01  # of the light or the clicks that were asked for

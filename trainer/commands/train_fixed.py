@@ -21,12 +21,13 @@ from pans.trainer.options import (
     check_order,
     option_names,
     plain_options,
+    stated_tolerance,
 )
 from pans.trainer.tasks.registry import Task, physical_encoder
 from pans.trainer.train.history import History
 from pans.trainer.train.loop import EpochReport, Trained, train
 
-from .arguments import Show, stated_tolerance
+from .arguments import Show
 from .evaluate import passive_light, words_of
 
 

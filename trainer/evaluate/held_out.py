@@ -11,7 +11,7 @@ from pans.runtime.detector.crosstalk import crosstalk_of
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, bleaching_of
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.options import Conditions
-from pans.trainer.tasks.registry import Objects, Task, load_task, remembered_task
+from pans.trainer.tasks.registry import Objects, Task, load_task, remembered_reading, remembered_task
 
 from .accuracy import (
     AS_IT_IS,
@@ -96,7 +96,8 @@ def held_out_of(
     if count is not None and count < 1:
         raise ValueError(f"objects is {count}, allowed: 1 or more")
     data_seed = int(facts.get("data_seed", 0)) if conditions.data_seed is None else conditions.data_seed
-    found = load_task(task or str(facts.get("task_argument", bundle.task)), data_dir, data_seed=data_seed)
+    name = task or str(facts.get("task_argument", bundle.task))
+    found = load_task(name, data_dir, data_seed=data_seed, reading=remembered_reading(facts))
     if bundle.picture_shape not in (None, found.image_shape):
         raise ValueError(f"{bundle.name} returns pictures of {bundle.picture_shape}, the task has {found.image_shape}")
     if bundle.picture_shape is None and found.classes != bundle.classes:

@@ -42,7 +42,7 @@ _LEAF_NUMBERS = 1 << 22  # objects times leaves at once
 _LIGHT_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
-OF_OBJECTS = ("right", "decided", "clicks", "photons", "illumination", "exposures", "surprise", "labels")
+OF_OBJECTS = ("right", "decided", "shares", "clicks", "photons", "illumination", "exposures", "surprise", "labels")
 ONE_DOSE = 1e-3  # of the dose that leaves 1/e: by so much the doses of walks to one state may differ, by steps of the dwell time
 BLEACHED_AT_ONCE = 512  # objects, whose pixels stand in memory
 
@@ -76,6 +76,7 @@ class Walks:
 
     right: F64
     decided: F64
+    shares: F64  # (n, classes): the chance that this class is decided
     clicks: F64
     photons: F64
     illumination: F64
@@ -208,15 +209,15 @@ _Sums = tuple[F64, F64, F64, F64, F64]  # clicks, photons, illumination, exposur
 
 def _judged(sums: _Sums, labels: NDArray[np.int64], automaton: Automaton, leaf_labels: NDArray[np.uint16]) -> Walks:
     leaves = sums[4]
-    right, surprise, by_class = *np.empty((2, len(labels))), np.zeros((automaton.n_classes, automaton.n_leaves))
+    surprise, by_class = np.empty(len(labels)), np.zeros((automaton.n_classes, automaton.n_leaves))
     surprises = -np.log2(np.maximum(automaton.posteriors[automaton.n_states :].astype(np.float64), LEAST))
     for label in range(automaton.n_classes):
         of_class = labels == label
-        right[of_class] = leaves[of_class] @ (leaf_labels == label).astype(np.float64)
         surprise[of_class] = leaves[of_class] @ surprises[:, label]
         by_class[label] = leaves[of_class].sum(axis=0)
-    decided = leaves @ (leaf_labels != NO_LABEL).astype(np.float64)
-    return Walks(np.minimum(right, decided), decided, *sums[:4], surprise, by_class, automaton, leaf_labels, labels)
+    shares = leaves @ (leaf_labels[:, None] == np.arange(automaton.n_classes)).astype(np.float64)
+    right, decided = shares[np.arange(len(labels)), labels], shares.sum(axis=1)
+    return Walks(right, decided, shares, *sums[:4], surprise, by_class, automaton, leaf_labels, labels)
 
 
 def _sampled(

@@ -155,20 +155,34 @@ def _varied(images: NDArray[np.uint8], how: Variation, random: np.random.Generat
     return _seen(images, (*first, *second), displacements(random, n, (height, width), how.bend) if how.bend else None)
 
 
-def enlarged(task: Task, variation: Variation, wanted: int, kept: int, seed: int) -> Task:
+def enlarged(task: Task, variation: Variation, wanted: int, kept: int, seed: int, *, equal: bool = False) -> Task:
     """Return `task` with changed copies of all but its last `kept` training objects before the objects as they are.
 
-    About `wanted` training objects in all, as far as they fit into memory; the held-out objects are the same, and `sha256` is another, so
-    that a checkpoint tells both apart. A task of pictures, or one
-    whose images come from something behind them, is returned as it is.
+    About `wanted` training objects in all, as far as they fit into memory; with `equal` as many of every class, for which those
+    kept are repeated too. The held-out objects are the same, and `sha256` is another, so that a checkpoint tells both apart. A task of
+    pictures, or one whose images come from something behind them, is returned as it is.
     """
     images, labels = task.train.images, task.train.labels
-    n = len(labels) - kept
-    wanted = min(wanted, IMAGES_MAX_BYTES // max(1, images[0].nbytes))
-    copies = max(0, round(wanted / n) - 1)
-    if variation == Variation() or not copies or task.target == "image" or task.train.behind is not None:
+    if task.target == "image" or task.train.behind is not None or (variation == Variation() and not equal):
         return task
-    drawn = [varied(images[:n], variation, [seed, number]) for number in range(copies)]
-    train = Objects(np.concatenate([*drawn, images]), np.concatenate([np.tile(labels[:n], copies), labels]))
-    named = f"{task.sha256} {wanted} {kept} {seed} {variation!r}"
-    return replace(task, train=train, kept=kept, sha256=hashlib.sha256(named.encode()).hexdigest())
+    n, most = len(labels) - kept, IMAGES_MAX_BYTES // max(1, images[0].nbytes)
+    counts = np.bincount(labels[:n], minlength=len(task.classes))
+    totals = (
+        np.full(len(counts), max(min(wanted, most) // len(counts), counts.max())) if equal else counts * wanted // n
+    )
+    if variation == Variation():
+        totals = np.full(len(counts), counts.max())
+    copied = _repeated(labels[:n], np.minimum(totals, most // len(counts)) - counts)
+    drawn = varied(images[copied], variation, [seed]) if len(copied) else images[:0]
+    back = np.bincount(labels[n:], minlength=len(counts))
+    again = n + _repeated(labels[n:], back.max() - back) if equal else copied[:0]
+    which = np.concatenate([np.arange(len(labels)), again])
+    train = Objects(np.concatenate([drawn, images[which]]), np.concatenate([labels[copied], labels[which]]))
+    named = f"{task.sha256} {wanted} {kept} {seed} {variation!r} {equal}"
+    return replace(task, train=train, kept=kept + len(again), sha256=hashlib.sha256(named.encode()).hexdigest())
+
+
+def _repeated(labels: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Places of `labels`, `wanted` (classes,) of each class, all of them in turn; none of a class that is not there."""
+    members = (np.flatnonzero(labels == label) for label in range(len(wanted)))
+    return np.concatenate([np.resize(one, max(0, int(n)) if len(one) else 0) for one, n in zip(members, wanted)])

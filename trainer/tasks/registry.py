@@ -2,7 +2,7 @@
 
 `load_task` returns a `Task` whose images are uint8 (n, height, width): 0 is black. A user's file or folder without a test part is split by
 position: every fifth object is held out. Both parts are then mixed, so that any stretch of them holds all classes in their shares: folders
-are read class by class, and trainings keep the last objects back.
+are read class by class, and trainings keep the last objects back. No picture of a folder is in both parts: duplicates are taken once.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.optics import Light, Optics
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.images import read_class_folder, to_8_bits
+from pans.runtime.images import Account, Reading, read_class_folder, to_8_bits
 from pans.runtime.npz_file import read_arrays
 from pans.runtime.offered import load_offered
 
@@ -74,6 +74,7 @@ class Task:
     target: str = "class"  # what is asked for: the class, or the `image`
     source: str = ""  # of drawn images: whose generator, which seed
     imaged: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None  # makes images of what is behind them
+    account: Account | None = None  # of a folder, what was read
     kept: int = 0  # the last training objects have no varied copies before them, and so can choose; 0: a part that a training chooses
 
     @property
@@ -98,16 +99,19 @@ _FULL_SCALES = {"uint8": 255.0, "uint16": 65535.0, "float16": 1.0, "float32": 1.
 _SPLIT_BY_POSITION = f"every {HOLD_OUT_EVERY}th object held out"
 _SPLIT_OF_FILE = "the test part of the data"
 _SPLIT_OF_SEED = "drawn from other random streams"
+PLAIN_READING = Reading()  # of a folder's photos, where nothing is said
 FIBRE_TASKS = {"mmf-mnist": "class", "mmf-mnist-image": "image"}  # MNIST behind a multimode fibre: what is asked for
 TASKS = (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS)  # the names of our own
 
 
-def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_seed: int = 0) -> Task:
+def load_task(
+    name_or_path: str, data_dir: str | Path | None = None, *, data_seed: int = 0, reading: Reading = PLAIN_READING
+) -> Task:
     """Return the public set or drawn task of that name, or the .npz file or folder of class folders at that path.
 
     `data_dir` (default: the environment variable PANS_DATA) holds the folders of the public sets; `data_seed` is that of drawn
-    tasks, and says nothing to others. UsageError says what
-    is missing or unfit, DamagedFileError which file is not the pinned one.
+    tasks, `reading` of a folder's photos, and both say nothing to others. UsageError says what is missing or unfit, DamagedFileError
+    which file is not the pinned one.
     """
     if name_or_path in PUBLIC_SETS:
         return _load_public(name_or_path, data_folder(data_dir))
@@ -120,7 +124,7 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_see
         return _checked_task(load_offered(offered[name_or_path])(data_seed), name_or_path)
     path = Path(name_or_path)
     if path.is_dir():
-        return _load_folder(path)
+        return _load_folder(path, reading)
     if path.is_file() and path.suffix == ".npz":
         return _load_npz(path)
     raise UsageError(
@@ -225,12 +229,46 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
         raise DamagedFileError(f"{path}: cannot be read: {error}") from error
 
 
-def _load_folder(folder: Path) -> Task:
-    """One folder per class, images of one size inside (see `pans.runtime.images`)."""
-    pictures = read_class_folder(folder, IMAGES_MAX_BYTES)
-    train, test = _split(folder, _objects(folder, pictures.images, pictures.labels))
-    name = folder.resolve().name
-    return _checked(Task(name, pictures.classes, train, test, pictures.sha256, _SPLIT_BY_POSITION), folder)
+def _load_folder(folder: Path, reading: Reading) -> Task:
+    """One folder per class, photos inside (see `pans.runtime.images`)."""
+    pictures = read_class_folder(folder, IMAGES_MAX_BYTES, reading)
+    objects, name = Objects(pictures.images, pictures.labels), folder.resolve().name
+    return replace(own_task(name, pictures.classes, objects, pictures.sha256), account=pictures.account)
+
+
+def own_task(name: str, classes: tuple[str, ...], objects: Objects, sha256: str = "") -> Task:
+    """Return the task of a user's images, the classes one after the other: every fifth is held out, at least one of each class.
+
+    UsageError for fewer than five images of a class. `sha256` is by default that of the pixels.
+    """
+    counts = np.bincount(objects.labels, minlength=len(classes))
+    if len(classes) == counts.size and counts.min() < HOLD_OUT_EVERY:
+        few = int(counts.argmin())
+        what = f"{name}: class {classes[few]!r} has {counts[few]} images, needed are {HOLD_OUT_EVERY} or more"
+        raise UsageError(what, remedy="add images of it, or leave the class out")
+    train, test = _split(Path(name), objects.take(np.argsort(objects.labels, kind="stable")))
+    sha256 = sha256 or hashlib.sha256(np.ascontiguousarray(objects.images).data).hexdigest()
+    return _checked(Task(name, classes, train, test, sha256, _SPLIT_BY_POSITION), Path(name))
+
+
+def fold_tasks(task: Task) -> list[Task]:
+    """Return tasks of the same images, each of which one holds out: `task`, then those that hold out parts of its training images."""
+    order = mixed_order(task.train.labels)
+    place = np.empty(len(order), np.int64)  # within the class: every part has its share of each
+    for label in range(len(task.classes)):
+        members = order[task.train.labels[order] == label]
+        place[members] = np.arange(len(members))
+    folds = [task]
+    for number in range(HOLD_OUT_EVERY - 1):
+        out = place % (HOLD_OUT_EVERY - 1) == number
+        rest, test = task.train.take(~out), task.train.take(out)
+        images, labels = (
+            np.concatenate([rest.images, task.test.images]),
+            np.concatenate([rest.labels, task.test.labels]),
+        )
+        train = Objects(images, labels).take(mixed_order(labels))
+        folds.append(replace(task, train=train, test=test, sha256=f"{task.sha256} {number}"))
+    return folds
 
 
 def _objects(where: Path, images: NDArray[Any], labels: NDArray[Any]) -> Objects:
@@ -289,6 +327,16 @@ def path_from(bundle: Path, task: str) -> str:
         return Path(os.path.relpath(task, bundle.parent)).as_posix()
     except ValueError:  # another drive
         return ""
+
+
+def remembered_reading(provenance: Mapping[str, Any]) -> Reading:
+    """Return how the photos of the folder were read that a bundle of that provenance was trained on."""
+    found = provenance.get("reading")
+    if not isinstance(found, Mapping):
+        return Reading(side=0)
+    side = found.get("side")
+    side = side if isinstance(side, int) and not isinstance(side, bool) else None
+    return Reading(side, found.get("pad") is True, found.get("skip_bad") is True)
 
 
 def remembered_task(provenance: Mapping[str, Any], name: str, bundle: Path) -> str:

@@ -1,0 +1,179 @@
+"""From a user's own images to a sensor and its results, without a word printed: `train_own`, and its parts for `pans train`.
+
+Held-out images choose nothing. Where a class has too few of them, as many sensors are trained as there are parts (`fold_tasks`), each on
+the other parts and with choices of its own, and every image is judged by the one that has not seen it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.errors import UsageError, as_usage_error
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.ranges import Range
+from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.adaptive.tune import Progress
+from pans.trainer.baselines.common import Report, Trials, silent
+from pans.trainer.baselines.rows import at_equal_light
+from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, decision_shares, light_of, sampled_shares
+from pans.trainer.evaluate.held_out import DEFAULT_TRIALS
+from pans.trainer.evaluate.walks import walks_of
+from pans.trainer.export.automaton import bundle_of, export_automaton
+from pans.trainer.options import LEAST_PHOTONS, AutomatonOptions, stated_tolerance
+from pans.trainer.tasks.changes import Variation, enlarged
+from pans.trainer.tasks.registry import HOLD_OUT_EVERY, Objects, Task, fold_tasks, own_task
+
+from .recipe import Recipe, choose_training, choose_variation
+from .results import Judged, SensorResults, results_of
+
+FEW_HELD_OUT = 10  # images of a class: of fewer the recall is hardly known, and each image is held out once
+FOLDS = Range(1, HOLD_OUT_EVERY, whole=True)
+CAMERAS = "direct_imaging", "direct_imaging_as_illuminated"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """What was chosen from the training images of `task`, and the task with their changed copies; `facts` for the bundle."""
+
+    task: Task
+    recipe: Recipe
+    facts: dict[str, Any]
+
+
+def prepared(task: Task, encoder: str, *, seed: int = 0, equal: bool = True, vary: bool = True) -> Prepared:
+    """Choose how the images may be varied (unless not `vary`) and the size of the training; with `equal` every class counts the same."""
+    variation, losses = Variation(), [0.0, 0.0]
+    if vary and task.target == "class":
+        choice = choose_variation(task, seed)
+        variation, losses = choice.variation, [round(choice.loss_before, 4), round(choice.loss, 4)]
+    recipe = choose_training(task, variation, encoder)
+    unequal = equal and len(set(np.bincount(task.train.labels))) > 1 and task.target == "class"
+    bigger = enlarged(task, variation, recipe.objects, recipe.kept, seed, equal=unequal)
+    changes = {name: value for name, value in asdict(variation).items() if value}
+    facts = {"training_objects": len(bigger.train), "variation": changes, "left_out_loss": losses}
+    return Prepared(bigger, recipe, facts | {"equal_classes": unequal})
+
+
+def folds_needed(task: Task) -> int:
+    """Return 5 where a class has so few held-out images that each image should be held out once, else 1."""
+    few = np.bincount(task.test.labels, minlength=len(task.classes)).min() < FEW_HELD_OUT
+    return HOLD_OUT_EVERY if few and task.split_here else 1
+
+
+def judged(bundle: Bundle, varied: Task, profile: Profile, seed: int = 0, report: Report = silent) -> Judged:
+    """Return what `bundle` and a camera with as much light decide on the held-out images of `varied`, whose copies the camera knows."""
+    objects = varied.test
+    if bundle.automaton is not None:
+        walks = walks_of(bundle, profile, objects.images, objects.labels)
+        shares, clicks, photons, sent = walks.shares, walks.clicks, walks.photons, walks.illumination
+    else:
+        light = light_of(bundle, profile, objects.images)
+        photons, clicks = light.photoelectrons.sum(axis=1), light.probability.sum(axis=1)
+        sent = np.full(len(objects), light.illumination)
+        exact = (bundle.largest + 1) ** bundle.n_features <= EXACT_OUTCOMES_MAX
+        shares = (
+            decision_shares(bundle, light) if exact else sampled_shares(bundle, light, trials=DEFAULT_TRIALS, seed=seed)
+        )
+    cameras: dict[str, Trials] = {}
+    if varied.light == "transmission" and photons.mean() >= LEAST_PHOTONS:
+        cameras = at_equal_light(varied, float(photons.mean()), float(sent.mean()), report, seed=seed)
+    return Judged(objects, shares, clicks, photons, sent, [cameras.get(name) for name in CAMERAS])
+
+
+def other_folds(
+    task: Task, profile: Profile, options: AutomatonOptions, folds: int, *, equal: bool, report: Report = silent
+) -> list[Judged]:
+    """Train and judge the sensors of all folds but the first, which is `task` itself."""
+    found = []
+    for number, fold in enumerate(fold_tasks(task)[1:folds], start=2):
+        words = f"sensor {number} of {folds}"
+        report(f"{words}: choosing", 0.0)
+        chosen = prepared(fold, "automaton", seed=options.seed, equal=equal)
+        recipe = replace(options, batch=chosen.recipe.batch)
+        trained = train_automaton(
+            chosen.task, profile, recipe, held_back=chosen.task.kept, report=_reporting(words, report)
+        )
+        bundle = bundle_of(trained, fold, profile, f"fold-{number}", {})
+        found.append(judged(bundle, chosen.task, profile, options.seed))
+    return found
+
+
+def _reporting(words: str, report: Report) -> Callable[[Progress], None]:
+    return lambda step: report(f"{words}: {step.stage}, accuracy {100 * step.accuracy:.1f} %", step.done / step.steps)
+
+
+def train_own(
+    images: ArrayLike,
+    labels: Sequence[Any] | NDArray[Any],
+    *,
+    classes: Sequence[str] | None = None,
+    out: str | Path | None = None,
+    profile: Profile | str = "ideal",
+    photons: float | None = None,
+    illumination: float | None = None,
+    seed: int = 0,
+    folds: int | None = None,
+    equal_classes: bool = True,
+    name: str = "own",
+    report: Report = silent,
+    **options: Any,
+) -> SensorResults:
+    """Train an automaton on `images`, uint8 (n, height, width), of `labels` (n,), and judge it on every fifth image, held out.
+
+    `labels` are numbers into `classes`, or names. `photons` and `illumination` are the budget of a decision (default: an illumination by
+    which a camera detects 10). `out` is the bundle to write, which is not replaced; without it the bundle is in `sensor` alone. With
+    `folds` 2 to 5 so many sensors are trained and judged (default 5 where a class has fewer than 10 held-out images, else 1).
+    `report(words, part done)` is called as it goes on; `options` are other fields of `AutomatonOptions`. UsageError for what does not fit.
+    """
+    started = time.perf_counter()
+    task = _task_of(np.asarray(images), np.asarray(labels), classes, name)
+    device = load_profile(profile) if isinstance(profile, str) else profile
+    chosen = prepared(task, "automaton", seed=seed, equal=equal_classes)
+    recipe = chosen.recipe
+    if photons is None and illumination is None and not {"clicks", "dose_cap"} & options.keys():
+        photons, illumination = recipe.photons, recipe.illumination
+    sizes = {"exposures": recipe.exposures, "states": recipe.states, "batch": recipe.batch, "epochs": recipe.epochs}
+    with as_usage_error():
+        asked = AutomatonOptions(
+            **{"copies": 0, "soft": 0.0, "optics": stated_tolerance(device), **sizes, **options},
+            photons=photons,
+            illumination=illumination,
+            seed=seed,
+        )
+        number = folds_needed(task) if folds is None else int(FOLDS.checked(folds, "folds"))
+        trained = train_automaton(
+            chosen.task, device, asked, held_back=chosen.task.kept, report=_reporting("training", report)
+        )
+        facts = chosen.facts | {"options": asdict(trained.options)}
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(out) if out is not None else Path(folder) / f"{name}.pans"
+            exported = export_automaton(path, trained, task, device, name=path.stem, provenance=facts)
+        parts = [judged(exported.bundle, chosen.task, device, seed, report)]
+        parts += other_folds(task, device, trained.options, number, equal=equal_classes, report=report)
+    return results_of(
+        parts,
+        task.classes,
+        seconds=time.perf_counter() - started,
+        bundle=None if out is None else path,
+        sha256=exported.sha256,
+        sensor=exported.bundle,
+    )
+
+
+def _task_of(images: NDArray[Any], labels: NDArray[Any], classes: Sequence[str] | None, name: str) -> Task:
+    if images.dtype != np.uint8 or images.ndim != 3 or labels.shape != images.shape[:1]:
+        what = f"images are {images.dtype} {images.shape}, labels {labels.shape}, allowed: uint8 (n, height, width) and (n,)"
+        raise UsageError(what, remedy="scale grey values to 0 to 255, one channel")
+    if classes is None:
+        found, labels = np.unique(labels, return_inverse=True)
+        classes = [str(one) for one in found]
+    return own_task(name, tuple(classes), Objects(images, labels.astype(np.int64)))
