@@ -4,12 +4,14 @@ Three sets, each a folder with one folder of pictures per class, the same for th
 
 - `shapes`:  1200 pictures of 32 x 32 pixels, grey PNG: discs, squares, triangles and crosses, moved, turned and resized at random;
 - `letters`: 300 pictures of 24 x 24 pixels, colour PNG and TIFF: five letters, tilted and moved, in strokes of several widths and colours;
-- `rods`:    3000 pictures of 40 x 32 pixels, grey PNG, BMP and JPEG: a rod in one of six directions, off the middle, over dust.
+- `photos`:  336 pictures of 20 to 4000 pixels, 298 discs, 32 squares and 6 triangles, as folders of photos are: JPEG, PNG and TIFF, grey and
+             colour, some turned by their EXIF data, transparent or of 16 bits, one copied twice, one damaged.
 
 Needs numpy and Pillow.
 """
 
 import math
+import shutil
 import sys
 from pathlib import Path
 
@@ -72,30 +74,54 @@ def draw_letter(kind, rng):
     return picture.resize((24, 24), Image.Resampling.BOX), "tif" if rng.random() < 0.3 else "png"
 
 
-def draw_rod(kind, rng):
-    """A soft rod in one of six directions, 30 degrees apart and up to 8 more or less, over dim dust."""
-    y, x = np.mgrid[:32, :40]
-    turn = math.radians(30 * int(kind[3:]) + rng.uniform(-8, 8))
-    middle = np.array((20, 16)) + rng.uniform(-4, 4, 2)
-    along = (x - middle[0]) * math.cos(turn) + (y - middle[1]) * math.sin(turn)
-    across = (y - middle[1]) * math.cos(turn) - (x - middle[0]) * math.sin(turn)
-    rod = rng.uniform(150, 230) * np.exp(-((across / rng.uniform(1.5, 2.3)) ** 2) - (along / rng.uniform(7.5, 10)) ** 6)
-    for _ in range(int(rng.integers(2, 6))):
-        place, size = rng.uniform((0, 0), (40, 32)), rng.uniform(1, 2)
-        rod += 60 * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * size**2))
-    grey = np.clip(rod + rng.normal(8, 4, rod.shape), 0, 255).astype(np.uint8)
-    return Image.fromarray(grey), ("png", "bmp", "jpg")[int(rng.integers(3))]
+def draw_photos(folder, rng, counts=(("disc", 298), ("square", 32), ("triangle", 6)), largest=4000):
+    """Shapes before a grey background with noise, in files of every kind."""
+    for kind, number in counts:
+        (Path(folder) / kind).mkdir(parents=True, exist_ok=True)
+        for i in range(number):
+            width, height = (
+                int(x) for x in math.exp(rng.uniform(math.log(20), math.log(0.75 * largest))) * rng.uniform(1, 4 / 3, 2)
+            )
+            if i == 1:
+                width, height = largest, 3 * largest // 4
+            side = min(width, height)
+            shape = draw_shape(kind, rng)[0].resize((side, side), Image.Resampling.BICUBIC)
+            grey = np.clip(rng.normal(rng.uniform(10, 40), 5, (height, width)), 0, 255)
+            top, left = (height - side) // 2, (width - side) // 2
+            part = grey[top : top + side, left : left + side]
+            part[:] = np.maximum(part, shape)
+            save_photo(grey, Path(folder) / kind / f"{i:04d}", i)
+        shutil.copy(next(Path(folder, kind).glob("0000.*")), Path(folder, kind, "copy-of-the-first.jpg"))
+    (Path(folder) / "disc" / "damaged.jpg").write_bytes(b"\xff\xd8\xff\xe0 no picture")
+
+
+def save_photo(grey, path, i):
+    """Save a picture (height, width), 0 to 255, as a file of the kind whose turn it is."""
+    picture = Image.fromarray(grey.astype(np.uint8))
+    if i % 16 == 2:
+        Image.fromarray((grey * 257).astype(np.uint16)).save(path.with_suffix(".tif"))
+    elif i % 16 == 3:
+        clear = Image.fromarray(np.where(grey > 60, 255, 0).astype(np.uint8))
+        Image.merge("RGBA", (picture, picture, picture, clear)).save(path.with_suffix(".png"), compress_level=1)
+    elif i % 16 == 4:  # on its side, and EXIF data that say so
+        turned = Image.Exif()
+        turned[0x0112] = 6
+        picture.transpose(Image.Transpose.ROTATE_90).save(path.with_suffix(".jpg"), quality=90, exif=turned)
+    else:
+        picture.convert("RGB").save(path.with_suffix(".jpg"), quality=90)
 
 
 SETS = {
     "shapes": (draw_shape, ("cross", "disc", "square", "triangle"), 1200),
     "letters": (draw_letter, tuple(LETTERS), 300),
-    "rods": (draw_rod, tuple(f"dir{i}" for i in range(6)), 3000),
 }
 
 
 def draw_folder(name, folder, seed=1, number=None):
     """Write a set (or the first `number` pictures of it) as class folders below `folder`."""
+    if name == "photos":
+        draw_photos(folder, np.random.default_rng(seed))
+        return
     draw, classes, usual = SETS[name]
     rng = np.random.default_rng([seed, len(classes)])
     for i in range(number or usual):
@@ -103,10 +129,10 @@ def draw_folder(name, folder, seed=1, number=None):
         picture, suffix = draw(kind, rng)
         path = Path(folder) / kind / f"{i:04d}.{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        picture.save(path, **({"quality": 95} if suffix == "jpg" else {}))
+        picture.save(path)
 
 
 if __name__ == "__main__":
-    if not 3 <= len(sys.argv) <= 4 or sys.argv[1] not in SETS:
-        sys.exit(f"usage: python practice_images.py {'|'.join(SETS)} FOLDER [SEED]")
+    if not 3 <= len(sys.argv) <= 4 or sys.argv[1] not in {*SETS, "photos"}:
+        sys.exit(f"usage: python practice_images.py {'|'.join(SETS)}|photos FOLDER [SEED]")
     draw_folder(sys.argv[1], sys.argv[2], int(sys.argv[3]) if len(sys.argv) == 4 else 1)

@@ -22,6 +22,8 @@ from pans.trainer.baselines.common import detect, measure
 from pans.trainer.tasks.changes import Variation, enlarged, varied
 from pans.trainer.tasks.registry import Objects, Task
 
+from .results import balanced
+
 OBJECTS = 8000  # training images with their varied copies, at most: more took longer and gained little
 OBJECTS_PER_IMAGE = 16  # and of few images as many
 PIXELS_MAX = 1 << 24  # of all of them: what trains within minutes on one core
@@ -160,37 +162,42 @@ def choose_variation(task: Task, seed: int = 0) -> Choice:
         for size in sizes:
             changed = replace(best, **{name: size})
             found = judge.losses(changed)
-            gain = losses - found
-            clear = gain.mean() > GAIN_SE * gain.std(ddof=1) / math.sqrt(len(gain))
-            if clear and (won is None or found.mean() < won[1].mean()):
+            gain, error = balanced(losses - found, judge.labels)
+            if gain > GAIN_SE * error and (won is None or balanced(won[1] - found, judge.labels)[0] > 0):
                 won = changed, found
         if won is not None:
             best, losses = won
-    return Choice(best, float(before.mean()), float(losses.mean()))
+    return Choice(best, *(balanced(values, judge.labels)[0] for values in (before, losses)))
 
 
 class _Judge:
-    """The left-out images, photon frames of each, and the images from which a world is made."""
+    """The left-out images, photon frames of each, and the images from which a world is made: of few images several parts in turn."""
 
     def __init__(self, task: Task, seed: int) -> None:
         n = len(task.train)
         n_out = max(1, min(LEFT_OUT_MAX, n // LEFT_OUT_PART))
+        turns = min(LEFT_OUT_PART, n // n_out, -(-LEFT_OUT_MAX // n_out))
+        places = np.arange(n)
         self.task, self.seed = task, seed
-        self.out = task.train.take(slice(n - n_out, None))
-        self.frames = -(-FRAMES // n_out)
-        self.known = task.train.first(min(n - n_out, WORLD))
+        self.parts = [places[n - (turn + 1) * n_out : n - turn * n_out] for turn in range(turns)]
+        self.known = [np.delete(places, part)[:WORLD] for part in self.parts]
+        self.labels = np.concatenate([task.train.labels[part] for part in self.parts])
+        self.frames = -(-FRAMES // len(self.labels))
 
     def losses(self, variation: Variation) -> NDArray[np.float64]:
         """Return -log P(true class | frame), the mean over frames of every left-out image, in a world of changed images, (images,)."""
-        known, plain = self.known, variation == Variation()
-        copies = 0 if plain else max(1, WORLD // len(known))
+        return np.concatenate([self._losses(*part, variation) for part in zip(self.parts, self.known)])
+
+    def _losses(self, out: NDArray[np.int64], of_world: NDArray[np.int64], variation: Variation) -> NDArray[np.float64]:
+        known, left_out = self.task.train.take(of_world), self.task.train.take(out)
+        copies = 0 if variation == Variation() else max(1, WORLD // min(2, len(self.parts)) // len(known))
         images = [known.images, *(varied(known.images, variation, [self.seed, copy]) for copy in range(copies))]
         world = Objects(np.concatenate(images), np.tile(known.labels, copies + 1))
-        measured = measure(replace(self.task, train=world, test=self.out), None)
+        measured = measure(replace(self.task, train=world, test=left_out), None)
         light = np.repeat(measured.photoelectrons(measured.test, FRAME_PHOTONS), self.frames, axis=0)
         frames = detect(light, "counting", np.random.default_rng([self.seed, 3]))
         joint = log_joint(measured, frames, FRAME_PHOTONS, "counting", floor=FLOOR)
         joint -= np.log(np.maximum(1, np.bincount(world.labels, minlength=joint.shape[1])))  # every class is as likely
         joint -= np.logaddexp.reduce(joint, axis=1, keepdims=True)
-        losses = -joint[np.arange(len(frames)), np.repeat(self.out.labels, self.frames)]
-        return np.minimum(losses, LOSS_MAX).reshape(-1, self.frames).mean(axis=1)
+        losses = -joint[np.arange(len(frames)), np.repeat(left_out.labels, self.frames)]
+        return np.asarray(np.minimum(losses, LOSS_MAX).reshape(-1, self.frames).mean(axis=1))

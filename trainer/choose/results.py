@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from pans.trainer.baselines.common import Trials
 from pans.trainer.tasks.registry import Objects, Task
 
 PAIRS = 6  # of confused classes that are named and shown
+LIGHT = ("clicks", "photons", "illumination")
 LEAST_CONFUSED = 0.02  # of the images of a class that are taken for another one
 CLASSES_SHOWN, IMAGES_SHOWN = 40, 16  # of a sheet: rows, images in each
 TILE_PX, GAP_PX, TITLE_PX = 64, 2, 14
@@ -113,30 +114,21 @@ class SensorResults:
             "equal illumination": self.camera_at_equal_illumination,
         }
         known = {f"camera, {name}": camera for name, camera in cameras.items() if camera is not None}
-        columns: list[Any] = [self, *known.values()]
         total, how = sum(self.images.values()), "held-out images"
         if self.folds > 1:
             how = f"images, each judged by one of {self.folds} sensors that had not seen it (classes are small)"
-        lines = [
-            f"SIMULATED, {total} {how}; ± standard error of the images",
-            " " * 24 + "".join(f"{name:>28}" for name in ("sensor", *known)),
+        rows = [
+            ("", "sensor", list(known)),
+            ("balanced accuracy, %", _with_error(self, "balanced_accuracy"), _each(known, "balanced_accuracy")),
+            ("  the sensor's gain", "", _each(known, "balanced_accuracy_gain", "+")),
+            ("accuracy, %", _with_error(self, "accuracy"), _each(known, "accuracy")),
+            ("  the sensor's gain", "", _each(known, "accuracy_gain", "+")),
+            *((name, _light(self, name), [_light(one, name) for one in known.values()]) for name in LIGHT),
         ]
-
-        def row(title: str, cell: Callable[[Any], str]) -> None:
-            lines.append(f"  {title:<22}" + "".join(f"{cell(one):>28}" for one in columns))
-
-        for title, name in (("balanced accuracy, %", "balanced_accuracy"), ("accuracy, %", "accuracy")):
-            row(title, lambda one, name=name: _with_error(one, name))  # type: ignore[misc]
-            row(
-                "  sensor's gain, points",
-                lambda one, name=name: "" if one is self else _with_error(one, f"{name}_gain", "+"),
-            )  # type: ignore[misc]
-        row("clicks", lambda one: f"{one.clicks:.2f}")
-        row("photons", lambda one: f"{one.photons:.2f}")
-        row("illumination", lambda one: f"{one.illumination:.1f}")
-        lines.append(
-            f"  always naming {one_line(self.majority_class, 40)!r}: accuracy {100 * self.majority:.1f} %, balanced {100 / len(self.classes):.1f} %"
-        )
+        lines = [f"SIMULATED, {total} {how}; ± standard error over the images"]
+        lines += [f"  {title:<22}{own:>14}" + "".join(f"{cell:>29}" for cell in cells) for title, own, cells in rows]
+        chance = f"accuracy {100 * self.majority:.1f} %, balanced {100 / len(self.classes):.1f} %"
+        lines.append(f"  always naming {one_line(self.majority_class, 40)!r}: {chance}")
         lines.append("  recall by class, % (95 % interval), images")
         for name, share in self.recall.items():
             low, high = self.recall_interval[name]
@@ -152,6 +144,14 @@ class SensorResults:
 
 def _with_error(one: Any, name: str, sign: str = "") -> str:
     return f"{100 * getattr(one, name):{sign}.1f} ± {100 * getattr(one, f'{name}_se'):.1f}"
+
+
+def _each(cameras: Mapping[str, CameraResults], name: str, sign: str = "") -> list[str]:
+    return [_with_error(camera, name, sign) for camera in cameras.values()]
+
+
+def _light(one: Any, name: str) -> str:
+    return f"{getattr(one, name):.2f}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,14 +188,14 @@ def results_of(
     right = shares[np.arange(len(labels)), labels]
     recall = np.diagonal(confusion) / np.maximum(1, counts)
     largest = int(counts.argmax())
-    accuracy, balanced = _mean(right), _balanced(right, labels)
+    accuracy, mean_recall = _mean(right), balanced(right, labels)
     cameras = [_camera(parts, number, right, labels) for number in range(2)]
     return SensorResults(
         classes=classes,
         accuracy=accuracy[0],
         accuracy_se=accuracy[1],
-        balanced_accuracy=balanced[0],
-        balanced_accuracy_se=balanced[1],
+        balanced_accuracy=mean_recall[0],
+        balanced_accuracy_se=mean_recall[1],
         majority_class=classes[largest],
         majority=float(counts[largest] / len(labels)),
         recall=dict(zip(classes, recall.tolist())),
@@ -222,9 +222,12 @@ def _camera(parts: Sequence[Judged], number: int, right: F64, labels: NDArray[np
         return None
     own = np.concatenate([camera.right.mean(axis=0) for camera in found])
     sizes = np.array([camera.right.shape[1] for camera in found])
-    of_mean, of_balanced = zip(*(figure for figure in ((_mean(x), _balanced(x, labels)) for x in (own, right - own))))
+    figures: dict[str, float] = {}
+    for name, figure in (("accuracy", _mean), ("balanced_accuracy", lambda values: balanced(values, labels))):
+        figures[name], figures[f"{name}_se"] = figure(own)
+        figures[f"{name}_gain"], figures[f"{name}_gain_se"] = figure(right - own)
     return CameraResults(
-        *(*of_mean[0], *of_mean[1], *of_balanced[0], *of_balanced[1]),
+        **figures,
         clicks=float(np.concatenate([camera.clicks for camera in found]).mean()),
         photons=float(np.concatenate([camera.photons for camera in found]).mean()),
         illumination=float(np.average([camera.illumination for camera in found], weights=sizes)),
@@ -236,8 +239,8 @@ def _mean(values: F64) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else 1.0
 
 
-def _balanced(values: F64, labels: NDArray[np.int64]) -> tuple[float, float]:
-    """Mean over the classes that are there of the mean within each, and its standard error."""
+def balanced(values: F64, labels: NDArray[np.int64]) -> tuple[float, float]:
+    """Return the mean over the classes of the mean of `values` (n,) within each, and its standard error; `labels` (n,)."""
     groups = [values[labels == label] for label in np.unique(labels)]
     squares = [float(((group - group.mean()) ** 2).sum()) for group in groups]
     spread = sum(squares) / max(1, len(values) - len(groups))

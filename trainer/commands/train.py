@@ -7,26 +7,32 @@ packages are imported when the command runs, not before.
 from __future__ import annotations
 
 import argparse
+import time
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_new_bundle, emit, say
 from pans.runtime.errors import UsageError, as_usage_error
+from pans.runtime.images import Reading
 from pans.runtime.outputs import check_outputs
+from pans.runtime.ranges import Range
 from pans.trainer.options import ENCODERS, SEED, AutomatonOptions, Options, add_unset_options, flag_of, option_names
 
 from .arguments import (
     HISTORY_FILES,
     add_data_dir,
+    add_reading,
     add_threads,
     displayed_progress,
     interruptible,
     needing,
+    reading_from,
     torch_with,
     warn_of_laws,
 )
 from .evaluate import warn_of_majority
-from .train_own import AUTOMATON, as_given, choose, finish, is_own, set_encoder
+from .train_own import AUTOMATON, Finished, as_given, choose, finish, is_own, set_encoder, sheets_of
 
 if TYPE_CHECKING:
     from .train_automaton import AutomatonTraining
@@ -63,19 +69,28 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true", help="continue from OUT.pans.checkpoint")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     add_data_dir(parser)
+    own = parser.add_argument_group("of your own images")
+    words = "train for the shares that the classes have in the folder (default: every class counts the same)"
+    own.add_argument("--keep-shares", action="store_true", help=words)
+    words = "judge so many sensors of the recipe, each on images it has not seen (default 1; 5 where a class has few images)"
+    own.add_argument("--folds", type=Range(1, 5, whole=True).option, metavar="N", help=words)
+    words = "pictures beside the bundle: what the sensor sees, what it confuses (default: written)"
+    own.add_argument("--sheets", action=argparse.BooleanOptionalAction, default=True, help=words)
+    add_reading(parser)
     words = "of your own images: choose nothing from them, take the options and defaults as they are"
     parser.add_argument("--as-is", action="store_true", help=words)
     add_new_bundle(parser)
 
 
 def _train(args: argparse.Namespace) -> int:
+    started = time.perf_counter()
     checkpoint = args.out.with_name(args.out.name + ".checkpoint")
     own = is_own(args)
     if own:
         set_encoder(args, ONLY_FIXED)
     automaton = args.encoder == AUTOMATON
     _refuse_foreign(args, automaton, own)
-    _check_files(args, checkpoint)
+    _check_files(args, checkpoint, own)
     torch_with(args.threads)
     from pans.runtime.instrument.profile import load_profile
     from pans.trainer.device import computing_on
@@ -86,8 +101,10 @@ def _train(args: argparse.Namespace) -> int:
     from .train_fixed import FixedTraining
 
     profile = load_profile(args.profile or ("ideal" if automaton else "oled-qcmos"))
-    task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
-    varied, facts = choose(args, task, profile) if own else (as_given(args, task), {})
+    reading = replace(reading_from(args), side=args.resize or 0) if args.as_is else reading_from(args)
+    task = load_task(args.task, args.data_dir, data_seed=args.data_seed, reading=reading)
+    chosen = choose(args, task, profile) if own else None
+    varied, facts = (as_given(args, task), {}) if chosen is None else (chosen.task, chosen.facts)
     if args.history is not None:
         with needing("--history", "plot"):
             import matplotlib  # noqa: F401 - asked for before the training, not after it
@@ -105,7 +122,7 @@ def _train(args: argparse.Namespace) -> int:
         say(f"interrupted; the last whole step is in {checkpoint}\n  continue with the same command and --resume")
         return EXIT_INTERRUPTED
     with as_usage_error(), computing_on(args.device if automaton else "cpu"):
-        digest, answer, lines = training.export(_provenance(args, watch.seconds()) | facts)
+        digest, answer, lines = training.export(_provenance(args, reading, watch.seconds()) | facts)
     warn_of_laws(training.bundle, profile, one_by_one=not automaton)
     checkpoint.unlink(missing_ok=True)
     if args.history is not None:
@@ -114,9 +131,11 @@ def _train(args: argparse.Namespace) -> int:
     warn_of_majority(answer.get("by_class"), answer["photons_mean"])
     seconds = watch.seconds()
     payload = {"bundle": str(args.out), "sha256": digest, **answer, "seconds": seconds, "simulated": True}
-    if own and task.target == "class":
-        more, words = finish(args, varied, profile, answer)
-        payload, lines = payload | more, [*lines, words]
+    if chosen is not None and task.target == "class":
+        options = training.options if isinstance(training, AutomatonTraining) else None
+        done = Finished(training.bundle, digest, options, started)
+        more, words = finish(args, task, chosen, profile, done)
+        payload, lines = payload | more, [*words, *training.budget_words]
     emit(args, payload, "\n".join([f"{args.out}  {digest[:12]}  trained in {seconds:.0f} s", *lines]))
     return EXIT_FINE
 
@@ -139,20 +158,21 @@ def _is_given(args: argparse.Namespace, name: str) -> bool:
     return getattr(args, name) not in (None, False)
 
 
-def _check_files(args: argparse.Namespace, checkpoint: Path) -> None:
+def _check_files(args: argparse.Namespace, checkpoint: Path, own: bool) -> None:
     """Refuse, before anything is loaded, what cannot be written in the end; a checkpoint is hours of work too."""
     inputs = [args.task, *([args.profile] if args.profile else [])]
     if checkpoint.exists() and not (args.resume or args.force):
         what = f"{checkpoint}: is here, of a training that was interrupted"
         raise UsageError(what, remedy="continue it by --resume, or replace it with --force")
-    check_outputs([args.out], inputs=inputs, force=args.force)
+    sheets = sheets_of(args) if own and args.sheets else []
+    check_outputs([args.out, *sheets], inputs=inputs, force=args.force)
     check_outputs([checkpoint], inputs=[*inputs, args.out], force=True)
     if args.history is not None:
         outputs = [args.history / name for name in HISTORY_FILES]
         check_outputs(outputs, inputs=inputs, force=args.force, makes_folders=True)
 
 
-def _provenance(args: argparse.Namespace, seconds: float) -> dict[str, Any]:
+def _provenance(args: argparse.Namespace, reading: Reading, seconds: float) -> dict[str, Any]:
     """What a bundle says of the command that made it."""
     from pans.trainer.tasks.registry import path_from, task_names
 
@@ -161,6 +181,7 @@ def _provenance(args: argparse.Namespace, seconds: float) -> dict[str, Any]:
         "data_path": path_from(args.out, args.task),
         "data_seed": args.data_seed,
         "training_seconds": round(seconds, 1),
+        **({"reading": asdict(reading)} if Path(args.task).is_dir() else {}),
     }
 
 

@@ -6,6 +6,7 @@ All accuracies here are exact expectations, SIMULATED through the profile.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ class AutomatonTraining:
     """A training of an automaton; see train.py."""
 
     quantity = "accuracy %"
+    budget_words: Sequence[str] = ()  # of a budget that was missed
     bundle: Bundle
     trained: TrainedAutomaton
 
@@ -108,6 +110,7 @@ class AutomatonTraining:
             *([f"  {bleaching.words()}"] if bleaching.spelled() else []),
             *missed,
         ]
+        self.budget_words = missed
         return exported.sha256, answer, lines
 
     def write_history(self, folder: Path, force: bool) -> list[Path]:

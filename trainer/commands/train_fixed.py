@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ class FixedTraining:
     """A training of fixed patterns or of passive optics; see train.py."""
 
     quantity = "loss"
+    budget_words: Sequence[str] = ()
     bundle: Bundle
     trained: Trained
 

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Mapping
-from dataclasses import asdict
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import say, warn
+from pans.runtime.outputs import write_file
 
-from .evaluate import direct_imaging
+from .arguments import displayed_parts
 
 if TYPE_CHECKING:
+    from pans.runtime.bundle.model import Bundle
     from pans.runtime.instrument.profile import Profile
+    from pans.trainer.choose.own import Prepared
     from pans.trainer.choose.recipe import Recipe
+    from pans.trainer.options import AutomatonOptions
     from pans.trainer.tasks.registry import Task
 
 AUTOMATON = "automaton"
@@ -24,6 +28,16 @@ SIZES = ("exposures", "states")  # which a training that starts from an automato
 CHANGES = ("copies", "shift_px", "offset_px")  # a user who asks for one of these has chosen how images are varied
 BUDGET_OFF = 0.05  # relative: more is said at the end
 RUN_DECISIONS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """A training that is over: its bundle, its options where it was an automaton's, and when it began (perf_counter)."""
+
+    bundle: Bundle
+    sha256: str
+    options: AutomatonOptions | None
+    started: float
 
 
 def is_own(args: argparse.Namespace) -> bool:
@@ -55,26 +69,33 @@ def as_given(args: argparse.Namespace, task: Task) -> Task:
     return task
 
 
-def choose(args: argparse.Namespace, task: Task, profile: Profile) -> tuple[Task, dict[str, Any]]:
-    """Choose what the options leave open, say what and why, and warn; return the task with its varied copies, and facts of the choice."""
-    from pans.trainer.choose.recipe import Choice, choose_training, choose_variation, warnings_of
-    from pans.trainer.tasks.changes import Variation, enlarged
+def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Prepared:
+    """Choose what the options leave open, say what was read and chosen, and why, and warn; write what the sensor will see."""
+    from pans.trainer.choose.own import prepared
+    from pans.trainer.choose.recipe import warnings_of
+    from pans.trainer.choose.results import seen_sheet
 
-    given = any(getattr(args, name) for name in CHANGES)
+    for line in [f"{task.name}:", *task.account.lines()] if task.account else ():
+        say(line)
     say(f"{task.name}: {len(task.train)} images to train on, {len(task.test)} held out, {len(task.classes)} classes")
-    choice = (
-        Choice(Variation(), 0.0, 0.0) if given or task.target == "image" else choose_variation(task, args.seed or 0)
-    )
-    recipe = choose_training(task, choice.variation, args.encoder or "active")
+    if args.sheets:
+        write_file(sheets_of(args)[0], seen_sheet(task), force=args.force)
+        say(f"what the sensor will see: {sheets_of(args)[0]}")
+    vary = not any(getattr(args, name) for name in CHANGES)
+    encoder = args.encoder or "active"
+    chosen = prepared(task, encoder, seed=args.seed or 0, equal=not args.keep_shares, vary=vary)
+    recipe = chosen.recipe
     for text in warnings_of(task, profile, recipe, args.clicks):
         warn(text)
     say("chosen from the images (--as-is chooses nothing):")
     for reason in [*(recipe.reasons if args.start is None else recipe.reasons[:1]), *_fill(args, recipe)]:
         say(f"  {reason}")
-    bigger = enlarged(task, choice.variation, recipe.objects, recipe.kept, args.seed or 0)
-    changes = {name: value for name, value in asdict(choice.variation).items() if value}
-    facts = {"training_objects": len(bigger.train), "variation": changes}
-    return bigger, facts | {"left_out_loss": [round(choice.loss_before, 4), round(choice.loss, 4)]}
+    return chosen
+
+
+def sheets_of(args: argparse.Namespace) -> list[Path]:
+    """Return the pictures beside the bundle: what the sensor sees, and what it confuses."""
+    return [args.out.with_name(f"{args.out.stem}-{name}.png") for name in ("seen", "confused")]
 
 
 def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
@@ -102,16 +123,36 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
 
 
 def finish(
-    args: argparse.Namespace, task: Task, profile: Profile, figures: Mapping[str, Any]
-) -> tuple[dict[str, Any], str]:
-    """Warn of a missed budget, compare with direct imaging, name the next commands; return keys of the answer, and words.
+    args: argparse.Namespace, task: Task, chosen: Prepared, profile: Profile, done: Finished
+) -> tuple[dict[str, Any], list[str]]:
+    """Judge the sensor beside a camera, write what it confuses, name the next commands; return keys of the answer, and lines.
 
-    `task` holds the changed copies too: direct imaging knows what the sensor was trained on.
+    `chosen` holds the changed copies too: the camera knows what the sensor was trained on.
     """
+    from pans.trainer.baselines.rows import equal_light_figures
+    from pans.trainer.choose.own import CAMERAS, folds_needed, judged, other_folds
+    from pans.trainer.choose.results import confused_sheet, results_of
+
+    bundle, seed = done.bundle, args.seed or 0
+    folds = 1
+    if done.options is not None:
+        folds = args.folds or folds_needed(task)
+    with displayed_parts() as report:
+        parts = [judged(bundle, chosen.task, profile, seed, report)]
+        if folds > 1 and done.options is not None:
+            equal = not args.keep_shares
+            parts += other_folds(task, profile, done.options, folds, equal=equal, report=report)
+    seconds = time.perf_counter() - done.started
+    results = results_of(parts, task.classes, seconds=seconds, bundle=args.out, sha256=done.sha256)
     if args.encoder != AUTOMATON:  # whose own words tell it
-        warn_of_budget(args, figures["clicks_mean"], figures["photons_mean"], figures["illumination"])
-    direct, words = direct_imaging(task, figures, args.seed or 0)
-    return direct, "\n".join([*words, next_commands(args, profile.name)])
+        warn_of_budget(args, results.clicks, results.photons, results.illumination)
+    lines, picture = results.lines(), confused_sheet(results) if args.sheets else None
+    if picture is not None:
+        write_file(sheets_of(args)[1], picture, force=args.force)
+        lines.append(f"  the images behind these pairs: {sheets_of(args)[1]}")
+    account = {"read": task.account.as_json()} if task.account else {}
+    cameras = {name: equal_light_figures(one) for name, one in zip(CAMERAS, parts[0].cameras) if one is not None}
+    return {"results": results.as_json(), **account, **cameras}, [*lines, next_commands(args, profile.name)]
 
 
 def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float, illumination: float) -> None:
@@ -133,8 +174,14 @@ def next_commands(args: argparse.Namespace, profile: str) -> str:
         scene = out.with_name(f"{out.stem}-scene.npz")
     device = f"sim:{profile}?scene={scene}&pace=fast&seed=1"
     lines = (
-        ["pans", "data", "scene", args.task, "-o", str(scene)],
+        ["pans", "data", "scene", args.task, *reading_words(args), "-o", str(scene)],
         ["pans", "run", str(out), "--device", device, "--decisions", str(RUN_DECISIONS), "--out", str(folder)],
         ["pans", "report", str(folder / "run.pansrec"), "-o", str(out.with_name(f"{out.stem}-report.html"))],
     )
     return "\n".join(["next:", *(f"  {shlex.join(line)}" for line in lines)])
+
+
+def reading_words(args: argparse.Namespace) -> list[str]:
+    """Return the options that say how photos were read, for another command."""
+    words = [] if args.resize is None else ["--resize", str(args.resize)]
+    return [*words, *(["--fit", "pad"] if args.fit == "pad" else []), *(["--skip-bad"] if args.skip_bad else [])]
