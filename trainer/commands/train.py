@@ -133,9 +133,9 @@ def _train(args: argparse.Namespace) -> int:
     payload = {"bundle": str(args.out), "sha256": digest, **answer, "seconds": seconds, "simulated": True}
     if chosen is not None and task.target == "class":
         options = training.options if isinstance(training, AutomatonTraining) else None
-        done = Finished(training.bundle, digest, options, started)
-        more, words = finish(args, task, chosen, profile, done)
-        payload, lines = payload | more, [*words, *training.budget_words]
+        done = Finished(training.bundle, digest, options, started, training.budget_words)
+        more, lines = finish(args, task, chosen, profile, done)
+        payload |= more
     emit(args, payload, "\n".join([f"{args.out}  {digest[:12]}  trained in {seconds:.0f} s", *lines]))
     return EXIT_FINE
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,12 +33,13 @@ RUN_DECISIONS = 1000
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """A training that is over: its bundle, its options where it was an automaton's, and when it began (perf_counter)."""
+    """A training that is over: its bundle, its options where it was an automaton's, when it began (perf_counter), and its words."""
 
     bundle: Bundle
     sha256: str
     options: AutomatonOptions | None
     started: float
+    words: Sequence[str] = ()  # of a budget that was missed
 
 
 def is_own(args: argparse.Namespace) -> bool:
@@ -146,7 +148,7 @@ def finish(
     results = results_of(parts, task.classes, seconds=seconds, bundle=args.out, sha256=done.sha256)
     if args.encoder != AUTOMATON:  # whose own words tell it
         warn_of_budget(args, results.clicks, results.photons, results.illumination)
-    lines, picture = results.lines(), confused_sheet(results) if args.sheets else None
+    lines, picture = [*results.lines(), *done.words], confused_sheet(results) if args.sheets else None
     if picture is not None:
         write_file(sheets_of(args)[1], picture, force=args.force)
         lines.append(f"  the images behind these pairs: {sheets_of(args)[1]}")

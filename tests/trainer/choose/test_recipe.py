@@ -8,8 +8,8 @@ from trainings import practice_folder
 
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.choose.recipe import BATCH, OBJECTS, choose_encoder, choose_training, choose_variation, warnings_of
-from pans.trainer.tasks.changes import Variation
-from pans.trainer.tasks.registry import Objects, Task, load_task
+from pans.trainer.tasks.changes import Variation, enlarged
+from pans.trainer.tasks.registry import Objects, Task, load_task, mixed_order
 
 IDEAL = load_profile("ideal")
 TURNED = Variation(turn_deg=180)
@@ -27,7 +27,7 @@ def task_of(counts, side=16, held_out=500):
 @pytest.mark.parametrize("n", [240, 960, 2400, 20_000])
 def test_small_sets_are_enlarged_and_take_steps_enough(n):
     recipe = choose_training(task_of([n // 4] * 4), TURNED, "automaton")
-    assert recipe.objects == max(n, OBJECTS)
+    assert recipe.objects == max(n, min(OBJECTS, 16 * n))
     assert recipe.kept == n // 12
     assert BATCH[0] <= recipe.batch <= BATCH[1]
     assert recipe.objects / recipe.batch >= 39
@@ -48,10 +48,10 @@ def told(task, profile=IDEAL, clicks=None):
 def test_warnings():
     assert told(task_of([100, 100])) == []
     assert "'class1' has 20 training images" in told(task_of([100, 20]))[0]
-    assert "the sensor prefers the larger class" in told(task_of([600, 100]))[0]
+    assert "every class counts the same" in told(task_of([600, 100]))[0]
     unequal = told(task_of([298, 32, 6]))  # too few of one class does not hide that they are unequal
     assert "'class2' has 6 training images, wanted are" in unequal[0]
-    assert "'class0' has 298 training images, 'class2' has 6: the sensor prefers the larger class" in unequal[1]
+    assert "'class0' has 298 training images, 'class2' has 6: every class counts the same" in unequal[1]
     assert "60 held-out images: the standard error" in told(task_of([100, 100], held_out=60))[0]
     dark = load_profile("dmd-spad")
     assert told(task_of([100, 100]), dark) == []
@@ -83,8 +83,28 @@ def wedges(n, seed):
 
 
 def test_images_in_all_directions_are_turned():
-    task = Task("wedges", ("wedge", "bar"), wedges(150, 1), wedges(10, 2), "0" * 64, "drawn")
+    task = Task("wedges", ("wedge", "bar"), wedges(30, 1), wedges(10, 2), "0" * 64, "drawn")
     choice = choose_variation(task)
     assert choice.variation.turn_deg == 180
     assert choice == choose_variation(task)
     assert choice != choose_variation(task, seed=1)
+
+
+def test_classes_are_made_equal_by_changed_copies_and_the_last_images_stay_apart():
+    task = task_of([60, 12, 4], side=8)
+    n = len(task.train)
+    images = np.broadcast_to(
+        np.arange(n, dtype=np.uint8)[:, None, None], (n, 8, 8)
+    )  # each its own grey, which no turn changes
+    order = mixed_order(task.train.labels)
+    task = replace(task, train=Objects(images, task.train.labels).take(order))
+    kept = task.train.images[-8:, 0, 0]
+    bigger = enlarged(task, TURNED, 900, 8, 0, equal=True)
+    fitted, back = bigger.train.first(len(bigger.train) - bigger.kept), bigger.train.take(slice(-bigger.kept, None))
+    assert np.bincount(fitted.labels).tolist() == [300, 300, 300]
+    assert len(set(np.bincount(back.labels, minlength=3)) - {0}) == 1
+    assert set(back.images[:, 0, 0]) == set(kept)
+    assert not set(fitted.images[:, 4, 4]) & set(kept)
+    given = np.bincount(task.train.labels[:-8])
+    shares = enlarged(task, TURNED, 900, 8, 0).train
+    assert np.bincount(shares.labels[:-8]).tolist() == pytest.approx((900 * given / given.sum()).tolist(), abs=1)

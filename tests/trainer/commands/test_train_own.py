@@ -5,12 +5,12 @@ import shlex
 
 import numpy as np
 import pytest
-from trainings import practice_folder
+from trainings import practice_folder, practice_images
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.trainer.baselines import rows
-from pans.trainer.choose import recipe
+from pans.trainer.choose import own, recipe
 from pans.trainer.commands import train_own
 from pans.trainer.commands.arguments import curve
 from pans.trainer.tasks.registry import load_task
@@ -23,6 +23,7 @@ def few(monkeypatch):
     monkeypatch.setattr(recipe, "OBJECTS", 400)
     monkeypatch.setattr(train_own, "RUN_DECISIONS", 40)
     monkeypatch.setattr(rows, "EQUAL_TRIALS", 2)
+    monkeypatch.setattr(own, "FEW_HELD_OUT", 2)
 
 
 @pytest.fixture
@@ -39,19 +40,61 @@ def test_a_folder_needs_no_option_and_the_next_commands_work(letters, pans):
     assert "an automaton" in said.err
     assert "at which a camera detects 10" in said.err
     assert "class 'H' has 24 training images" in said.err
-    assert "direct imaging" in said.out
-    following = [shlex.split(line) for line in said.out.partition("next:")[2].split("\n") if line.strip()]
-    assert [words[:2] for words in following] == [["pans", "data"], ["pans", "run"], ["pans", "report"]]
+    assert "camera, equal photons" in said.out
+    assert "recall by class" in said.out
+    following = [shlex.split(line)[1:] for line in said.out.partition("next:")[2].split("\n") if line.strip()]
+    assert [words[0] for words in following] == ["data", "run", "report"]
     for words in following:
-        assert main(words[1:]) == 0, words
+        assert main(words) == 0, words
     bundle, _ = load_bundle("letters.pans")
     assert bundle.automaton is not None
-    assert bundle.provenance["training_objects"] == 3 * 110 + 120
+    assert bundle.provenance["training_objects"] == 400 + 10  # those kept apart have no copies
     assert bundle.provenance["variation"]
     options, camera = bundle.provenance["options"], load_task(letters)
     assert options["photons"] == 10.0
     assert options["illumination"] * camera.train.images.mean() / 255 == pytest.approx(10, rel=0.05)
     assert bundle.expected["objects"] == 30
+
+
+def test_a_messy_folder_is_trained_on_by_one_command(tmp_path, monkeypatch, pans):
+    """Photos of 20 to 300 pixels in all kinds of files, one damaged, one twice, few of one class."""
+    counts = {"disc": 30, "square": 20, "triangle": 6}
+    practice_images().draw_photos(tmp_path / "photos", np.random.default_rng(0), counts.items(), largest=300)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recipe, "TRIES", {"turn_deg": (25.0,)})
+    assert "disc/damaged.jpg" in (refused := pans.refuses("train", "photos", *QUICK, "-o", "p.pans"))
+    assert "--skip-bad" in refused
+    assert main(["train", "photos", "--skip-bad", "--resize", "16", *QUICK, "-o", "p.pans", "--json"]) == 0
+    said = pans.said()
+    for words in (
+        "--resize 16",
+        "colour to grey",
+        "transparent",
+        "of 16 bits",
+        "EXIF",
+        "duplicate: disc/copy",
+        "refused: disc/damaged",
+    ):
+        assert words in said.err, words
+    answer = json.loads(said.out)
+    read, found = answer["read"]["classes"], answer["results"]
+    assert [(row["files"], row["taken"], row["duplicates"]) for row in read.values()] == [
+        (32, 30, 1),
+        (21, 20, 1),
+        (7, 6, 1),
+    ]
+    assert (found["folds"], found["images"]) == (5, counts)
+    for camera in ("camera_at_equal_photons", "camera_at_equal_illumination"):
+        assert {"balanced_accuracy_gain", "balanced_accuracy_gain_se", "clicks", "photons", "illumination"} <= found[
+            camera
+        ].keys()
+    for name in ("seen", "confused"):
+        assert (tmp_path / f"p-{name}.png").read_bytes()[:4] == b"\x89PNG"
+    again = pans("evaluate", "p.pans")  # reads the photos as the training did
+    assert again["accuracy_mean"] == pytest.approx(answer["accuracy_mean"])
+    assert "exists" in pans.refuses("train", "photos", "--skip-bad", *QUICK, "-o", "p.pans")
+    assert main(["data", "scene", "photos", "--skip-bad", "--resize", "16", "-o", "p.npz"]) == 0
+    assert np.load("p.npz")["images"].shape == (11, 16, 16)
 
 
 def test_as_is_chooses_nothing(letters, pans):
@@ -71,7 +114,7 @@ def test_an_option_of_fixed_patterns_asks_for_them(letters, pans, monkeypatch):
     assert main(["train", letters, *words, "-o", "letters.pans"]) == 0
     said = pans.said()
     assert "8 epochs in batches of" in said.err
-    assert "direct imaging" in said.out
+    assert "camera, equal photons" in said.out
     assert load_bundle("letters.pans")[0].pattern_levels.shape[0] == 3
 
 
@@ -115,7 +158,7 @@ def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, mon
     assert not found["better_than_majority"]
     assert "not better than always naming the largest class, 'square'" in said.err
     assert "class 'cross' has 5 training images" in said.err
-    assert "'square' has 239 training images, 'cross' has 5: the sensor prefers the larger class" in said.err
+    assert "'square' has 239 training images, 'cross' has 5: every class counts the same" in said.err
     assert main(["evaluate", "s.pans", "--task", "unequal.npz", "--exact"]) == 0
     said = pans.said()
     assert "not better than always naming the largest class" in said.err

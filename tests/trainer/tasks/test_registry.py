@@ -12,7 +12,7 @@ from pans.runtime.errors import DamagedFileError, PansError, UsageError
 from pans.trainer.tasks import registry as tasks
 from pans.trainer.tasks.mmf import release_intensity
 from pans.trainer.tasks.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
-from pans.trainer.tasks.registry import FIBRE_TASKS, load_task, path_from, remembered_task, task_names
+from pans.trainer.tasks.registry import FIBRE_TASKS, fold_tasks, load_task, path_from, remembered_task, task_names
 
 RNG = np.random.default_rng(0)
 
@@ -164,6 +164,14 @@ def test_folder_of_class_folders(tmp_path):
     assert (task.name, task.classes, task.image_shape) == ("set", ("bright", "dark"), (4, 5))
     assert len(task.train) == 16
     assert sorted(task.test.images[:, 0, 0].tolist()) == [24, 29, 204, 209]
+    folds = fold_tasks(task)  # each image is held out once, and never trained on then
+    assert sorted(int(i[0, 0]) for fold in folds for i in fold.test.images) == sorted(
+        [*range(20, 30), *range(200, 210)]
+    )
+    for fold in folds:
+        assert not {*fold.test.images[:, 0, 0]} & {*fold.train.images[:, 0, 0]}
+        assert sorted(fold.test.labels) == [0, 0, 1, 1]
+        assert len(fold.train) == 16
     (tmp_path / "set" / "dark" / "zz.png").write_text("no image")
     with pytest.raises(DamagedFileError, match=r"zz\.png"):
         load_task(str(tmp_path / "set"))
