@@ -60,6 +60,7 @@ GREYED, BLACKENED, SCALED, TURNED, ENLARGED, CUT, PADDED = (
     *("from colour to grey", "with transparent parts, now black", "of 16 bits or more, scaled by their full scale"),
     *("turned as their EXIF data say", "enlarged", "cut at the edges", "padded with black"),
 )
+CUT_WORDS = ", cut to their mean aspect ratio (--fit pad keeps all)"
 
 
 class LabelledPictures(NamedTuple):
@@ -264,20 +265,11 @@ class _Found:
         aspect = sum(number * math.log(w / h) for (h, w), number in sizes.items()) / sizes.total()
         height, width = (max(1, round(side * math.exp(min(0.0, way)))) for way in (-aspect, aspect))
         which = f"--resize {side}" if reading.side else f"by default; --resize N for another, up to {largest}"
-        rest = "as all pictures have it" if len(sizes) == 1 else "which is the mean one of the pictures"
-        rest += (
-            ", what lies beyond is " + ("not cut but padded" if reading.pad else "cut (--fit pad keeps it)")
-            if len(sizes) > 1
-            else ""
-        )
-        self.account.size = f"images of {width} x {height} pixels ({which}) from {_span(sizes)}; aspect ratio {rest}"
+        ends = (f"{w} x {h}" for h, w in (pick(sizes, key=math.prod) for pick in (min, max)))
+        from_ = " to ".join(dict.fromkeys(ends))
+        beyond = "" if len(sizes) == 1 else ", padded to their mean aspect ratio" if reading.pad else CUT_WORDS
+        self.account.size = f"images of {width} x {height} pixels ({which}) from {from_}{beyond}"
         return height, width
-
-
-def _span(sizes: Counter[tuple[int, int]]) -> str:
-    """The smallest and the largest size, by area, in words."""
-    ends = [f"{w} x {h}" for h, w in (pick(sizes, key=math.prod) for pick in (min, max))]
-    return ends[0] if len(sizes) == 1 else f"{ends[0]} to {ends[1]}"
 
 
 def _all_of(folder: Path, faults: dict[str, list[PansError]], *, can_skip: bool) -> PansError:
