@@ -32,7 +32,7 @@ from pans.trainer.options import LEAST_PHOTONS, AutomatonOptions, stated_toleran
 from pans.trainer.tasks.changes import Variation, enlarged
 from pans.trainer.tasks.registry import HOLD_OUT_EVERY, Objects, Task, fold_tasks, own_task
 
-from .recipe import Recipe, choose_training, choose_variation
+from .recipe import PHOTONS, Recipe, choose_training, choose_variation
 from .results import Judged, SensorResults, results_of
 
 FEW_HELD_OUT = 10  # images of a class: of fewer the recall is hardly known, and each image is held out once
@@ -51,11 +51,12 @@ class Prepared:
 
 def prepared(task: Task, encoder: str, *, seed: int = 0, equal: bool = True, vary: bool = True) -> Prepared:
     """Choose how the images may be varied (unless not `vary`) and the size of the training; with `equal` every class counts the same."""
-    variation, losses = Variation(), [0.0, 0.0]
+    variation, losses, photons = Variation(), [0.0, 0.0], PHOTONS[0]
     if vary and task.target == "class":
         choice = choose_variation(task, seed)
         variation, losses = choice.variation, [round(choice.loss_before, 4), round(choice.loss, 4)]
-    recipe = choose_training(task, variation, encoder)
+        photons = choice.photons
+    recipe = choose_training(task, variation, encoder, photons)
     unequal = equal and len(set(np.bincount(task.train.labels))) > 1 and task.target == "class"
     bigger = enlarged(task, variation, recipe.objects, recipe.kept, seed, equal=unequal)
     changes = {name: value for name, value in asdict(variation).items() if value}

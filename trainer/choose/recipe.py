@@ -22,14 +22,20 @@ from pans.trainer.baselines.common import detect, measure
 from pans.trainer.tasks.changes import Variation, enlarged, varied
 from pans.trainer.tasks.registry import Objects, Task
 
-from .results import balanced
+from .results import F64, balanced
 
 OBJECTS = 8000  # training images with their varied copies, at most: more took longer and gained little
 OBJECTS_PER_IMAGE = 16  # and of few images as many
 PIXELS_MAX = 1 << 24  # of all of them: what trains within minutes on one core
-PHOTONS = 10.0  # what a camera detects of a decision's budget of light, where none is asked for
+PHOTONS = (
+    10.0,
+    20.0,
+    40.0,
+)  # what a camera detects of a decision's budget of light, where none is asked for: the least that tells enough
+TOLD = 0.25  # of the way from chance to certainty is what a camera must tell of left-out images
 LEAST_GREY = 1e-3  # mean transmission: of darker images the budget would be without bound
 EXPOSURES, STATES = 32, 128  # of an automaton trained on so few images; more states learn them by heart
+EXPOSURES_PER_PHOTON = 1.6  # more exposures for more light
 STEPS_PER_EPOCH = 40  # fewer steps than that hardly move the patterns
 BATCH = (50, 500)
 FEATURES = 10  # fixed patterns where none are asked for
@@ -47,7 +53,9 @@ TRIES: dict[str, tuple[Any, ...]] = {  # one after the other: the best of each g
     "stretch": (0.15,),
     "bend": (0.02,),
 }
-FRAME_PHOTONS = 20.0  # so many that shapes count, so few that a left-out image need not be matched pixel by pixel
+FRAMES_LIGHT = (
+    2.0  # times the light of a decision: shapes count, but a left-out image need not be matched pixel by pixel
+)
 WORLD = 5000  # images of the world, changed copies included
 LEFT_OUT_PART = 5
 LEFT_OUT_MAX = 400
@@ -83,19 +91,20 @@ def choose_encoder(profile: Profile) -> tuple[str, str]:
     return "active", f"fixed patterns: {profile.name} is a {profile.mode} profile, an automaton needs a sequential one"
 
 
-def choose_training(task: Task, variation: Variation, encoder: str) -> Recipe:
+def choose_training(task: Task, variation: Variation, encoder: str, photons: float = PHOTONS[0]) -> Recipe:
     """Return the training of `encoder` for a user's own images; what the user asks for takes the place of what is here."""
     n, pixels = len(task.train), math.prod(task.image_shape)
     kept = max(1, n // KEPT_PART)
     objects = n if variation == Variation() else max(n, min(OBJECTS, OBJECTS_PER_IMAGE * n, PIXELS_MAX // pixels))
-    light = PHOTONS, float(f"{PHOTONS / max(task.train.images.mean() / 255, LEAST_GREY):.2g}")
+    light = photons, float(f"{photons / max(task.train.images.mean() / 255, LEAST_GREY):.2g}")
+    exposures = max(EXPOSURES, round(EXPOSURES_PER_PHOTON * photons))
     batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
     reasons = [f"{objects} training images from {n}: {variation}; these changes made left-out images more likely"]
     if variation == Variation():
         reasons = [f"{n} training images as they are: no change of them made left-out images more likely"]
     if encoder == "automaton":
-        reasons.append(f"{EXPOSURES} exposures of at most {STATES} states: more would learn so few images by heart")
-        return Recipe(encoder, objects, kept, *light, batch, 6, tuple(reasons), EXPOSURES, STATES)
+        reasons.append(f"{exposures} exposures of at most {STATES} states: more would learn so few images by heart")
+        return Recipe(encoder, objects, kept, *light, batch, 6, tuple(reasons), exposures, STATES)
     epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
     reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
     return Recipe(encoder, objects, kept, *light, batch, epochs, tuple(reasons), features=FEATURES)
@@ -151,11 +160,14 @@ class Choice:
     variation: Variation
     loss_before: float
     loss: float
+    photons: float  # of a decision, at which left-out images can be told
 
 
 def choose_variation(task: Task, seed: int = 0) -> Choice:
-    """Return the changes that serve the training images of `task` best; none where none helps."""
+    """Return the light that the images need, and the changes that serve the training images of `task` best; none where none helps."""
     judge = _Judge(task, seed)
+    photons = next((level for level in PHOTONS if judge.told(level) >= TOLD), PHOTONS[-1])
+    judge.photons = FRAMES_LIGHT * photons
     best = Variation()
     losses = before = judge.losses(best)
     for name, sizes in TRIES.items():
@@ -168,7 +180,7 @@ def choose_variation(task: Task, seed: int = 0) -> Choice:
                 won = changed, found
         if won is not None:
             best, losses = won
-    return Choice(best, *(balanced(values, judge.labels)[0] for values in (before, losses)))
+    return Choice(best, *(balanced(values, judge.labels)[0] for values in (before, losses)), photons)
 
 
 class _Judge:
@@ -184,21 +196,31 @@ class _Judge:
         self.known = [np.delete(places, part)[:WORLD] for part in self.parts]
         self.labels = np.concatenate([task.train.labels[part] for part in self.parts])
         self.frames = -(-FRAMES // len(self.labels))
+        self.photons = FRAMES_LIGHT * PHOTONS[0]
 
-    def losses(self, variation: Variation) -> NDArray[np.float64]:
+    def told(self, photons: float) -> float:
+        """Return how far from chance (0) to certainty (1) the recalls of left-out images are, on average, at so many photons."""
+        self.photons, chance = photons, 1 / len(self.task.classes)
+        right = [self._joint(*part, Variation())[1] for part in zip(self.parts, self.known)]
+        return (balanced(np.concatenate(right), self.labels)[0] - chance) / (1 - chance)
+
+    def losses(self, variation: Variation) -> F64:
         """Return -log P(true class | frame), the mean over frames of every left-out image, in a world of changed images, (images,)."""
-        return np.concatenate([self._losses(*part, variation) for part in zip(self.parts, self.known)])
+        return np.concatenate([self._joint(*part, variation)[0] for part in zip(self.parts, self.known)])
 
-    def _losses(self, out: NDArray[np.int64], of_world: NDArray[np.int64], variation: Variation) -> NDArray[np.float64]:
+    def _joint(self, out: NDArray[np.int64], of_world: NDArray[np.int64], variation: Variation) -> tuple[F64, F64]:
+        """The losses, and shares of right decisions, of the left-out images `out` in a world of the images `of_world`."""
         known, left_out = self.task.train.take(of_world), self.task.train.take(out)
         copies = 0 if variation == Variation() else max(1, WORLD // min(2, len(self.parts)) // len(known))
         images = [known.images, *(varied(known.images, variation, [self.seed, copy]) for copy in range(copies))]
         world = Objects(np.concatenate(images), np.tile(known.labels, copies + 1))
         measured = measure(replace(self.task, train=world, test=left_out), None)
-        light = np.repeat(measured.photoelectrons(measured.test, FRAME_PHOTONS), self.frames, axis=0)
+        light = np.repeat(measured.photoelectrons(measured.test, self.photons), self.frames, axis=0)
         frames = detect(light, "counting", np.random.default_rng([self.seed, 3]))
-        joint = log_joint(measured, frames, FRAME_PHOTONS, "counting", floor=FLOOR)
+        joint = log_joint(measured, frames, self.photons, "counting", floor=FLOOR)
         joint -= np.log(np.maximum(1, np.bincount(world.labels, minlength=joint.shape[1])))  # every class is as likely
         joint -= np.logaddexp.reduce(joint, axis=1, keepdims=True)
-        losses = -joint[np.arange(len(frames)), np.repeat(left_out.labels, self.frames)]
-        return np.asarray(np.minimum(losses, LOSS_MAX).reshape(-1, self.frames).mean(axis=1))
+        labels = np.repeat(left_out.labels, self.frames)
+        losses = np.minimum(-joint[np.arange(len(frames)), labels], LOSS_MAX)
+        right = (joint.argmax(axis=1) == labels).astype(np.float64)
+        return losses.reshape(-1, self.frames).mean(axis=1), right.reshape(-1, self.frames).mean(axis=1)

@@ -113,6 +113,8 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
             setattr(args, name, 0)
     if any(getattr(args, name, None) is not None for name in ("photons", "clicks", "alpha", "illumination")):
         return []
+    from pans.trainer.choose.recipe import PHOTONS
+
     words = []
     # fixed patterns would have to meet both budgets, an automaton need not use both up
     if args.encoder not in (None, "active"):
@@ -121,7 +123,12 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
     if args.encoder in (None, "active", AUTOMATON):
         args.illumination = recipe.illumination
         words.append(f"an illumination of {recipe.illumination:g}, at which a camera detects {recipe.photons:g}")
-    return [f"at most {' and '.join(words)}: a first guess (--photons, --illumination for another budget)"]
+    why = (
+        "the least that tells a camera enough of left-out images"
+        if recipe.photons < PHOTONS[-1]
+        else "as much as is tried"
+    )
+    return [f"at most {' and '.join(words)}: {why} (--photons, --illumination for another budget)"]
 
 
 def finish(
