@@ -1,4 +1,5 @@
-"""What `pans train` chooses for a user's own images: how they may be varied, the encoder, the size of the training, and warnings.
+"""What `pans train` chooses for a user's own images, and what the sensor then achieves beside a camera.
 
-A task and a profile come in, a `Recipe` with its reasons goes out. Everything is in `recipe.py`.
+`recipe.py` chooses how images may be varied, light, encoder and the size of the training, with its reasons. `own.py` trains and judges,
+from arrays too (`train_own`). `results.py` holds `SensorResults`, its table and its pictures.
 """

@@ -32,7 +32,7 @@ from pans.trainer.options import LEAST_PHOTONS, AutomatonOptions, stated_toleran
 from pans.trainer.tasks.changes import Variation, enlarged
 from pans.trainer.tasks.registry import HOLD_OUT_EVERY, Objects, Task, fold_tasks, own_task
 
-from .recipe import PHOTONS, Recipe, choose_training, choose_variation
+from .recipe import PLAIN_LIGHT, Recipe, choose_training, choose_variation
 from .results import Judged, SensorResults, results_of
 
 FEW_HELD_OUT = 10  # images of a class: of fewer the recall is hardly known, and each image is held out once
@@ -51,12 +51,12 @@ class Prepared:
 
 def prepared(task: Task, encoder: str, *, seed: int = 0, equal: bool = True, vary: bool = True) -> Prepared:
     """Choose how the images may be varied (unless not `vary`) and the size of the training; with `equal` every class counts the same."""
-    variation, losses, photons = Variation(), [0.0, 0.0], PHOTONS[0]
+    variation, losses, light = Variation(), [0.0, 0.0], PLAIN_LIGHT
     if vary and task.target == "class":
         choice = choose_variation(task, seed)
         variation, losses = choice.variation, [round(choice.loss_before, 4), round(choice.loss, 4)]
-        photons = choice.photons
-    recipe = choose_training(task, variation, encoder, photons)
+        light = choice.light
+    recipe = choose_training(task, variation, encoder, light)
     unequal = equal and len(set(np.bincount(task.train.labels))) > 1 and task.target == "class"
     bigger = enlarged(task, variation, recipe.objects, recipe.kept, seed, equal=unequal)
     changes = {name: value for name, value in asdict(variation).items() if value}
@@ -99,7 +99,7 @@ def other_folds(
         words = f"sensor {number} of {folds}"
         report(f"{words}: choosing", 0.0)
         chosen = prepared(fold, "automaton", seed=options.seed, equal=equal)
-        recipe = replace(options, batch=chosen.recipe.batch)
+        recipe = replace(options, batch=chosen.recipe.batch, first_price=chosen.recipe.first_price)
         trained = train_automaton(
             chosen.task, profile, recipe, held_back=chosen.task.kept, report=_reporting(words, report)
         )
@@ -142,7 +142,7 @@ def train_own(
     recipe = chosen.recipe
     if photons is None and illumination is None and not {"clicks", "dose_cap"} & options.keys():
         photons, illumination = recipe.photons, recipe.illumination
-    sizes = {"exposures": recipe.exposures, "states": recipe.states, "batch": recipe.batch, "epochs": recipe.epochs}
+    sizes = {name: getattr(recipe, name) for name in ("exposures", "states", "batch", "epochs", "first_price")}
     with as_usage_error():
         asked = AutomatonOptions(
             **{"copies": 0, "soft": 0.0, "optics": stated_tolerance(device), **sizes, **options},

@@ -33,9 +33,14 @@ PHOTONS = (
     40.0,
 )  # what a camera detects of a decision's budget of light, where none is asked for: the least that tells enough
 TOLD = 0.25  # of the way from chance to certainty is what a camera must tell of left-out images
+LEAST_TOLD = 0.02  # less is chance
 LEAST_GREY = 1e-3  # mean transmission: of darker images the budget would be without bound
 EXPOSURES, STATES = 32, 128  # of an automaton trained on so few images; more states learn them by heart
-EXPOSURES_PER_PHOTON = 1.6  # more exposures for more light
+EXPOSURES_PER_PHOTON = 1.2  # more exposures for more light
+FIRST_PRICE = (
+    0.2  # nats per photoelectron of the first exposure, at most; and so many times what a camera learns from one:
+)
+PRICE_OF_TOLD = 2.0  # dearer light stays off where bright objects tell little, and no training turns it on again
 STEPS_PER_EPOCH = 40  # fewer steps than that hardly move the patterns
 BATCH = (50, 500)
 FEATURES = 10  # fixed patterns where none are asked for
@@ -81,6 +86,7 @@ class Recipe:
     exposures: int = 0
     states: int = 0
     features: int = 0
+    first_price: float = FIRST_PRICE
 
 
 def choose_encoder(profile: Profile) -> tuple[str, str]:
@@ -91,23 +97,35 @@ def choose_encoder(profile: Profile) -> tuple[str, str]:
     return "active", f"fixed patterns: {profile.name} is a {profile.mode} profile, an automaton needs a sequential one"
 
 
-def choose_training(task: Task, variation: Variation, encoder: str, photons: float = PHOTONS[0]) -> Recipe:
+@dataclass(frozen=True, slots=True)
+class Light:
+    """The light of a decision: what a camera detects of it, and nats per photoelectron that the first exposure may cost."""
+
+    photons: float
+    first_price: float
+
+
+PLAIN_LIGHT = Light(PHOTONS[0], FIRST_PRICE)
+
+
+def choose_training(task: Task, variation: Variation, encoder: str, light: Light = PLAIN_LIGHT) -> Recipe:
     """Return the training of `encoder` for a user's own images; what the user asks for takes the place of what is here."""
     n, pixels = len(task.train), math.prod(task.image_shape)
     kept = max(1, n // KEPT_PART)
     objects = n if variation == Variation() else max(n, min(OBJECTS, OBJECTS_PER_IMAGE * n, PIXELS_MAX // pixels))
-    light = photons, float(f"{photons / max(task.train.images.mean() / 255, LEAST_GREY):.2g}")
-    exposures = max(EXPOSURES, round(EXPOSURES_PER_PHOTON * photons))
+    budget = light.photons, float(f"{light.photons / max(task.train.images.mean() / 255, LEAST_GREY):.2g}")
+    exposures = max(EXPOSURES, round(EXPOSURES_PER_PHOTON * light.photons))
     batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
     reasons = [f"{objects} training images from {n}: {variation}; these changes made left-out images more likely"]
     if variation == Variation():
         reasons = [f"{n} training images as they are: no change of them made left-out images more likely"]
     if encoder == "automaton":
         reasons.append(f"{exposures} exposures of at most {STATES} states: more would learn so few images by heart")
-        return Recipe(encoder, objects, kept, *light, batch, 6, tuple(reasons), exposures, STATES)
+        sizes = {"exposures": exposures, "states": STATES, "first_price": light.first_price}
+        return Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), **sizes)
     epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
     reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
-    return Recipe(encoder, objects, kept, *light, batch, epochs, tuple(reasons), features=FEATURES)
+    return Recipe(encoder, objects, kept, *budget, batch, epochs, tuple(reasons), features=FEATURES)
 
 
 def as_trained_on(task: Task, provenance: Mapping[str, Any]) -> Task:
@@ -160,13 +178,17 @@ class Choice:
     variation: Variation
     loss_before: float
     loss: float
-    photons: float  # of a decision, at which left-out images can be told
+    light: Light  # at which left-out images can be told
 
 
 def choose_variation(task: Task, seed: int = 0) -> Choice:
     """Return the light that the images need, and the changes that serve the training images of `task` best; none where none helps."""
     judge = _Judge(task, seed)
-    photons = next((level for level in PHOTONS if judge.told(level) >= TOLD), PHOTONS[-1])
+    for photons in PHOTONS:
+        told = max(LEAST_TOLD, judge.told(photons))
+        if told >= TOLD:
+            break
+    price = PRICE_OF_TOLD * told * math.log(len(task.classes)) / photons
     judge.photons = FRAMES_LIGHT * photons
     best = Variation()
     losses = before = judge.losses(best)
@@ -180,7 +202,11 @@ def choose_variation(task: Task, seed: int = 0) -> Choice:
                 won = changed, found
         if won is not None:
             best, losses = won
-    return Choice(best, *(balanced(values, judge.labels)[0] for values in (before, losses)), photons)
+    return Choice(
+        best,
+        *(balanced(values, judge.labels)[0] for values in (before, losses)),
+        Light(photons, min(FIRST_PRICE, price)),
+    )
 
 
 class _Judge:

@@ -108,8 +108,12 @@ def _train(args: argparse.Namespace) -> int:
     if args.history is not None:
         with needing("--history", "plot"):
             import matplotlib  # noqa: F401 - asked for before the training, not after it
-    kind: type[AutomatonTraining | FixedTraining] = AutomatonTraining if automaton else FixedTraining
-    training = kind(args, task, varied, profile)
+    training: AutomatonTraining | FixedTraining
+    if automaton:
+        price = chosen.recipe.first_price if chosen is not None else None
+        training = AutomatonTraining(args, task, varied, profile, price)
+    else:
+        training = FixedTraining(args, task, varied, profile)
     try:
         with (
             as_usage_error(),

@@ -39,10 +39,13 @@ class AutomatonTraining:
     bundle: Bundle
     trained: TrainedAutomaton
 
-    def __init__(self, args: argparse.Namespace, task: Task, varied: Task, profile: Profile) -> None:
+    def __init__(
+        self, args: argparse.Namespace, task: Task, varied: Task, profile: Profile, first_price: float | None = None
+    ) -> None:
         self.args, self.task, self.varied, self.profile = args, task, varied, profile
         given: dict[str, Any] = {"optics": stated_tolerance(profile)}
         given |= {name: value for name in option_names(AutomatonOptions) if (value := getattr(args, name)) is not None}
+        given |= {} if first_price is None else {"first_price": first_price}
         self.options = AutomatonOptions(**given)
         self.start: Bundle | None = None
         if args.start is not None:
