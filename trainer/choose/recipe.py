@@ -121,8 +121,8 @@ def choose_training(task: Task, variation: Variation, encoder: str, light: Light
         reasons = [f"{n} training images as they are: no change of them made left-out images more likely"]
     if encoder == "automaton":
         reasons.append(f"{exposures} exposures of at most {STATES} states: more would learn so few images by heart")
-        sizes = {"exposures": exposures, "states": STATES, "first_price": light.first_price}
-        return Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), **sizes)
+        shape = {"exposures": exposures, "states": STATES}
+        return Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), **shape, first_price=light.first_price)
     epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
     reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
     return Recipe(encoder, objects, kept, *budget, batch, epochs, tuple(reasons), features=FEATURES)
@@ -202,11 +202,8 @@ def choose_variation(task: Task, seed: int = 0) -> Choice:
                 won = changed, found
         if won is not None:
             best, losses = won
-    return Choice(
-        best,
-        *(balanced(values, judge.labels)[0] for values in (before, losses)),
-        Light(photons, min(FIRST_PRICE, price)),
-    )
+    means = [balanced(values, judge.labels)[0] for values in (before, losses)]
+    return Choice(best, means[0], means[1], Light(photons, min(FIRST_PRICE, price)))
 
 
 class _Judge:

@@ -74,8 +74,6 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     own.add_argument("--keep-shares", action="store_true", help=words)
     words = "judge so many sensors of the recipe, each on images it has not seen (default 1; 5 where a class has few images)"
     own.add_argument("--folds", type=Range(1, 5, whole=True).option, metavar="N", help=words)
-    words = "pictures beside the bundle: what the sensor sees, what it confuses (default: written)"
-    own.add_argument("--sheets", action=argparse.BooleanOptionalAction, default=True, help=words)
     add_reading(parser)
     words = "of your own images: choose nothing from them, take the options and defaults as they are"
     parser.add_argument("--as-is", action="store_true", help=words)
@@ -168,7 +166,7 @@ def _check_files(args: argparse.Namespace, checkpoint: Path, own: bool) -> None:
     if checkpoint.exists() and not (args.resume or args.force):
         what = f"{checkpoint}: is here, of a training that was interrupted"
         raise UsageError(what, remedy="continue it by --resume, or replace it with --force")
-    sheets = sheets_of(args) if own and args.sheets else []
+    sheets = sheets_of(args) if own else []
     check_outputs([args.out, *sheets], inputs=inputs, force=args.force)
     check_outputs([checkpoint], inputs=[*inputs, args.out], force=True)
     if args.history is not None:

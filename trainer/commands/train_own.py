@@ -80,9 +80,8 @@ def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Prepared:
     for line in [f"{task.name}:", *task.account.lines()] if task.account else ():
         say(line)
     say(f"{task.name}: {len(task.train)} images to train on, {len(task.test)} held out, {len(task.classes)} classes")
-    if args.sheets:
-        write_file(sheets_of(args)[0], seen_sheet(task), force=args.force)
-        say(f"what the sensor will see: {sheets_of(args)[0]}")
+    write_file(sheets_of(args)[0], seen_sheet(task), force=args.force)
+    say(f"what the sensor will see: {sheets_of(args)[0]}")
     vary = not any(getattr(args, name) for name in CHANGES)
     encoder = args.encoder or "active"
     chosen = prepared(task, encoder, seed=args.seed or 0, equal=not args.keep_shares, vary=vary)
@@ -143,19 +142,16 @@ def finish(
     from pans.trainer.choose.results import confused_sheet, results_of
 
     bundle, seed = done.bundle, args.seed or 0
-    folds = 1
-    if done.options is not None:
-        folds = args.folds or folds_needed(task)
     with displayed_parts() as report:
         parts = [judged(bundle, chosen.task, profile, seed, report)]
-        if folds > 1 and done.options is not None:
-            equal = not args.keep_shares
+        if done.options is not None:
+            folds, equal = args.folds or folds_needed(task), not args.keep_shares
             parts += other_folds(task, profile, done.options, folds, equal=equal, report=report)
     seconds = time.perf_counter() - done.started
     results = results_of(parts, task.classes, seconds=seconds, bundle=args.out, sha256=done.sha256)
     if args.encoder != AUTOMATON:  # whose own words tell it
         warn_of_budget(args, results.clicks, results.photons, results.illumination)
-    lines, picture = [*results.lines(), *done.words], confused_sheet(results) if args.sheets else None
+    lines, picture = [*results.lines(), *done.words], confused_sheet(results)
     if picture is not None:
         write_file(sheets_of(args)[1], picture, force=args.force)
         lines.append(f"  the images behind these pairs: {sheets_of(args)[1]}")

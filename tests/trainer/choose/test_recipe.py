@@ -7,6 +7,7 @@ import pytest
 from trainings import practice_folder
 
 from pans.runtime.instrument.profile import load_profile
+from pans.trainer.choose import recipe
 from pans.trainer.choose.recipe import BATCH, OBJECTS, choose_encoder, choose_training, choose_variation, warnings_of
 from pans.trainer.tasks.changes import Variation, enlarged
 from pans.trainer.tasks.registry import Objects, Task, load_task, mixed_order
@@ -60,13 +61,23 @@ def test_warnings():
     assert "dark counts alone" in told(task_of([100, 100]), hot)[0]
 
 
-def test_letters_are_not_mirrored_nor_turned_over(tmp_path):
+def test_letters_are_not_mirrored_nor_turned_over_and_dark_ones_get_more_light(tmp_path, monkeypatch):
     task = load_task(str(practice_folder(tmp_path / "letters", "letters", 200)))
     choice = choose_variation(task)
     assert choice.variation != Variation()
     assert choice.variation.turn_deg <= 25
     assert not choice.variation.mirror_x
     assert choice.loss < choice.loss_before
+    monkeypatch.setattr(recipe, "TRIES", {})
+    images = 255 - task.train.images // 2
+    dark = choose_variation(replace(task, train=Objects(images, task.train.labels))).light
+    assert dark.photons > choice.light.photons == 10.0
+    assert dark.first_price < choice.light.first_price
+    bigger = choose_training(task, TURNED, "automaton", dark)
+    assert (
+        bigger.photons == dark.photons == pytest.approx(bigger.illumination * task.train.images.mean() / 255, rel=0.05)
+    )
+    assert bigger.exposures == max(32, round(1.2 * dark.photons))
 
 
 def wedges(n, seed):
