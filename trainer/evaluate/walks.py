@@ -6,6 +6,7 @@ The sums over walks are `pans.runtime.decide.expectation`. SIMULATED figures: th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -117,48 +118,79 @@ def walks_of(
     depends on the walk to it. ValueError for what does not fit.
     """
     whole = _fitting(bundle, profile, images, conditions, trials)
-    law = outcome_law_of(bundle, profile, conditions.eta, conditions.dark)
     automaton = stopped(whole, conditions.confidence) if conditions.confidence else whole
     leaf_labels = leaf_verdicts(automaton, conditions.confidence).labels
-    step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
-    step = step if conditions.bleaching.is_none else min(step, BLEACHED_AT_ONCE)
-    afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
-    patterns, scale = patterns_met(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
-
-    sent = patterns.sum(axis=1, dtype=np.float64)[automaton.rows].sum(axis=1) * automaton.dwell / automaton.dwell_steps
-    left = None
-    if trials is None:
-        left = left_by_state(automaton, sent * scale, conditions.bleaching, bundle.n_pixels)
-        if left is None:
-            raise ValueError("bleaching depends on the walk, there is no exact expectation (sample trials instead)")
-
-    def expected(seen: NDArray[Any], begins: tuple[float, float]) -> ExpectedWalk:
-        return expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins, left=left)
-
-    begins, rng = (0.0, 0.0), np.random.default_rng(conditions.seed)
-    if trials is None and afterpulses.time:
-        some = np.linspace(0, len(images) - 1, min(step, BEGIN_OBJECTS, len(images))).astype(np.int64)
-        few = object_transmission(profile, images[some].reshape(len(some), -1))
-        # objects begin with the memory that those before them leave, which begin with it too
-        for _ in range(BEGIN_ROUNDS):
-            ends = expected(few, begins).ends
-            assert ends is not None
-            mean, square = ends.mean(axis=0).tolist()
-            begins = mean, max(square - mean**2, 0.0)
+    step = _at_once(bundle, automaton, conditions)
+    sums_of = _walking(bundle, automaton, profile, images, conditions, trials)
     parts: list[Walks] = []
     for start in range(0, len(images), step):
-        part = images[start : start + step]
-        seen = object_transmission(profile, part.reshape(len(part), -1))
-        if trials is None:
-            found = expected(seen, begins)
-            sums = found.clicks, found.photons, found.illumination, found.exposures, found.leaves
-        else:
-            light = automaton, patterns, seen, scale
-            sums = _sampled(light, (law, afterpulses), conditions.bleaching, trials, rng)
+        sums = sums_of(images[start : start + step])
         parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
     joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in OF_OBJECTS}
     by_class = sum((part.by_class for part in parts[1:]), parts[0].by_class)
     return replace(parts[0], **joined, by_class=by_class, trials=trials or 0, classes=bundle.classes)
+
+
+def leaf_chances(bundle: Bundle, profile: Profile, images: NDArray[np.uint8], conditions: Conditions = AS_IT_IS) -> F64:
+    """Return the chance that a walk on each of `images` (n, height, width) ends at each leaf, float64 (n, leaves); see `walks_of`."""
+    automaton = _fitting(bundle, profile, images, conditions, None)
+    return _walking(bundle, automaton, profile, images, conditions, None)(images)[4]
+
+
+def _walking(
+    bundle: Bundle,
+    automaton: Automaton,
+    profile: Profile,
+    images: NDArray[np.uint8],
+    conditions: Conditions,
+    trials: int | None,
+) -> Callable[[NDArray[np.uint8]], _Sums]:
+    """Return what gives the sums of a part of `images`: exactly, or of `trials` walks."""
+    law = outcome_law_of(bundle, profile, conditions.eta, conditions.dark)
+    afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
+    patterns, scale = patterns_met(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
+    if trials is not None:
+        rng = np.random.default_rng(conditions.seed)
+
+        def sampled(part: NDArray[np.uint8]) -> _Sums:
+            light = automaton, patterns, _seen(profile, part), scale
+            return _sampled(light, (law, afterpulses), conditions.bleaching, trials, rng)
+
+        return sampled
+    sent = patterns.sum(axis=1, dtype=np.float64)[automaton.rows].sum(axis=1) * automaton.dwell / automaton.dwell_steps
+    left = left_by_state(automaton, sent * scale, conditions.bleaching, bundle.n_pixels)
+    if left is None:
+        raise ValueError("bleaching depends on the walk, there is no exact expectation (sample trials instead)")
+
+    def walk(part: NDArray[np.uint8], begins: tuple[float, float]) -> ExpectedWalk:
+        seen = _seen(profile, part)
+        return expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins, left=left)
+
+    begins = 0.0, 0.0
+    if afterpulses.time:
+        some = np.linspace(0, len(images) - 1, min(_at_once(bundle, automaton, conditions), BEGIN_OBJECTS, len(images)))
+        # objects begin with the memory that those before them leave, which begin with it too
+        for _ in range(BEGIN_ROUNDS):
+            ends = walk(images[some.astype(np.int64)], begins).ends
+            assert ends is not None
+            mean, square = ends.mean(axis=0).tolist()
+            begins = mean, max(square - mean**2, 0.0)
+
+    def expected(part: NDArray[np.uint8]) -> _Sums:
+        found = walk(part, begins)
+        return found.clicks, found.photons, found.illumination, found.exposures, found.leaves
+
+    return expected
+
+
+def _at_once(bundle: Bundle, automaton: Automaton, conditions: Conditions) -> int:
+    """How many objects are looked at together, so that memory stays small."""
+    step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
+    return step if conditions.bleaching.is_none else min(step, BLEACHED_AT_ONCE)
+
+
+def _seen(profile: Profile, images: NDArray[np.uint8]) -> NDArray[Any]:
+    return object_transmission(profile, images.reshape(len(images), -1))
 
 
 def _fitting(
