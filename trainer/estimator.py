@@ -126,7 +126,8 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
 
     def predict(self, X: ArrayLike) -> NDArray[Any]:
         """Return the class decided for every image, (n,), each on clicks drawn for it."""
-        return self.classes_[self.predict_proba(X).argmax(axis=1)]
+        chosen = self.predict_proba(X).argmax(axis=1)
+        return self.classes_[chosen]
 
     def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
         """Return the posterior of every class, float64 (n, classes), given the clicks that `predict` decides on."""
@@ -169,6 +170,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
         tags.input_tags.positive_only = tags.input_tags.three_d_array = True
+        tags.classifier_tags.poor_score = True  # of two grey values ten photons do not tell what a number does
         return tags
 
     def __getstate__(self) -> dict[str, Any]:
