@@ -105,17 +105,17 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
 
         ValueError for pixels outside 0 to `scale`; UsageError or PlanError for what the profile or the training cannot do.
         """
-        X, shape = self._flat(X)
-        X, y = validate_data(self, X, y, dtype=(np.float64, np.float32))
-        check_classification_targets(y)
-        self.classes_, labels = np.unique(y, return_inverse=True)
+        given, shape = _flat(X)
+        grey, named = validate_data(self, given, y, dtype=(np.float64, np.float32))
+        check_classification_targets(named)
+        self.classes_, labels = np.unique(named, return_inverse=True)
         if len(self.classes_) < 2:
             raise ValueError(f"y holds one class, {self.classes_[0]!r}, needed are 2 or more")
-        self.image_shape_ = _image_shape(self.image_shape or shape, X.shape[1])
-        self.scale_ = float(X.max()) or 1.0 if self.scale == LARGEST else float(self.scale)
+        self.image_shape_ = _image_shape(self.image_shape or shape, grey.shape[1])
+        self.scale_ = float(grey.max()) or 1.0 if self.scale == LARGEST else float(self.scale)
         self.seed_ = int(check_random_state(self.random_state).randint(1 << 31))
         self.profile_ = self.profile if isinstance(self.profile, Profile) else load_profile(self.profile)
-        every = self._objects(X, labels)
+        every = self._objects(grey, labels)
         objects = every.take(np.random.default_rng(self.seed_).permutation(len(every)))  # the last ones are held back
         digest = hashlib.sha256(objects.images.tobytes() + objects.labels.tobytes()).hexdigest()
         names = tuple(str(name) for name in self.classes_)
@@ -192,18 +192,11 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
 
     # ---- between arrays and the trainer ----
 
-    def _flat(self, X: ArrayLike) -> tuple[Any, tuple[int, int] | None]:
-        """`X` with flat images, and their height and width where it says so."""
-        if getattr(X, "ndim", 0) != 3:
-            return X, None
-        images = np.asarray(X)
-        return images.reshape(len(images), -1), (int(images.shape[1]), int(images.shape[2]))
-
     def _asked(self, X: ArrayLike) -> Objects:
         """Checked images to decide on; their labels stand for nothing."""
         check_is_fitted(self)
-        X = validate_data(self, self._flat(X)[0], dtype=(np.float64, np.float32), reset=False)
-        return self._objects(X, np.zeros(len(X), np.int64))
+        grey = validate_data(self, _flat(X)[0], dtype=(np.float64, np.float32), reset=False)
+        return self._objects(grey, np.zeros(len(grey), np.int64))
 
     def _objects(self, X: NDArray[Any], labels: NDArray[np.int64]) -> Objects:
         check_non_negative(X, type(self).__name__)
@@ -220,7 +213,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         encoder = self.encoder or choose_encoder(self.profile_)[0]
         recipe = choose_training(task, Variation(), encoder)
         photons = recipe.photons if self.photons is None and self.illumination is None else self.photons
-        given = {"photons": photons, "illumination": self.illumination, "seed": self.seed_}
+        given: dict[str, Any] = {"photons": photons, "illumination": self.illumination, "seed": self.seed_}
         given |= {"epochs": self.epochs or recipe.epochs, "batch": recipe.batch}
         about: dict[str, Any] = {"name": "sensor", "provenance": {}}
         if encoder == AUTOMATON:
@@ -253,6 +246,14 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
             upto = leaf_chances(self.bundle_, self.profile_, images[part]).cumsum(axis=1)
             leaves[part] = (upto < uniform[part, None] * upto[:, -1:]).sum(axis=1)
         return automaton.posteriors[automaton.n_states + leaves].astype(np.float64)
+
+
+def _flat(X: ArrayLike) -> tuple[Any, tuple[int, int] | None]:
+    """`X` with flat images, and their height and width where it says so."""
+    if getattr(X, "ndim", 0) != 3:
+        return X, None
+    images = np.asarray(X)
+    return images.reshape(len(images), -1), (int(images.shape[1]), int(images.shape[2]))
 
 
 def _image_shape(asked: tuple[int, int] | None, pixels: int) -> tuple[int, int]:
