@@ -1,14 +1,47 @@
-"""Figures as small PNG files (extra `plot`), without a screen: a new one with its axes, and saving it."""
+"""Results as a notebook and pandas show them (`Result`); pictures as small PNG files (extra `plot`), without a screen."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from pans.runtime.errors import UsageError
+from pans.runtime.html_card import html_card
 from pans.runtime.outputs import whole_file
 
 DPI = 90
+
+
+class Result:
+    """What dataclasses of figures have besides: a table in a notebook, and a frame of pandas."""
+
+    __slots__ = ()
+
+    def rows(self) -> dict[str, dict[str, Any]]:
+        """Return the figures of each row by their names; shares are from 0 to 1."""
+        found: dict[str, Any] = asdict(self)  # type: ignore[call-overload]
+        plain = {name: value for name, value in found.items() if not isinstance(value, Mapping)}
+        return {"sensor": plain | _plain(found.get("by_class"))}
+
+    def to_frame(self) -> Any:
+        """Return `rows` as a pandas.DataFrame; UsageError where pandas is not installed."""
+        try:
+            import pandas
+        except ModuleNotFoundError as error:
+            what = "to_frame needs the package pandas, which is not installed"
+            raise UsageError(what, remedy="pip install 'pans-runtime[frames]'") from error
+        return pandas.DataFrame.from_dict(self.rows(), orient="index")
+
+    def _repr_html_(self) -> str:
+        cards = (html_card(f"{name} (SIMULATED)", figures) for name, figures in self.rows().items())
+        return "".join(cards)
+
+
+def _plain(figures: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {name: value for name, value in (figures or {}).items() if not isinstance(value, Mapping)}
 
 
 def use_files_alone() -> None:

@@ -1,4 +1,4 @@
-"""What a notebook needs: load a profile, a bundle or a recording, build a plan, run on a device, replay, evaluate, decide on clicks.
+"""What a notebook needs: train a sensor, load a profile, a bundle or a recording, run on a device, replay, evaluate, decide on clicks.
 
 This is `import pans`; what a name needs is loaded when it is first used. Each call is a few lines around the packages, which have the
 rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.trainer).
@@ -29,19 +29,58 @@ if TYPE_CHECKING:
     from pans.runtime.core.plan import build_plan
     from pans.runtime.decide.verdict import Verdicts
     from pans.runtime.instrument.profile import Profile, load_profile
+    from pans.runtime.record import Recording
     from pans.runtime.record import read_recording as load_recording
-    from pans.runtime.record.replaying import replay
-    from pans.trainer.evaluate import evaluate
+    from pans.runtime.record.replaying import Replayed, replay
+    from pans.trainer.choose.estimator import PansClassifier
+    from pans.trainer.choose.own import train_own as train
+    from pans.trainer.choose.results import CameraResults, SensorResults
+    from pans.trainer.evaluate import Measured, MeasuredPictures, MeasuredWalks, evaluate
 
 _HOMES = {
+    "Bundle": ("pans.runtime.bundle.model", "Bundle"),
+    "CameraResults": ("pans.trainer.choose.results", "CameraResults"),
+    "Measured": ("pans.trainer.evaluate", "Measured"),
+    "MeasuredPictures": ("pans.trainer.evaluate", "MeasuredPictures"),
+    "MeasuredWalks": ("pans.trainer.evaluate", "MeasuredWalks"),
+    "Outcome": ("pans.runtime.commands.one_run", "Outcome"),
+    "PansClassifier": ("pans.trainer.choose.estimator", "PansClassifier"),
+    "Profile": ("pans.runtime.instrument.profile", "Profile"),
+    "Recording": ("pans.runtime.record", "Recording"),
+    "Replayed": ("pans.runtime.record.replaying", "Replayed"),
+    "SensorResults": ("pans.trainer.choose.results", "SensorResults"),
+    "Verdicts": ("pans.runtime.decide.verdict", "Verdicts"),
     "build_plan": ("pans.runtime.core.plan", "build_plan"),
     "evaluate": ("pans.trainer.evaluate", "evaluate"),
     "load_profile": ("pans.runtime.instrument.profile", "load_profile"),
     "load_recording": ("pans.runtime.record", "read_recording"),
     "replay": ("pans.runtime.record.replaying", "replay"),
+    "train": ("pans.trainer.choose.own", "train_own"),
 }
-__all__ = ["__version__", "build_plan", "decide", "evaluate", "load_bundle", "load_profile", "load_recording"]
-__all__ += ["replay", "run"]
+__all__ = [
+    "Bundle",
+    "CameraResults",
+    "Measured",
+    "MeasuredPictures",
+    "MeasuredWalks",
+    "Outcome",
+    "PansClassifier",
+    "Profile",
+    "Recording",
+    "Replayed",
+    "SensorResults",
+    "Verdicts",
+    "__version__",
+    "build_plan",
+    "decide",
+    "evaluate",
+    "load_bundle",
+    "load_profile",
+    "load_recording",
+    "replay",
+    "run",
+    "train",
+]
 
 
 def __getattr__(name: str) -> object:
@@ -52,15 +91,16 @@ def __getattr__(name: str) -> object:
     try:
         globals()[name] = getattr(import_module(module), found)
     except ModuleNotFoundError as error:
-        if name != "evaluate":
+        if not module.startswith("pans.trainer"):
             raise
-        what = f"pans.evaluate needs the package {error.name}, which is not installed"
-        raise UsageError(what, remedy="pip install 'pans-runtime[train]'") from error
+        extra = "sklearn" if name == "PansClassifier" else "train"
+        what = f"pans.{name} needs the package {error.name}, which is not installed"
+        raise UsageError(what, remedy=f"pip install 'pans-runtime[{extra}]'") from error
     return globals()[name]
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)
 
 
 def load_bundle(path: str | Path) -> Bundle:

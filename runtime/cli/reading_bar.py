@@ -1,4 +1,4 @@
-"""Bars on the terminal: while a command reads a long file (`replay`, `verify`, `report`, `info`, `export`, `compare`), and of any work.
+"""Bars: on the terminal while a command reads a long file (`replay`, `verify`, `report`, `info`, `export`, `compare`), and of any work.
 
 There is none for a pass over a file that ends within a second, for a command whose standard error is no terminal, and with `--quiet`.
 """
@@ -10,8 +10,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 from pans.runtime.container import watching_blocks
+from pans.runtime.safe_text import html
 
 from .printing import state
 
@@ -74,8 +76,50 @@ def reading_bar() -> Iterator[None]:
 @contextmanager
 def progress_bar(what: str, total: float, *, threaded: bool = True) -> Iterator[Callable[[float], None]]:
     """Yield a call that displays on a terminal how much of `total` is done; `threaded` draws in a thread of its own."""
+    with _terminal_bar(threaded=threaded) as report:
+        yield lambda done: report(what, done / total)
+
+
+@contextmanager
+def work_bar() -> Iterator[Callable[[str, float], None]]:
+    """Yield a call that displays, on a terminal or in a notebook, what is being done and which part of it is done, 0 to 1."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    if shell is None or not hasattr(shell, "kernel"):
+        with _terminal_bar() as report:
+            yield report
+        return
+    line, drawn_s = _NotebookLine(), 0.0
+
+    def draw(what: str, part: float) -> None:
+        nonlocal drawn_s
+        if time.monotonic() - drawn_s >= DRAWN_EVERY_S:
+            line.draw(f'<progress value="{part:.3f}" max="1"></progress> {html(what)}')
+            drawn_s = time.monotonic()
+
+    try:
+        yield draw
+    finally:
+        line.draw("")
+
+
+class _NotebookLine:
+    """A line of HTML below a notebook's cell, which is drawn again and again."""
+
+    def __init__(self) -> None:
+        from IPython import display
+
+        untyped: Any = display
+        self._handle = untyped.display({"text/html": "", "text/plain": ""}, raw=True, display_id=True)
+
+    def draw(self, text: str) -> None:
+        self._handle.update({"text/html": text, "text/plain": ""}, raw=True)
+
+
+@contextmanager
+def _terminal_bar(*, threaded: bool = True) -> Iterator[Callable[[str, float], None]]:
     if state.quiet or not sys.stderr.isatty():
-        yield lambda done: None
+        yield lambda what, part: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -83,5 +127,5 @@ def progress_bar(what: str, total: float, *, threaded: bool = True) -> Iterator[
     text = TextColumn("{task.description}", markup=False)
     columns = (text, BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=threaded) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda done: progress.update(task, completed=min(done, total), refresh=not threaded)
+        task = progress.add_task("", total=1.0)
+        yield lambda what, part: progress.update(task, description=what, completed=min(part, 1.0), refresh=not threaded)

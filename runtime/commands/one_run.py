@@ -64,6 +64,10 @@ class Outcome:
     recording: Path | None
     report: Path | None
 
+    def __repr__(self) -> str:
+        told = f"{self.summary.tally.decisions} decisions, recording {self.recording}, report {self.report}"
+        return f"<Run: {self.summary.verdict}, {told}>"
+
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the figures of the summary, and the files."""
         found = self.summary.as_json()

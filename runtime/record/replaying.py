@@ -7,7 +7,8 @@ agree with a recording that was cut off. A `ClickLog` notes the clicks behind ea
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import recorded_flow_core, replayed_figures
 from pans.runtime.flow.matching import PassageFigures
+from pans.runtime.html_card import html_card
 from pans.runtime.instrument.profile import parse_profile
 from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.ranges import Range
@@ -72,7 +74,8 @@ class ClickLog:
         self.decisions += [one for one in decisions if not one.flags & DecisionFlag.ABSTAINED or one.flags & int(ASKED)]
 
 
-class Replayed(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Replayed:
     """What a replay gave: how many decisions, the SHA-256 of their log, what those about passing objects were worth, the agreement.
 
     `contradictions` are those of the stream with the plan and with itself, by what is wrong, as the core counted them in the run.
@@ -93,6 +96,16 @@ class Replayed(NamedTuple):
     def more(self) -> int:
         """Decisions beyond those that are recorded."""
         return max(0, self.decisions - self.recorded)
+
+    def _repr_html_(self) -> str:
+        agreement = "yes" if self.as_recorded else "NO"
+        facts = {
+            "as recorded": agreement,
+            "decisions": self.decisions,
+            "recorded": self.recorded,
+            "sha256": self.sha256,
+        }
+        return html_card("Replay", facts | self.contradictions)
 
 
 def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = None) -> Replayed:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.model import Bundle
+from pans.runtime.cli.reading_bar import work_bar
 from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.ranges import Range
@@ -30,7 +32,7 @@ from pans.trainer.evaluate.walks import walks_of
 from pans.trainer.export.automaton import bundle_of, export_automaton
 from pans.trainer.options import LEAST_PHOTONS, AutomatonOptions, stated_tolerance
 from pans.trainer.tasks.changes import Variation, enlarged
-from pans.trainer.tasks.registry import HOLD_OUT_EVERY, Objects, Task, fold_tasks, own_task
+from pans.trainer.tasks.registry import HOLD_OUT_EVERY, Objects, Task, fold_tasks, load_task, own_task
 
 from .recipe import PLAIN_LIGHT, Recipe, choose_training, choose_variation
 from .results import Judged, SensorResults, results_of
@@ -113,8 +115,8 @@ def _reporting(words: str, report: Report) -> Callable[[Progress], None]:
 
 
 def train_own(
-    images: ArrayLike,
-    labels: Sequence[Any] | NDArray[Any],
+    images: ArrayLike | str | Path,
+    labels: Sequence[Any] | NDArray[Any] | None = None,
     *,
     classes: Sequence[str] | None = None,
     out: str | Path | None = None,
@@ -125,41 +127,55 @@ def train_own(
     folds: int | None = None,
     equal_classes: bool = True,
     name: str = "own",
-    report: Report = silent,
+    data_dir: str | Path | None = None,
+    progress: bool | Report = True,
     **options: Any,
 ) -> SensorResults:
-    """Train an automaton on `images`, uint8 (n, height, width), of `labels` (n,), and judge it on every fifth image, held out.
+    """Train an automaton on images, and return what it decides on those held out, beside a camera.
 
-    `labels` are numbers into `classes`, or names. `photons` and `illumination` are the budget of a decision (default: an illumination by
-    which a camera detects 10). `out` is the bundle to write, which is not replaced; without it the bundle is in `sensor` alone. With
-    `folds` 2 to 5 so many sensors are trained and judged (default 5 where a class has fewer than 10 held-out images, else 1).
-    `report(words, part done)` is called as it goes on; `options` are other fields of `AutomatonOptions`. UsageError for what does not fit.
+    `images` are uint8 (n, height, width) of `labels` (n,), numbers into `classes` or names: every fifth image is held out. Or `images` is
+    all of it: the name of a task (`pans data list`; `data_dir` as there), a folder of class folders with photos, or a .npz file.
+    `photons` and `illumination` are the budget of a decision (default: chosen from the images). `out` is the
+    bundle to write, which is not replaced; without it the bundle is in `sensor` alone. With `folds` 2 to 5 so many sensors are trained
+    and judged (default 5 where a class has fewer than 10 held-out images, else 1). `progress` displays a bar on a terminal or in a
+    notebook; a function is called with words and the part that is done. `options` are other fields of `AutomatonOptions`. UsageError
+    for what does not fit. Fixed patterns are `pans.PansClassifier`'s.
+
+    >>> import numpy as np
+    >>> images = np.zeros((60, 4, 4), np.uint8)
+    >>> images[::2, :, :2] = images[1::2, :, 2:] = 255
+    >>> found = train_own(images, ["left", "right"] * 30, exposures=6, states=4, epochs=1, folds=1, progress=False)
+    >>> found.classes, found.accuracy > 0.8, found.sensor.n_features
+    (('left', 'right'), True, 6)
     """
     started = time.perf_counter()
-    task = _task_of(np.asarray(images), np.asarray(labels), classes, name)
+    task = _task_of(images, labels, classes, name, data_dir)
     device = load_profile(profile) if isinstance(profile, str) else profile
-    chosen = prepared(task, "automaton", seed=seed, equal=equal_classes)
-    recipe = chosen.recipe
-    if photons is None and illumination is None and not {"clicks", "dose_cap"} & options.keys():
-        photons, illumination = recipe.photons, recipe.illumination
-    sizes = {name: getattr(recipe, name) for name in ("exposures", "states", "batch", "epochs", "first_price")}
-    with as_usage_error():
-        asked = AutomatonOptions(
-            **{"copies": 0, "soft": 0.0, "optics": stated_tolerance(device), **sizes, **options},
-            photons=photons,
-            illumination=illumination,
-            seed=seed,
-        )
-        number = folds_needed(task) if folds is None else int(FOLDS.checked(folds, "folds"))
-        trained = train_automaton(
-            chosen.task, device, asked, held_back=chosen.task.kept, report=_reporting("training", report)
-        )
-        facts = chosen.facts | {"options": asdict(trained.options)}
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(out) if out is not None else Path(folder) / f"{name}.pans"
-            exported = export_automaton(path, trained, task, device, name=path.stem, provenance=facts)
-        parts = [judged(exported.bundle, chosen.task, device, seed, report)]
-        parts += other_folds(task, device, trained.options, number, equal=equal_classes, report=report)
+    shown = work_bar() if progress is True else nullcontext(progress or silent)
+    with shown as report:
+        own, equal = task.split_here, equal_classes and task.split_here
+        chosen = prepared(task, "automaton", seed=seed, equal=equal, vary=own)
+        recipe = chosen.recipe
+        if photons is None and illumination is None and not {"clicks", "dose_cap"} & options.keys():
+            photons, illumination = recipe.photons, recipe.illumination
+        sizes = {one: getattr(recipe, one) for one in ("exposures", "states", "batch", "epochs", "first_price")}
+        with as_usage_error():
+            asked = AutomatonOptions(
+                **{"copies": 0, "soft": 0.0, "optics": stated_tolerance(device), **sizes, **options},
+                photons=photons,
+                illumination=illumination,
+                seed=seed,
+            )
+            number = folds_needed(task) if folds is None else int(FOLDS.checked(folds, "folds"))
+            trained = train_automaton(
+                chosen.task, device, asked, held_back=chosen.task.kept, report=_reporting("training", report)
+            )
+            facts = chosen.facts | {"options": asdict(trained.options)}
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(out) if out is not None else Path(folder) / f"{name}.pans"
+                exported = export_automaton(path, trained, task, device, name=path.stem, provenance=facts)
+            parts = [judged(exported.bundle, chosen.task, device, seed, report)]
+            parts += other_folds(task, device, trained.options, number, equal=equal, report=report)
     return results_of(
         parts,
         task.classes,
@@ -170,11 +186,25 @@ def train_own(
     )
 
 
-def _task_of(images: NDArray[Any], labels: NDArray[Any], classes: Sequence[str] | None, name: str) -> Task:
-    if images.dtype != np.uint8 or images.ndim != 3 or labels.shape != images.shape[:1]:
-        what = f"images are {images.dtype} {images.shape}, labels {labels.shape}, allowed: uint8 (n, height, width) and (n,)"
+def _task_of(
+    images: ArrayLike | str | Path,
+    labels: ArrayLike | None,
+    classes: Sequence[str] | None,
+    name: str,
+    data_dir: str | Path | None,
+) -> Task:
+    if isinstance(images, str | Path):
+        if labels is not None or classes is not None:
+            what = f"labels and classes belong to arrays, {str(images)!r} has its own"
+            raise UsageError(what, remedy="leave them out")
+        return load_task(str(images), data_dir)
+    found, given = np.asarray(images), np.asarray(labels)
+    if found.dtype != np.uint8 or found.ndim != 3 or given.shape != found.shape[:1]:
+        what = (
+            f"images are {found.dtype} {found.shape}, labels {given.shape}, allowed: uint8 (n, height, width) and (n,)"
+        )
         raise UsageError(what, remedy="scale grey values to 0 to 255, one channel")
     if classes is None:
-        found, labels = np.unique(labels, return_inverse=True)
-        classes = [str(one) for one in found]
-    return own_task(name, tuple(classes), Objects(images, labels.astype(np.int64)))
+        named, given = np.unique(given, return_inverse=True)
+        classes = [str(one) for one in named]
+    return own_task(name, tuple(classes), Objects(found, given.astype(np.int64)))

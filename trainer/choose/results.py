@@ -20,6 +20,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.safe_text import one_line
 from pans.trainer.baselines.common import Trials
+from pans.trainer.figures import Result
 from pans.trainer.tasks.registry import Objects, Task
 
 PAIRS = 6  # of confused classes that are named and shown
@@ -32,7 +33,7 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class CameraResults:
+class CameraResults(Result):
     """An ideal camera, decided on by the exact posterior, on the same images; gains are the sensor's figure minus the camera's.
 
     Shares from 0 to 1; `_se` are standard errors over the images, those of gains paired: image by image.
@@ -52,7 +53,7 @@ class CameraResults:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorResults:
+class SensorResults(Result):
     """What a trained sensor decides on held-out images; shares from 0 to 1, `_se` standard errors over the images.
 
     `confusion` float64 (classes, classes) counts held-out images by true class (row) and decided class, in expectation.
@@ -93,6 +94,19 @@ class SensorResults:
         plain["recall_interval"] = {name: list(ends) for name, ends in self.recall_interval.items()}
         plain |= {"classes": list(self.classes), "confusion": self.confusion.tolist(), "confused": self.confused()}
         return plain | {"bundle": None if self.bundle is None else str(self.bundle)}
+
+    def rows(self) -> dict[str, dict[str, Any]]:
+        """Return the figures of the sensor and of the cameras, by their names; shares are from 0 to 1."""
+        cameras = {
+            "camera at equal photons": self.camera_at_equal_photons,
+            "camera at equal illumination": self.camera_at_equal_illumination,
+        }
+        found = {"sensor": self, **{name: camera for name, camera in cameras.items() if camera is not None}}
+        names = [f"{name}{error}" for name in ("accuracy", "balanced_accuracy") for error in ("", "_se")]
+        return {
+            row: {name: getattr(one, name) for name in (*names, "clicks", "photons", "illumination")}
+            for row, one in found.items()
+        }
 
     def confused(self) -> list[dict[str, Any]]:
         """Return the pairs of classes that are confused most: `true`, `decided`, and the `share` of the images of `true`."""

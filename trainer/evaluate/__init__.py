@@ -8,5 +8,6 @@ from pans.trainer.options import Conditions
 
 from .accuracy import Light, Measured, MeasuredPictures, light_of
 from .held_out import evaluate, measure
+from .walks import MeasuredWalks
 
-__all__ = ["Conditions", "Light", "Measured", "MeasuredPictures", "evaluate", "light_of", "measure"]
+__all__ = ["Conditions", "Light", "Measured", "MeasuredPictures", "MeasuredWalks", "evaluate", "light_of", "measure"]

@@ -32,6 +32,7 @@ from pans.runtime.instrument.click_law import (
     object_transmission,
 )
 from pans.runtime.instrument.profile import Profile
+from pans.trainer.figures import Result
 from pans.trainer.model.exposure import exposure_us_of
 from pans.trainer.options import Conditions
 
@@ -381,7 +382,7 @@ def evaluate_sampled(
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuredPictures:
+class MeasuredPictures(Result):
     """Means per picture returned. `ssim_std` is the spread over trials, `ssim_se_objects` the error from having few objects."""
 
     ssim_mean: float

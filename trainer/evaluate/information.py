@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
+from pans.trainer.figures import Result
 
 from .readings import outcome_probabilities
 
@@ -32,7 +33,7 @@ I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Conveyed:
+class Conveyed(Result):
     """Bits of the class that the posterior of a decision conveys, and that per unit of light, with standard errors from the objects.
 
     None without a posterior, or without light.

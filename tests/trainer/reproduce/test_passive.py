@@ -15,7 +15,6 @@ from pans.trainer.options import Options
 from pans.trainer.reproduce import passive
 from pans.trainer.reproduce.page import Asked, page_of, write_page
 from pans.trainer.reproduce.printed import PASSIVE, recipe
-from pans.trainer.tasks import mmf as task_mmf
 from pans.trainer.tasks.registry import Objects, Task, draw_task
 from pans.trainer.train import exact_search
 from pans.trainer.train.data import TrainingData
@@ -96,7 +95,7 @@ def test_a_table_of_pictures_shows_speckle_and_asks_for_the_digit(monkeypatch):
     passive.load.cache_clear()
     data = TrainingData(shown, load_profile("ideal"), Options(features=4, encoder="coherent"))
     assert data.target.numpy() == pytest.approx(images.reshape(5, -1) / 255, abs=1e-6)
-    wanted = task_mmf.release_intensity(images).reshape(5, -1)
+    wanted = passive.release_intensity(images).reshape(5, -1)
     assert data.shown.numpy() == pytest.approx(wanted, abs=0.51 / 255)
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from pans.runtime.bundle.optics import phase_mask, scatter
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
+from pans.trainer.reproduce.passive import release_intensity
 from pans.trainer.tasks import registry as tasks
-from pans.trainer.tasks.mmf import release_intensity
 from pans.trainer.tasks.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
 from pans.trainer.tasks.registry import FIBRE_TASKS, fold_tasks, load_task, path_from, remembered_task, task_names
 

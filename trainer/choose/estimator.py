@@ -23,18 +23,18 @@ from sklearn.utils.validation import check_is_fitted, check_non_negative, valida
 from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.evaluate.accuracy import Measured, light_of
+from pans.trainer.evaluate.held_out import HeldOut, as_trained, measure, trials_needed
+from pans.trainer.evaluate.walks import MeasuredWalks, leaf_chances
+from pans.trainer.export.automaton import export_automaton
+from pans.trainer.export.writer import export_trained
+from pans.trainer.options import EXACT_FEATURES_MAX, AutomatonOptions, Options, stated_tolerance
+from pans.trainer.tasks.changes import Variation
+from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.train.loop import train
 
-from .adaptive.train import train_automaton
-from .choose.recipe import choose_encoder, choose_training
-from .evaluate.accuracy import Measured, light_of
-from .evaluate.held_out import HeldOut, measure, trials_needed
-from .evaluate.walks import MeasuredWalks, leaf_chances
-from .export.automaton import export_automaton
-from .export.writer import export_trained
-from .options import EXACT_FEATURES_MAX, AutomatonOptions, Options
-from .tasks.changes import Variation
-from .tasks.registry import Objects, Task
-from .train.loop import train
+from .recipe import choose_encoder, choose_training
 
 AUTOMATON = "automaton"
 LARGEST = "largest"  # of `scale`
@@ -134,7 +134,9 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         objects = self._asked(X)
         if self.bundle_.automaton is not None:
             return self._at_leaves(objects.images)
-        light = light_of(self.bundle_, self.profile_, objects.images)
+        how = as_trained(self.bundle_)
+        optics: dict[str, Any] = {"imaging": how.imaging_on(self.profile_), "bleaching": how.bleaching}
+        light = light_of(self.bundle_, self.profile_, objects.images, **optics)
         draws = enumerate(self._draws(objects.images))
         counts = np.concatenate([light.counts(self.shots, draw, slice(at, at + 1)) for at, draw in draws])
         scores = make_decider(self.bundle_, shots=self.shots).scores_batch(counts, self.shots).astype(np.float64)
@@ -158,7 +160,8 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
             raise ValueError(f"y {wanted.shape} holds other classes than {self.classes_}, or not one for each image")
         task = Task("arrays", self.bundle_.classes, objects, Objects(objects.images, labels), "", "")
         held_out = HeldOut(task, task.test, self.profile_)
-        found = measure(self.bundle_, held_out, shots=self.shots, trials=trials_needed(self.bundle_, self.shots))
+        trials, how = trials_needed(self.bundle_, self.shots), as_trained(self.bundle_)
+        found = measure(self.bundle_, held_out, shots=self.shots, trials=trials, conditions=how)
         assert isinstance(found, Measured | MeasuredWalks), "a classifier returns no pictures"
         return found
 
@@ -215,7 +218,8 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         photons = recipe.photons if self.photons is None and self.illumination is None else self.photons
         given: dict[str, Any] = {"photons": photons, "illumination": self.illumination, "seed": self.seed_}
         given |= {"epochs": self.epochs or recipe.epochs, "batch": recipe.batch}
-        about: dict[str, Any] = {"name": "sensor", "provenance": {}}
+        given["optics"] = stated_tolerance(self.profile_) if encoder in ("active", AUTOMATON) else None
+        about: dict[str, Any] = {"name": "sensor", "provenance": {"options": {}}}
         if encoder == AUTOMATON:
             sizes = {"exposures": self.features or recipe.exposures, "states": recipe.states, "copies": 0, "soft": 0.0}
             wanted = AutomatonOptions(**(given | sizes | dict(self.options or {})))
@@ -243,7 +247,8 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         leaves = np.empty(len(images), np.int64)
         for start in range(0, len(images), AT_ONCE):
             part = slice(start, start + AT_ONCE)
-            upto = leaf_chances(self.bundle_, self.profile_, images[part]).cumsum(axis=1)
+            chances = leaf_chances(self.bundle_, self.profile_, images[part], as_trained(self.bundle_))
+            upto = chances.cumsum(axis=1)
             leaves[part] = (upto < uniform[part, None] * upto[:, -1:]).sum(axis=1)
         return automaton.posteriors[automaton.n_states + leaves].astype(np.float64)
 

@@ -1,0 +1,1 @@
+../../tests/runtime/typed_use.py
