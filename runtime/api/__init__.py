@@ -14,9 +14,10 @@ rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.tra
 
 from __future__ import annotations
 
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime import __version__ as __version__
 from pans.runtime.errors import UsageError, as_usage_error
@@ -164,11 +165,13 @@ def run(
     out: str | Path | None = None,
     shows: bool = False,
     force: bool = False,
+    **more: Any,
 ) -> Outcome:
     """Run `bundle` on the device behind a URL until `decisions` are made or `seconds` have passed; without both, until interrupted.
 
     It is what `pans run` does: `out` is a folder for the recording and a page (None: neither; UsageError if they
-    are there already, unless `force`), `shows` draws the live view on stderr.
+    are there already, unless `force`), `shows` draws the live view on stderr. `more` are other fields of
+    `pans.runtime.live.RunOptions`, such as `dark_slots=4` or `on_dark="abstain"`; UsageError for one that is not there.
     `profile` is by default the one that a `sim:` URL names. The result has `summary` (`accuracy`, `verdict`, ...; `as_json()` is what
     the command prints), `confusion`, and the paths `recording` and `report`. DeviceError and LinkError if the device cannot be armed.
     """
@@ -180,6 +183,9 @@ def run(
     from pans.runtime.instrument.profile import Profile, load_profile
     from pans.runtime.live import RunOptions
 
+    if unknown := more.keys() - {one.name for one in fields(RunOptions)}:
+        what = f"pans.run has no option {', '.join(sorted(unknown))}"
+        raise UsageError(what, remedy="help(pans.runtime.live.RunOptions) lists them")
     loaded = profile if isinstance(profile, Profile) else load_profile(profile or profile_of(device))
     with TemporaryDirectory() as folder:
         path = bundle_path(bundle) if isinstance(bundle, (str, Path)) else _written(bundle, Path(folder))
@@ -194,6 +200,7 @@ def run(
             command="pans.run",
             display=shows,
             force=force,
+            **more,
         )
         return run_once(options, loaded)
 

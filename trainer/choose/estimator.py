@@ -38,6 +38,7 @@ from .recipe import choose_encoder, choose_training
 
 AUTOMATON = "automaton"
 LARGEST = "largest"  # of `scale`
+GROW_EPOCHS = 4  # few images make few steps: 2 were worse on held-back digits
 AT_ONCE = 256  # objects: the chances of all leaves stand in memory
 
 
@@ -222,6 +223,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         about: dict[str, Any] = {"name": "sensor", "provenance": {"options": {}}}
         if encoder == AUTOMATON:
             sizes = {"exposures": self.features or recipe.exposures, "states": recipe.states, "copies": 0, "soft": 0.0}
+            sizes["grow_epochs"] = GROW_EPOCHS
             wanted = AutomatonOptions(**(given | sizes | dict(self.options or {})))
             grown = train_automaton(task, self.profile_, wanted)
             return export_automaton(path, grown, task, self.profile_, **about).bundle
