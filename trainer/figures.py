@@ -13,6 +13,12 @@ from pans.runtime.html_card import html_card
 from pans.runtime.outputs import whole_file
 
 DPI = 90
+_IN_WORDS = (
+    *((name, 100, ".1f") for name in ("accuracy", "balanced_accuracy", "majority_share", "abstained")),
+    *((name, 1, ".3f") for name in ("ssim", "mse", "bits")),
+    *((name, 1, ".2f") for name in ("clicks", "photons", "illumination", "exposures")),
+    ("objects", 1, "d"),
+)
 
 
 class Result:
@@ -36,12 +42,25 @@ class Result:
         return pandas.DataFrame.from_dict(self.rows(), orient="index")
 
     def _repr_html_(self) -> str:
-        cards = (html_card(f"{name} (SIMULATED)", figures) for name, figures in self.rows().items())
-        return "".join(cards)
+        return "".join(html_card(f"{name} (SIMULATED)", _in_words(row)) for name, row in self.rows().items())
 
 
 def _plain(figures: Mapping[str, Any] | None) -> dict[str, Any]:
     return {name: value for name, value in (figures or {}).items() if not isinstance(value, Mapping)}
+
+
+def _in_words(row: Mapping[str, Any]) -> dict[str, str]:
+    """The figures that a person looks for, with their standard errors over the objects: shares in percent, light per decision."""
+    found = {}
+    for name, factor, form in _IN_WORDS:
+        value = row.get(f"{name}_mean", row.get(name))
+        if value is not None:
+            error = row.get(f"{name}_se_objects", row.get(f"{name}_se"))
+            words = f"{factor * value:{form}}" + (f" ± {factor * error:{form}}" if error is not None else "")
+            found[name.replace("_", " ")] = words + (" %" if factor == 100 else "")
+    if "trials" in row:
+        found["decisions"] = f"{row['trials']} per object" if row["trials"] else "exact expectation"
+    return found
 
 
 def use_files_alone() -> None:

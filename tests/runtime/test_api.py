@@ -1,5 +1,6 @@
 """`import pans`: what a notebook needs, with the same figures as the commands give."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -54,10 +55,58 @@ def test_an_automaton_decides_on_words_and_long_words_are_counts() -> None:
     assert len(pans.decide(long, np.zeros((2, 70), int)).labels) == 2
 
 
-def test_without_the_train_extra_evaluate_says_what_to_install() -> None:
-    code = "import sys; sys.modules['pans.trainer.evaluate'] = None; import pans; pans.evaluate"
+@pytest.mark.parametrize(
+    ("missing", "name", "extra"),
+    [
+        ("pans.trainer.evaluate", "evaluate", "train"),
+        ("torch", "train", "train"),
+        ("sklearn", "PansClassifier", "sklearn"),
+    ],
+)
+def test_without_its_extra_a_name_says_what_to_install(missing: str, name: str, extra: str) -> None:
+    code = f"import sys; sys.modules[{missing!r}] = None; import pans; dir(pans); pans.{name}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert "pip install 'pans-runtime[train]'" in done.stderr
+    assert f"pans.{name} needs the package {missing}" in done.stderr
+    assert f"pip install 'pans-runtime[{extra}]'" in done.stderr
+
+
+def test_results_are_tables_in_a_notebook_and_frames_of_pandas(tmp_path: Path) -> None:
+    done = pans.run("fashion10", DEVICE, decisions=20, out=tmp_path, dark_slots=2)
+    assert repr(done).startswith("<Run: PASS, 20 decisions, recording ")
+    assert done.summary.dark["exposures"] == 40
+    with pytest.raises(UsageError, match="no option dark_slits"):
+        pans.run("fashion10", DEVICE, decisions=20, dark_slits=2)
+    recording = pans.load_recording(done.recording or "")
+    again = pans.replay(recording, recording.bundle())
+    assert ("as recorded", "yes") in cells(again._repr_html_())
+    assert "as_recorded=True" in repr(again)
+
+    images = np.zeros((60, 4, 4), np.uint8)
+    images[::2, :, :2] = images[1::2, :, 2:] = 255
+    said: list[float] = []
+    small: dict[str, Any] = {"exposures": 5, "states": 4, "epochs": 1, "folds": 1}
+    results = pans.train(images, ["<b>", "right"] * 30, progress=lambda _, part: said.append(part), **small)
+    assert 0.8 < results.accuracy <= 1.0
+    assert max(said) == 1.0
+    frame = pytest.importorskip("pandas") and results.to_frame()
+    assert frame.loc["sensor", "accuracy"] == results.accuracy
+    camera = results.camera_at_equal_photons
+    assert camera is not None
+    assert frame.loc["camera at equal photons", "photons"] == camera.photons
+    assert ("accuracy", f"{100 * results.accuracy:.1f} ± {100 * results.accuracy_se:.1f} %") in cells(
+        results._repr_html_()
+    )
+    scene = tmp_path / "scene.npz"
+    np.savez(scene, images=images, labels=[0, 1] * 30, classes=results.classes)
+    measured = pans.evaluate(results.sensor, task=str(scene))
+    assert isinstance(measured, pans.MeasuredWalks)
+    assert ("photons", f"{measured.photons_mean:.2f}") in cells(measured._repr_html_())
+    assert measured.to_frame().loc["sensor", "clicks_mean"] == measured.clicks_mean
+
+
+def cells(card: str) -> list[tuple[str, str]]:
+    """The rows of an HTML card: name and value."""
+    return re.findall(r"<tr><th>(.*?)</th><td>(.*?)</td></tr>", card)
 
 
 @pytest.mark.parametrize("clicks", [[0.5], [1.0], ["a"], [None], "abc", {}, [[1, 2], [3]], [[0.5] * 10], [2**70]])

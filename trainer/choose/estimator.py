@@ -20,7 +20,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, check_non_negative, validate_data
 
-from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
+from pans.runtime.bundle.model import Bundle, load_bundle, with_expected, write_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.adaptive.train import train_automaton
@@ -226,7 +226,10 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
             sizes["grow_epochs"] = GROW_EPOCHS
             wanted = AutomatonOptions(**(given | sizes | dict(self.options or {})))
             grown = train_automaton(task, self.profile_, wanted)
-            return export_automaton(path, grown, task, self.profile_, **about).bundle
+            bundle = export_automaton(path, grown, task, self.profile_, **about).bundle
+            expected = {**(bundle.expected or {}), "split": "the training images"}  # none were held out
+            write_bundle(with_expected(bundle, expected), path, force=True)
+            return load_bundle(path)[0]
         features = self.features or recipe.features
         given |= {"features": features, "encoder": encoder, "shots": self.shots, "conserving": encoder != "active"}
         given["estimator"] = "exact" if features <= EXACT_FEATURES_MAX else "local"
