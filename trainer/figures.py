@@ -14,7 +14,7 @@ from pans.runtime.outputs import whole_file
 
 DPI = 90
 _IN_WORDS = (
-    *((name, 100, ".1f") for name in ("accuracy", "balanced_accuracy", "majority_share", "abstained")),
+    *((name, 100, ".1f") for name in ("accuracy", "balanced_accuracy", "majority_share")),
     *((name, 1, ".3f") for name in ("ssim", "mse", "bits")),
     *((name, 1, ".2f") for name in ("clicks", "photons", "illumination", "exposures")),
     ("objects", 1, "d"),

@@ -73,7 +73,7 @@ def test_without_its_extra_a_name_says_what_to_install(missing: str, name: str, 
 def test_results_are_tables_in_a_notebook_and_frames_of_pandas(tmp_path: Path) -> None:
     done = pans.run("fashion10", DEVICE, decisions=20, out=tmp_path, dark_slots=2)
     assert repr(done).startswith("<Run: PASS, 20 decisions, recording ")
-    assert done.summary.dark["exposures"] == 40
+    assert done.summary.dark.exposures == 40
     with pytest.raises(UsageError, match="no option dark_slits"):
         pans.run("fashion10", DEVICE, decisions=20, dark_slits=2)
     recording = pans.load_recording(done.recording or "")

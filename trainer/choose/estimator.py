@@ -45,21 +45,19 @@ AT_ONCE = 256  # objects: the chances of all leaves stand in memory
 class PansClassifier(ClassifierMixin, BaseEstimator):
     """A photon-counting sensor as a scikit-learn classifier: `fit` trains what light to send, `predict` decides on a few clicks.
 
-    Parameters
-    ----------
-    profile : the instrument, a `Profile` or the name or path of one. Default: one without faults.
-    encoder : "automaton" (each pattern follows from the clicks before it), "active" (fixed patterns), or "incoherent" and "coherent" for
-        passive optics. None: an automaton where the profile can show one.
-    features : number of patterns; of an automaton the most exposures of a decision. None: 10, or 32 of an automaton.
-    photons, illumination : what a decision may take on average: photoelectrons detected, and photoelectrons sent (those that a clear pixel
-        would give, summed over pixels and patterns). Without both: 10 photons.
-    epochs : passes over the training images. None: 6 of an automaton, else about 3000 steps.
-    shots : decisions take so many exposures of every pattern (not of an automaton).
-    scale : value in X that stands for full transmission (1); 0 is black. A brighter pixel is a ValueError. "largest": the largest value
-        in the X of `fit`, and a brighter pixel counts as that.
-    image_shape : height and width, where X is flat. None: a square where there is one, else a row.
-    options : further fields of `pans.trainer.options.Options` (of an automaton: `AutomatonOptions`), such as {"states": 64}.
-    random_state : seed of the training and of the clicks, as everywhere in scikit-learn.
+    - `profile`: the instrument, a `Profile` or the name or path of one. Default: one without faults.
+    - `encoder`: "automaton" (each pattern follows from the clicks before it), "active" (fixed patterns), or "incoherent" and "coherent"
+      for passive optics. None: an automaton where the profile can show one.
+    - `features`: number of patterns; of an automaton the most exposures of a decision. None: 10, or 32 of an automaton.
+    - `photons`, `illumination`: what a decision may take on average, photoelectrons detected and photoelectrons sent (those that a clear
+      pixel would give, summed over pixels and patterns). Without both: 10 photons.
+    - `epochs`: passes over the training images. None: 6 of an automaton, else about 3000 steps.
+    - `shots`: exposures of every pattern (not of an automaton).
+    - `scale`: the value in X that stands for full transmission (1); 0 is black. A brighter pixel is a ValueError. "largest": the largest
+      value in the X of `fit`, and a brighter pixel counts as that.
+    - `image_shape`: height and width, where X is flat. None: a square where there is one, else a row.
+    - `options`: further fields of `pans.trainer.options.Options` (of an automaton: `AutomatonOptions`), such as {"states": 64}.
+    - `random_state`: seed of the training and of the clicks, as everywhere in scikit-learn.
 
     `predict` and `predict_proba` draw clicks. A fitted sensor draws the same ones for the same image, so that two calls agree and neither
     the order of the images nor the batch matters. An image that X holds several times has other clicks each time: to see the noise,
