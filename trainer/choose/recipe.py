@@ -68,6 +68,9 @@ FRAMES = 400  # of all left-out images, several of each where they are few
 LOSS_MAX = 4.0  # nats: one photon where no image of the class has light must not outweigh all others
 FLOOR = 5e-3  # least transmission in the posterior
 GAIN_SE = 0.5  # standard errors, over the images, of the mean gain that a change must bring
+MILD = frozenset(
+    ("turn_deg", "shift", "size")
+)  # of which the least is taken unless it clearly costs: else few images are learnt by heart
 STEP_SE = 1.0  # and a larger one beyond a smaller: needless turns cost the sensor 5 points of `shapes`
 
 
@@ -116,9 +119,11 @@ def choose_training(task: Task, variation: Variation, encoder: str, light: Light
     budget = light.photons, float(f"{light.photons / max(task.train.images.mean() / 255, LEAST_GREY):.2g}")
     exposures = max(EXPOSURES, round(EXPOSURES_PER_PHOTON * light.photons))
     batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
-    reasons = [f"{objects} training images from {n}: {variation}; these changes made left-out images more likely"]
+    reasons = [
+        f"{objects} training images from {n}: {variation}; these changes made left-out images more likely, or cost nothing"
+    ]
     if variation == Variation():
-        reasons = [f"{n} training images as they are: no change of them made left-out images more likely"]
+        reasons = [f"{n} training images as they are: every change of them made left-out images less likely"]
     if encoder == "automaton":
         reasons.append(f"{exposures} exposures of at most {STATES} states: more would learn so few images by heart")
         shape = {"exposures": exposures, "states": STATES}
@@ -198,7 +203,8 @@ def choose_variation(task: Task, seed: int = 0) -> Choice:
             changed = replace(best, **{name: size})
             found = judge.losses(changed)
             gain, error = balanced((losses if won is None else won[1]) - found, judge.labels)
-            if gain > (GAIN_SE if won is None else STEP_SE) * error:
+            mild = name in MILD and size == sizes[0]
+            if gain > (-GAIN_SE if mild else GAIN_SE if won is None else STEP_SE) * error:
                 won = changed, found
         if won is not None:
             best, losses = won

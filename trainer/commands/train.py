@@ -166,8 +166,9 @@ def _check_files(args: argparse.Namespace, checkpoint: Path, own: bool) -> None:
     if checkpoint.exists() and not (args.resume or args.force):
         what = f"{checkpoint}: is here, of a training that was interrupted"
         raise UsageError(what, remedy="continue it by --resume, or replace it with --force")
-    sheets = sheets_of(args) if own else []
-    check_outputs([args.out, *sheets], inputs=inputs, force=args.force)
+    check_outputs([args.out], inputs=inputs, force=args.force)
+    if own:  # what a training that was interrupted has written already
+        check_outputs(sheets_of(args), inputs=inputs, force=args.force or args.resume)
     check_outputs([checkpoint], inputs=[*inputs, args.out], force=True)
     if args.history is not None:
         outputs = [args.history / name for name in HISTORY_FILES]

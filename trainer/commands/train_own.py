@@ -80,7 +80,7 @@ def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Prepared:
     for line in [f"{task.name}:", *task.account.lines()] if task.account else ():
         say(line)
     say(f"{task.name}: {len(task.train)} images to train on, {len(task.test)} held out, {len(task.classes)} classes")
-    write_file(sheets_of(args)[0], seen_sheet(task), force=args.force)
+    write_file(sheets_of(args)[0], seen_sheet(task), force=args.force or args.resume)
     say(f"what the sensor will see: {sheets_of(args)[0]}")
     vary = not any(getattr(args, name) for name in CHANGES)
     encoder = args.encoder or "active"
