@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pans.runtime.instrument.profile import Profile
     from pans.trainer.choose.own import Prepared
     from pans.trainer.choose.recipe import Recipe
+    from pans.trainer.choose.results import SensorResults
     from pans.trainer.options import AutomatonOptions
     from pans.trainer.tasks.registry import Task
 
@@ -29,6 +30,7 @@ SIZES = ("exposures", "states")  # which a training that starts from an automato
 CHANGES = ("copies", "shift_px", "offset_px")  # a user who asks for one of these has chosen how images are varied
 BUDGET_OFF = 0.05  # relative: more is said at the end
 RUN_DECISIONS = 1000
+CLEAR_SE = 2.0  # standard errors that tell a sensor from a camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +153,7 @@ def finish(
     results = results_of(parts, task.classes, seconds=seconds, bundle=args.out, sha256=done.sha256)
     if args.encoder != AUTOMATON:  # whose own words tell it
         warn_of_budget(args, results.clicks, results.photons, results.illumination)
+    warn_of_camera(results)
     lines, picture = [*results.lines(), *done.words], confused_sheet(results)
     if picture is not None:
         write_file(sheets_of(args)[1], picture, force=args.force)
@@ -158,6 +161,18 @@ def finish(
     account = {"read": task.account.as_json()} if task.account else {}
     cameras = {name: equal_light_figures(one) for name, one in zip(CAMERAS, parts[0].cameras) if one is not None}
     return {"results": results.as_json(), **account, **cameras}, [*lines, next_commands(args, profile.name)]
+
+
+def warn_of_camera(results: SensorResults) -> None:
+    """Warn where the sensor is not better than a camera with as much light."""
+    cameras = {"photons": results.camera_at_equal_photons, "illumination": results.camera_at_equal_illumination}
+    for name, camera in cameras.items():
+        if camera is not None and camera.balanced_accuracy_gain <= CLEAR_SE * camera.balanced_accuracy_gain_se:
+            gain = f"{100 * camera.balanced_accuracy_gain:+.1f} ± {100 * camera.balanced_accuracy_gain_se:.1f} points"
+            warn(
+                f"the sensor is not better than an ideal camera at equal {name} ({gain} of balanced accuracy). Objects that differ little "
+                "before a bright ground tell a camera as much: try darker ground, more contrast, or less light"
+            )
 
 
 def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float, illumination: float) -> None:
