@@ -85,7 +85,7 @@ def test_arrays_are_trained_on_and_every_image_is_judged_once(few, tmp_path):
         task.train.images,
         labels,
         out=tmp_path / "s.pans",
-        report=lambda words, part: told.append((words, part)),
+        progress=lambda words, part: told.append((words, part)),
         **QUICK,
     )
     assert found.folds == 5
