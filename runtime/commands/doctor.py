@@ -29,7 +29,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
 from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import UsageError
 from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
-from pans.runtime.timing.realtime import FIFO_PRIORITY, GRANTED, first_line, isolated_cores
+from pans.runtime.timing.realtime import FIFO_PRIORITY, GRANTED, first_line, isolated_cores, lacking
 
 if TYPE_CHECKING:
     from pans.runtime.timing.rehearsal import Rehearsal
@@ -44,14 +44,6 @@ HELPS, HARMS = 0.9, 1.1  # ratio of quantiles, besides every round
 AWAY_MS_PER_S, AWAY_US = 1.0, 200.0  # a fifth of the shortest deadline (1 ms)
 OPEN_FILES = 15  # the port, the recording, the log and what Python and the loop have open; measured
 RECORDED = (("fashion-adaptive", "dmd-spad"), ("fashion10", "oled-qcmos"))
-NEEDED_OF_SYSTEM: Mapping[str, Callable[[], bool]] = {
-    "real-time priority (SCHED_FIFO)": lambda: hasattr(os, "sched_setscheduler"),
-    "locked memory (mlockall)": lambda: sys.platform == "linux",
-    "binding to a core (--core)": lambda: hasattr(os, "sched_setaffinity"),
-    "page faults by thread": lambda: sys.platform == "linux",
-    "pseudo-terminals": lambda: hasattr(os, "openpty"),
-    "systemd (pans service)": lambda: sys.platform == "linux",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +288,7 @@ def disk_mib_per_hour(bundle_name: str, profile_name: str) -> float:
 
 def check_system() -> Iterator[Finding]:
     """What this system does not have, named at once."""
-    missing = [what for what, is_there in NEEDED_OF_SYSTEM.items() if not is_there()]
+    missing = lacking()
     found = f"{sys.platform}: tried on Linux only" if sys.platform != "linux" else "linux"
     found += f"; not here: {', '.join(missing)}" if missing else ""
     remedy = "runs do without, and deadlines of milliseconds are then not kept reliably: docs/how-to/real-time.md"

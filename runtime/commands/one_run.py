@@ -29,7 +29,7 @@ from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import DISK_NEARLY_FULL, INTERRUPTED, RECORDING_DELETED, REFUSED, Stop, stop_signals
 from pans.runtime.live.run_options import FLOW, RunOptions
-from pans.runtime.timing.realtime import check_core
+from pans.runtime.timing.realtime import check_core, lacking
 
 from .run_files import check_run_files, claimed, gone_if_refused, part_limits, recording_header, what_was_run
 
@@ -355,6 +355,8 @@ class _Run:
                 welcome = run.connection.session.welcome
                 if welcome is not None and (words := scene_words(welcome.facts, options.device)):
                     say(f"pans: {words}")
+                if not link.virtual and (missing := lacking()):
+                    say(f"pans: {sys.platform} has no {', no '.join(missing)}; decisions that are late are counted")
                 seen.prepared(run)
                 monitor.prepared(run)
                 if besides is not None and besides.prepared is not None:

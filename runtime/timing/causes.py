@@ -396,7 +396,7 @@ class Counters:
                 os.close(self._files.pop())
 
     def _watch(self) -> None:
-        if (priority := os.sched_getparam(0).sched_priority) > 1:
+        if hasattr(os, "sched_getparam") and (priority := os.sched_getparam(0).sched_priority) > 1:
             with suppress(OSError):  # a reading in time is worth little against a run
                 os.sched_setscheduler(0, os.sched_getscheduler(0), os.sched_param(priority - 1))
         while not self._stop.wait(READ_EVERY_S):

@@ -35,6 +35,20 @@ PAGE_BYTES = 4096
 SMALL_BYTES, PIN_EVERY_BYTES = 400, 128 << 10  # pymalloc: objects to 512 bytes, in arenas of 256 KiB or 1 MiB
 COUNTED = {"minor": "ru_minflt", "major": "ru_majflt", "involuntary_switches": "ru_nivcsw"}
 
+OF_SYSTEM: Mapping[str, Callable[[], bool]] = {
+    "real-time priority (SCHED_FIFO)": lambda: hasattr(os, "sched_setscheduler"),
+    "locked memory (mlockall)": lambda: sys.platform == "linux",
+    "binding to a core (--core)": lambda: hasattr(os, "sched_setaffinity"),
+    "page faults by thread": lambda: sys.platform == "linux",
+    "pseudo-terminals": lambda: hasattr(os, "openpty"),
+    "systemd (pans service)": lambda: sys.platform == "linux",
+}
+
+
+def lacking() -> list[str]:
+    """Return what this system does not have of what runs, ports and services use where they can."""
+    return [what for what, is_there in OF_SYSTEM.items() if not is_there()]
+
 
 @contextmanager
 def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[dict[str, Any]]:

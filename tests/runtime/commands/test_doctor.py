@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -109,3 +111,56 @@ def test_a_run_writes_its_trace(tmp_path: Path, pans: Pans) -> None:
     assert sum(len(bytes.fromhex(line[2])) for line in received) == summary["link"]["bytes_in"]
     times = [float(line[0]) for line in sent]
     assert times == sorted(times)
+
+
+MAC = """
+import os, resource, select, sys
+import numba, onnxruntime, serial.tools.list_ports, usb.core  # which look at the system themselves
+import pans.runtime.kernel.receive
+sys.platform = "darwin"
+of_linux = {os: ("sched_", "SCHED_", "eventfd", "memfd", "posix_f"), select: ("epoll",), resource: ("RUSAGE_TH",)}
+for module, start in of_linux.items():
+    for name in [name for name in vars(module) if name.startswith(start) and name != "sched_yield"]:
+        delattr(module, name)
+from pans.runtime.cli import main
+code = main(sys.argv[1:])
+sys.stdout.flush()
+os._exit(code)
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (
+            ["doctor"],
+            0,
+            "not here: real-time priority (SCHED_FIFO), locked memory (mlockall), binding to a core (--core)",
+        ),
+        (["demo", "--realtime", "--seconds", "0.3", "--deadline-us", "1e8"], 0, "darwin has no real-time priority"),
+        (["simulate", "--profile", "dmd-spad", "--core", "0"], 2, "this system cannot pin threads to cores"),
+    ],
+)
+def test_what_is_of_linux_only_is_named_at_once(words: list[str], code: int, said: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", MAC, *words], capture_output=True, text=True, cwd=tmp_path, timeout=300
+    )
+    assert said in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.returncode == code
+
+
+def test_the_disk_that_a_recording_takes_is_that_of_a_run(tmp_path: Path, pans: Pans) -> None:
+    words = (
+        "--device",
+        "sim:oled-qcmos?pace=fast&seed=1",
+        "--decisions",
+        "400",
+        "--out",
+        tmp_path / "run",
+        "--no-realtime",
+    )
+    summary = pans("run", "fashion10", *words)
+    recording = (tmp_path / "run" / "run.pansrec").stat().st_size - (SHIPPED / "fashion10.pans").stat().st_size
+    hours = summary["decisions"] * 11 * 16_666.7e-6 / 3600
+    assert doctor.disk_mib_per_hour("fashion10", "oled-qcmos") == pytest.approx(recording / 2**20 / hours, rel=0.5)
