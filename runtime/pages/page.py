@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import re
+import tomllib
 from collections.abc import Iterator, Mapping
 from functools import cache
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -66,3 +68,42 @@ def picture(values: NDArray[np.float64], low: float = 0.0, high: float | None = 
     step, top = -(-max(values.shape) // SIDE_MAX), float(values.max()) if high is None else high
     share = np.clip((values[::step, ::step] - low) / ((top - low) or 1.0), 0.0, 1.0)
     return f"data:image/png;base64,{base64.b64encode(grey_png(np.rint(255 * share).astype(np.uint8))).decode()}"
+
+
+# ---- words of events and faults ----
+
+
+@cache
+def words() -> dict[str, Any]:
+    """Return templates/words.toml; the kinds of events stand in docs/reference/formats.md."""
+    return tomllib.loads(files(__package__).joinpath("templates/words.toml").read_text(encoding="utf-8"))
+
+
+def sentence_of(event: Mapping[str, Any]) -> str:
+    """Return an event as one sentence; of an unknown kind, or with facts missing, its facts in a row.
+
+    >>> sentence_of({"kind": "reconnected", "attempts": 2, "outage_ms": 812.345})
+    'The device was found again after 812 ms (2 attempts).'
+    """
+    kind = str(event.get("kind", "?"))
+    if kind == "blame":
+        return _blame(event)
+    try:
+        said = words()["sentences"][kind].format_map({key: _plain(value) for key, value in event.items()})
+        return said.replace("..", ".").strip()
+    except (KeyError, IndexError, ValueError):
+        facts = ", ".join(f"{key} {_plain(value)}" for key, value in event.items() if key != "kind")
+        return f"{kind.replace('_', ' ')}{': ' if facts else ''}{facts}"
+
+
+def _blame(event: Mapping[str, Any]) -> str:
+    late = event.get("what") == "late"
+    what = f"{event.get('decisions', 1)} late decisions" if late else f"{event.get('exposures', 0)} missing exposures"
+    sure = "" if event.get("sure", True) else ", not surely"
+    return f"The cause of {what} is {event.get('cause', 'unknown')}{sure}: {event.get('why', '')}."
+
+
+def _plain(value: Any) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -28,8 +28,7 @@ from pans.runtime.report.words import exposure_words, figure_rows, flow_rows, me
 
 from .bundle import optics
 from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, whole
-from .events import sentence_of
-from .page import points, render
+from .page import points, render, sentence_of, words
 from .rates import BINS, Rates, Stretches
 from .timing import Clock, Durations, latency_chart
 from .walks import Walks
@@ -38,24 +37,6 @@ CONFUSION_MAX = 40  # classes
 ACCURACY_BINS, OBJECTS_PER_BIN = 60, 20
 SHOWN, OF_A_KIND = 200, 30  # events
 F64 = NDArray[np.float64]
-# words of a fault (report/summary.py) -> what to do about it; the first that fits
-ADVICE = (
-    ("decisions later than", "“Late and missing work” names the cause; `pans doctor` checks the machine."),
-    ("exposures lost", "Check the cable, the hub and the device's buffer; “Late and missing work” names the cause."),
-    ("messages lost", "Check the cable: only marks of objects were lost, no clicks."),
-    ("lost and found again", "Check cable, power and hub. Decisions during an outage are missing."),
-    ("was lost", "Check cable, power and hub; `pans devices` shows whether the device is there."),
-    ("contradict the evidence", "Messages do not fit the plan or each other: check the device's firmware (`pans conform`) and the link."),
-    ("another pattern than planned", "Check the trigger between projector and detector: a pattern was skipped or shown twice."),
-    ("named their state too late", "Let the device choose the pattern (`--drive device`), or give the loop a core of its own (`--core`)."),
-    ("exposure_tolerance_us", "Begin and end exposures by a hardware timer of the device, not in its main loop."),
-    ("decisions abstained", "The flags in the decision log say why; “Events” below has the moments."),
-    ("decisions were made", "The run ended early; run it again for the rest."),
-    ("the calibration contradicts", "Calibrate again with `pans calibrate`: the dark counts are not those of the calibration."),
-    ("dark", "Look for stray light, check the detector's temperature, then calibrate again (`pans calibrate`)."),
-    ("channel", "A channel is dead or disconnected: check its supply and cable."),
-    ("pulses were not made", "The pulse was asked for too late: raise `--gate-delay-us`, or check the actuator."),
-)  # fmt: skip
 
 
 class Reading:
@@ -271,7 +252,7 @@ def run_page(recording: Recording) -> bytes:
 
 def advice_on(fault: str) -> str:
     """Return what to do about a fault, "" where nothing is known."""
-    return next((advice for words, advice in ADVICE if words in fault), "")
+    return next((one["text"] for one in words()["advice"] if one["words"] in fault), "")
 
 
 def mistakes(counts: NDArray[np.int64], bundle: Bundle | None) -> list[str]:

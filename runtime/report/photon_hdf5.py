@@ -13,6 +13,9 @@ from __future__ import annotations
 import importlib
 import io
 import time
+import tomllib
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +57,11 @@ def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: Clic
     write_file(path, image.getbuffer(), force=force)
 
 
+@cache
+def _titles() -> dict[str, str]:
+    return tomllib.loads(files(__package__).joinpath("photon_hdf5.toml").read_text(encoding="utf-8"))
+
+
 def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
     """Text as bytes, and a title on every node: what readers of the format expect."""
     for name, value in tree.items():
@@ -67,7 +75,7 @@ def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
             if isinstance(value, str):  # so that PyTables, with which readers are written, reads bytes and not an array
                 for key, said in (("CLASS", "ARRAY"), ("VERSION", "2.4"), ("FLAVOR", "python")):
                     node.attrs[key] = np.bytes_(said)
-        node.attrs["TITLE"] = np.bytes_(_TITLES.get(where, name.replace("_", " ")).encode())
+        node.attrs["TITLE"] = np.bytes_(_titles().get(where, name.replace("_", " ")).encode())
 
 
 def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
@@ -132,86 +140,6 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
             }
         },
     }
-
-
-_ORIGIN = {  # of a file and of the one that it was made from
-    "software": "Software used to save the original data file.",
-    "software_version": "Version of the software used to save the original data file.",
-    "creation_time": "Creation time of the original data file.",
-    "filename": "File name of the original data file before conversion to Photon-HDF5.",
-    "filename_full": "File name (with full path) of the original data file before conversion to Photon-HDF5.",
-}
-_IDENTITY = {
-    "author": "Author of the current data file.",
-    "author_affiliation": "Company or institution the author is affiliated with.",
-    "creator": "Creator of the current Photon-HDF5 file.",
-    "creator_affiliation": "Company or institution the creator is affiliated with.",
-    "filename": "Original file name of the current Photon-HDF5 file (i.e. file name at creation time).",
-    "filename_full": (
-        "Original file name (with full path) of the current Photon-HDF5 file (i.e. full file name at creation time)."
-    ),
-    "creation_time": "Creation time of the current Photon-HDF5 file.",
-    "software": "Name of the software used to create the current Photon-HDF5 file.",
-    "software_version": "Version of the software used to create current the Photon-HDF5 file.",
-    "format_name": "Name of the file format.",
-    "format_version": "Version for the Photon-HDF5 format.",
-    "format_url": "Official URL for the Photon-HDF5 format.",
-}
-_SETUP = {
-    "num_pixels": "Total number of detector pixels.",
-    "num_spots": 'Number of excitation (or detection) "spots" in the sample.',
-    "num_spectral_ch": "Number of distinct spectral bands which are acquired.",
-    "num_polarization_ch": "Number of distinct polarization states which are acquired.",
-    "num_split_ch": (
-        "Number of distinct detection channels detecting the same spectral band and polarization. "
-        "This value is > 1 when using a non-polarizing beam splitter."
-    ),
-    "modulated_excitation": (
-        "True (i.e. 1) if there is any form of excitation modulation of excitation wavelength (as in us-ALEX or PAX) or "
-        "polarization. This field is also True for pulse-interleaved excitation (PIE) or ns-ALEX measurements."
-    ),
-    "lifetime": (
-        "True (i.e. 1) if the measurement includes a nanotimes array of photon arrival times with respect to a laser "
-        "pulse (as in TCSPC measurements)."
-    ),
-    "excitation_alternated": (
-        "New in version 0.5. Indicates whether each excitation source is alternated (True, or 1) or not alternated (False, or 0)."
-    ),
-    "excitation_cw": (
-        "For each excitation source, this field indicates whether excitation is continuous wave (CW), True (i.e. 1), "
-        "or pulsed, False (i.e. 0)."
-    ),
-    "excitation_wavelengths": (
-        "List of excitation wavelengths (center wavelength if broad-band) in increasing order (unit: meter)."
-    ),
-    "detection_wavelengths": "Reference wavelengths (units: meter) for each detected spectral band.",
-}
-# The format's own words, to the letter (photon-hdf5.org, version 0.5); below /user ours.
-_TITLES = {
-    "/format_name": _IDENTITY["format_name"],
-    "/format_version": _IDENTITY["format_version"],
-    "/acquisition_duration": "Measurement duration in seconds.",
-    "/description": "A user-defined comment describing the data file.",
-    "/photon_data": "Group containing arrays of photon-data.",
-    "/photon_data/timestamps": (
-        "Array of photon timestamps. Units specified in timestamps_units (defined in timestamps_specs/)."
-    ),
-    "/photon_data/timestamps_specs": "Specifications for timestamps.",
-    "/photon_data/timestamps_specs/timestamps_unit": "Value of 1-unit timestamp-increment in seconds.",
-    "/photon_data/detectors": "Array of pixel IDs for each timestamp.",
-    "/photon_data/measurement_specs": ("Metadata necessary for interpretation of the particular type of measurement."),
-    "/photon_data/measurement_specs/measurement_type": "Name of the measurement the data represents.",
-    "/photon_data/measurement_specs/detectors_specs": "Mapping between the pixel IDs and the detection channels.",
-    "/setup": "Information about the experimental setup.",
-    "/identity": "Information about the Photon-HDF5 data file.",
-    "/provenance": "Information about the original data file.",
-    **{f"/setup/{name}": title for name, title in _SETUP.items()},
-    **{f"/identity/{name}": title for name, title in _IDENTITY.items()},
-    **{f"/provenance/{name}": title for name, title in _ORIGIN.items()},
-    "/user/pans/pattern": "Pattern that was shown during the exposure of each click; 65535: dark slot.",
-    "/user/pans/object": "Object that stood before the detector at each click; 4294967295: not known.",
-    "/user/pans/classes": "Names of the classes, in the order of the labels in decisions.",
-}
 
 
 def _identity(path: Path) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from pans.runtime.cli import main
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.pages.charts import POINTS_MAX, Axis, Curve, chart
-from pans.runtime.pages.events import sentence_of
 from pans.runtime.pages.index import accuracy_over
+from pans.runtime.pages.page import sentence_of
 from pans.runtime.pages.rates import BINS, SET_MAX, Rates, Stretches
 from pans.runtime.pages.run import Decisions
 from pans.runtime.pages.timing import CLOCK_MAX, Clock, Durations, survival
