@@ -175,7 +175,9 @@ def check_together(options: RunOptions) -> None:
     _check_address(options.serve, options.serve_public, "--serve")
     if options.serve_control and (options.serve_public or not options.serve):
         what = "has no effect without --serve" if not options.serve else "and --serve-public: there is no password"
-        remedy = "add --serve HOST:PORT, or leave it out" if not options.serve else "use a tunnel (docs/how-to/live-view.md)"
+        remedy = (
+            "add --serve HOST:PORT, or leave it out" if not options.serve else "use a tunnel (docs/how-to/live-view.md)"
+        )
         raise UsageError(f"--serve-control {what}", remedy=remedy)
     _check_address(options.metrics, options.metrics_public, "--metrics")
 

@@ -85,7 +85,7 @@ BLUE, ORANGE, GREEN, RED, GREY = (
     "#7d8289",
 )  # 3:1 on the white and the dark ground
 STYLES = ((BLUE, "solid"), (ORANGE, "dashed"))  # of the lines of a figure
-LIMITS = ("chance", "deadline", "stated")  # drawn dotted
+LIMITS = ("chance", "deadline", "stated", "expected_high")  # drawn dotted
 LEVEL_COLOURS = {"bad": RED, "warn": ORANGE, "note": GREEN}
 TEXTS = ("head", "health", "alarms", "word", "latest", "classes", "figures")
 POLICY = "default-src 'none'; script-src 'self' {}; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
@@ -107,7 +107,9 @@ class Plot(NamedTuple):
 PLOTS = {
     "accuracy": Plot("right decisions (%)", {"accuracy": "right", "chance": "guessing"}, band=True, ends=(0, 100)),
     "latency": Plot("after the exposure (us)", {"p50": "50 %", "p99": "99 %", "deadline": "deadline"}, scale="log"),
-    "dark": Plot("clicks per dark exposure", {"dark": "measured"}, band=True, scale="log"),
+    "dark": Plot(
+        "clicks per dark exposure", {"dark": "measured", "expected_high": "expected, at most"}, band=True, scale="log"
+    ),
     "light": Plot("per decision", {"clicks": "clicks", "photons": "photons", "stated": "clicks stated"}),
     "late": Plot("per second", {"lost": "lost exposures", "late": "late decisions"}),
     "rate": Plot("per second", {"rate": "decisions"}),
