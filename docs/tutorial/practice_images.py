@@ -4,8 +4,8 @@ Three sets, each a folder with one folder of pictures per class, the same for th
 
 - `shapes`:  1200 pictures of 32 x 32 pixels, grey PNG: discs, squares, triangles and crosses, moved, turned and resized at random;
 - `letters`: 300 pictures of 24 x 24 pixels, colour PNG and TIFF: five letters, tilted and moved, in strokes of several widths and colours;
-- `photos`:  336 pictures of 20 to 4000 pixels, 298 discs, 32 squares and 6 triangles, as folders of photos are: JPEG, PNG and TIFF, grey and
-             colour, some turned by their EXIF data, transparent or of 16 bits, one copied twice, one damaged.
+- `photos`:  336 pictures of 20 to 4000 pixels, 298 discs, 32 squares and 6 triangles, as folders of photos are: JPEG, PNG and TIFF, grey
+             and colour, some turned by their EXIF data, transparent or of 16 bits, one copied twice, one damaged.
 
 Needs numpy and Pillow.
 """

@@ -135,7 +135,9 @@ class Snapshots:
         The loop may be ahead of the decisions that it has handed over. A word belongs to the decision whose checksum it has.
         """
         core, words = self._core, dict[int, NDArray[np.int64]]()
-        for look in range(0 if core is None else LOOKS):
+        for look in range(LOOKS):
+            if core is None:
+                break
             if look:
                 self._breathe(LOOK_EVERY_S)
             words |= {zlib.crc32(counts.tobytes()): counts for counts in core.windows.seen_now()}
