@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 
-from .charts import Axis, Curve, Mark, chart, extremes, percent, seconds, span
+from .charts import Axis, Curve, Mark, chart, percent, seconds, span
 
 LEAST_US = 1.0
 NO_TIME_US = 0.05  # p99 of the host's own time
@@ -102,8 +102,13 @@ class Clock:
         self.n += len(rows)
         some = self.samples = np.append(self.samples, rows)
         if len(some) > 2 * CLOCK_MAX:
-            ticks = (some["tick"] - some["tick"][0]).astype(np.int64) * self._nominal_ns
-            self.samples = some[extremes((some["host_ns"] - some["host_ns"][0]) - ticks, CLOCK_MAX // 2)]
+            ticks = (some["tick"] - some["tick"][0]).astype(np.int64)
+            off_ns = (some["host_ns"] - some["host_ns"][0]) - ticks * self._nominal_ns
+            # by time, not by number: what was thinned before must not be thinned more than what came since
+            stretch = (ticks - ticks.min()) * (CLOCK_MAX // 2) // max(int(np.ptp(ticks)), 1)
+            order = np.lexsort((off_ns, stretch))
+            ends = np.flatnonzero(np.diff(stretch[order], append=CLOCK_MAX))
+            self.samples = some[np.unique(order[np.concatenate([ends, [0], ends[:-1] + 1])])]
 
     def facts(self, summary: Mapping[str, Any]) -> dict[str, Any] | None:
         """Return the drift in words, that of the line, the probes that lie outside, and a chart; None of a run too short for it."""
