@@ -306,8 +306,9 @@ class _View:
         now.on_click(lambda: self._redraw(follows=True))
         roots = [*self._divs.values(), self._span, self._least, now, self._picture()]
         roots += [self._figure(name, plot) for name, plot in PLOTS.items()]
-        for root in [*roots, *(self._controls(wide) if page.control else ())]:
-            document.add_root(root)
+        with document.models.freeze():  # the models are counted once, not with each root
+            for root in [*roots, *(self._controls(wide) if page.control else ())]:
+                document.add_root(root)
         document.template, document.title = page.template, title_of(page.history)
         document.template_variables["control"] = page.control
 

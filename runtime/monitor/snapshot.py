@@ -135,16 +135,15 @@ class Snapshots:
         The loop may be ahead of the decisions that it has handed over. A word belongs to the decision whose checksum it has.
         """
         core, words = self._core, dict[int, NDArray[np.int64]]()
-        for look in range(LOOKS):
-            if core is None:
-                break
-            if look:
-                self._breathe(LOOK_EVERY_S)
+        if core is None:
+            return {"latest": [_facts_of(row) for row in tuple(self._latest)[-LATEST:]]}
+        for _ in range(LOOKS):
             words |= {zlib.crc32(counts.tobytes()): counts for counts in core.windows.seen_now()}
+            self._breathe(LOOK_EVERY_S)
         latest = tuple(self._latest)
         facts: dict[str, Any] = {"latest": [_facts_of(row) for row in latest[-LATEST:]]}
         for row in reversed(latest):
-            if core is not None and row.counts_crc in words and not row.flags & DecisionFlag.GAP:
+            if row.counts_crc in words and not row.flags & DecisionFlag.GAP:
                 return facts | self._word(core, row, words[row.counts_crc])
         return facts
 
