@@ -157,8 +157,7 @@ class Recording:
         The index `time` is the time of day in UTC: exact between rows, its beginning known to about two seconds. Columns are those of
         the CSV export; `attrs` has their `units` and `meanings` and the recording's facts. What is missing is NA or NaN.
 
-        >>> frame = pans.load_recording("run.pansrec").to_frame()  # doctest: +SKIP
-        >>> frame.latency_us.resample("1min").quantile(0.99)  # doctest: +SKIP
+        `pans.load_recording("run.pansrec").to_frame().latency_us.resample("1min").quantile(0.99)` is the latency over time.
         """
         return _tables().frame_of(self, table)
 
