@@ -176,6 +176,7 @@ class AutomatonOptions:
     candidates: int = 6
     first_price: float = 0.2  # nats per photoelectron detected of the first exposure, halved every `half` levels
     half: float = 6.0
+    price: float = 1.0  # times the price with which a budget begins, of public sets: less where light tells less
     tune_epochs: int | None = None  # of grey patterns; None: 3, or 0 through optics, where they brought nothing
     epochs: int = option(6, "of the patterns as they are displayed", range=EPOCHS)
     tune_rate: float = 0.005

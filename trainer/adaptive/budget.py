@@ -54,7 +54,7 @@ def first_prices(options: AutomatonOptions) -> Prices:
     prices, budgets = [], budgets_of(options)
     for kind, budget in budgets.items():
         price = PRICE_AT_10 * (10.0 / (budget * DETECTED_PER[kind])) ** PRICE_POWER
-        prices.append(Price(kind, price * _share(kind, len(budgets)), budget))
+        prices.append(Price(kind, options.price * price * _share(kind, len(budgets)), budget))
     return Prices(prices)
 
 

@@ -39,6 +39,7 @@ from .results import Judged, SensorResults, results_of
 
 FEW_HELD_OUT = 10  # images of a class: of fewer the recall is hardly known, and each image is held out once
 FOLDS = Range(1, HOLD_OUT_EVERY, whole=True)
+PRICES = "first_price", "price"
 CAMERAS = "direct_imaging", "direct_imaging_as_illuminated"
 
 
@@ -49,6 +50,10 @@ class Prepared:
     task: Task
     recipe: Recipe
     facts: dict[str, Any]
+
+    def prices(self) -> dict[str, float]:
+        """Return what light may cost, as options of an automaton."""
+        return {one: getattr(self.recipe, one) for one in PRICES}
 
 
 def prepared(task: Task, encoder: str, *, seed: int = 0, equal: bool = True, vary: bool = True) -> Prepared:
@@ -101,7 +106,7 @@ def other_folds(
         words = f"sensor {number} of {folds}"
         report(f"{words}: choosing", 0.0)
         chosen = prepared(fold, "automaton", seed=options.seed, equal=equal)
-        recipe = replace(options, batch=chosen.recipe.batch, first_price=chosen.recipe.first_price)
+        recipe = replace(options, batch=chosen.recipe.batch, **chosen.prices())
         trained = train_automaton(
             chosen.task, profile, recipe, held_back=chosen.task.kept, report=_reporting(words, report)
         )
@@ -158,7 +163,7 @@ def train_own(
         recipe = chosen.recipe
         if photons is None and illumination is None and not {"clicks", "dose_cap"} & options.keys():
             photons, illumination = recipe.photons, recipe.illumination
-        sizes = {one: getattr(recipe, one) for one in ("exposures", "states", "batch", "epochs", "first_price")}
+        sizes = {one: getattr(recipe, one) for one in ("exposures", "states", "batch", "epochs")} | chosen.prices()
         with as_usage_error():
             asked = AutomatonOptions(
                 **{"copies": 0, "soft": 0.0, "optics": stated_tolerance(device), **sizes, **options},

@@ -40,6 +40,7 @@ EXPOSURES_PER_PHOTON = 1.2  # more exposures for more light
 FIRST_PRICE = (
     0.2  # nats per photoelectron of the first exposure, at most; and so many times what a camera learns from one:
 )
+PUBLIC_NATS = 1.1  # that a camera learns of the public sets at 10 photons, for which prices of light were found
 PRICE_OF_TOLD = 2.0  # dearer light stays off where bright objects tell little, and no training turns it on again
 STEPS_PER_EPOCH = 40  # fewer steps than that hardly move the patterns
 BATCH = (50, 500)
@@ -90,6 +91,7 @@ class Recipe:
     states: int = 0
     features: int = 0
     first_price: float = FIRST_PRICE
+    price: float = 1.0
 
 
 def choose_encoder(profile: Profile) -> tuple[str, str]:
@@ -102,13 +104,19 @@ def choose_encoder(profile: Profile) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """The light of a decision: what a camera detects of it, and nats per photoelectron that the first exposure may cost."""
+    """The light of a decision: what a camera detects of it, and the nats that it learns."""
 
     photons: float
-    first_price: float
+    nats: float
+
+    @property
+    def prices(self) -> dict[str, float]:
+        """What light may cost: options of an automaton."""
+        first = min(FIRST_PRICE, PRICE_OF_TOLD * self.nats / self.photons)
+        return {"first_price": first, "price": min(1.0, self.nats / PUBLIC_NATS)}
 
 
-PLAIN_LIGHT = Light(PHOTONS[0], FIRST_PRICE)
+PLAIN_LIGHT = Light(PHOTONS[0], PUBLIC_NATS)
 
 
 def choose_training(task: Task, variation: Variation, encoder: str, light: Light = PLAIN_LIGHT) -> Recipe:
@@ -127,7 +135,7 @@ def choose_training(task: Task, variation: Variation, encoder: str, light: Light
     if encoder == "automaton":
         reasons.append(f"{exposures} exposures of at most {STATES} states: more would learn so few images by heart")
         shape = {"exposures": exposures, "states": STATES}
-        return Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), **shape, first_price=light.first_price)
+        return Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), **shape, **light.prices)
     epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
     reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
     return Recipe(encoder, objects, kept, *budget, batch, epochs, tuple(reasons), features=FEATURES)
@@ -193,7 +201,6 @@ def choose_variation(task: Task, seed: int = 0) -> Choice:
         told = max(LEAST_TOLD, judge.told(photons))
         if told >= TOLD:
             break
-    price = PRICE_OF_TOLD * told * math.log(len(task.classes)) / photons
     judge.photons = FRAMES_LIGHT * photons
     best = Variation()
     losses = before = judge.losses(best)
@@ -209,7 +216,7 @@ def choose_variation(task: Task, seed: int = 0) -> Choice:
         if won is not None:
             best, losses = won
     means = [balanced(values, judge.labels)[0] for values in (before, losses)]
-    return Choice(best, means[0], means[1], Light(photons, min(FIRST_PRICE, price)))
+    return Choice(best, means[0], means[1], Light(photons, told * math.log(len(task.classes))))
 
 
 class _Judge:

@@ -108,8 +108,8 @@ def _train(args: argparse.Namespace) -> int:
             import matplotlib  # noqa: F401 - asked for before the training, not after it
     training: AutomatonTraining | FixedTraining
     if automaton:
-        price = chosen.recipe.first_price if chosen is not None else None
-        training = AutomatonTraining(args, task, varied, profile, price)
+        prices = {} if chosen is None else chosen.prices()
+        training = AutomatonTraining(args, task, varied, profile, prices)
     else:
         training = FixedTraining(args, task, varied, profile)
     try:

@@ -6,7 +6,7 @@ All accuracies here are exact expectations, SIMULATED through the profile.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -40,13 +40,12 @@ class AutomatonTraining:
     trained: TrainedAutomaton
 
     def __init__(
-        self, args: argparse.Namespace, task: Task, varied: Task, profile: Profile, first_price: float | None = None
+        self, args: argparse.Namespace, task: Task, varied: Task, profile: Profile, prices: Mapping[str, float]
     ) -> None:
         self.args, self.task, self.varied, self.profile = args, task, varied, profile
         given: dict[str, Any] = {"optics": stated_tolerance(profile)}
         given |= {name: value for name in option_names(AutomatonOptions) if (value := getattr(args, name)) is not None}
-        given |= {} if first_price is None else {"first_price": first_price}
-        self.options = AutomatonOptions(**given)
+        self.options = AutomatonOptions(**given, **prices)
         self.start: Bundle | None = None
         if args.start is not None:
             self.start, digest = load_bundle(args.start)
