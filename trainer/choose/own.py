@@ -51,7 +51,7 @@ class Prepared:
     recipe: Recipe
     facts: dict[str, Any]
 
-    def prices(self) -> dict[str, float]:
+    def prices(self) -> dict[str, Any]:
         """Return what light may cost, as options of an automaton."""
         return {one: getattr(self.recipe, one) for one in PRICES}
 

@@ -110,7 +110,7 @@ class Light:
     nats: float
 
     @property
-    def prices(self) -> dict[str, float]:
+    def prices(self) -> dict[str, Any]:
         """What light may cost: options of an automaton."""
         first = min(FIRST_PRICE, PRICE_OF_TOLD * self.nats / self.photons)
         return {"first_price": first, "price": min(1.0, self.nats / PUBLIC_NATS)}

@@ -45,7 +45,7 @@ class AutomatonTraining:
         self.args, self.task, self.varied, self.profile = args, task, varied, profile
         given: dict[str, Any] = {"optics": stated_tolerance(profile)}
         given |= {name: value for name in option_names(AutomatonOptions) if (value := getattr(args, name)) is not None}
-        self.options = AutomatonOptions(**given, **prices)
+        self.options = AutomatonOptions(**given | dict(prices))
         self.start: Bundle | None = None
         if args.start is not None:
             self.start, digest = load_bundle(args.start)
