@@ -134,8 +134,8 @@ def choose_training(task: Task, variation: Variation, encoder: str, light: Light
         reasons = [f"{n} training images as they are: every change of them made left-out images less likely"]
     if encoder == "automaton":
         reasons.append(f"{exposures} exposures of at most {STATES} states: more would learn so few images by heart")
-        shape = {"exposures": exposures, "states": STATES}
-        return Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), **shape, **light.prices)
+        made = Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), exposures, STATES)
+        return replace(made, **light.prices)
     epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
     reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
     return Recipe(encoder, objects, kept, *budget, batch, epochs, tuple(reasons), features=FEATURES)
