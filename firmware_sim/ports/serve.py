@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
@@ -258,9 +259,17 @@ def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
     )
 
 
+_READ: dict[str, Callable[[str], Any]] = {
+    "int": int,
+    "float": float,
+    "str": str,
+    "bool": {"0": False, "1": True}.__getitem__,
+}
+
+
 def _value(url: str, key: str, text: str, kind: str) -> Any:
     try:
-        return {"int": int, "float": float, "str": str, "bool": {"0": False, "1": True}.__getitem__}[kind](text)
+        return _READ[kind](text)
     except (ValueError, KeyError):
         noun = {"int": "a whole number", "bool": "0 or 1"}.get(kind, "a number")
         raise UsageError(f"{url!r}: {key} must be {noun}, found {text!r}") from None

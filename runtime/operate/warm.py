@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import Automaton
+from pans.runtime.bundle.automaton import reachable_automaton
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle, write_bundle
 from pans.runtime.cli import say
 
@@ -53,7 +53,7 @@ def warm(report: Callable[[float], None] = lambda share: None) -> dict[str, Any]
         for name, bundle in bundles():
             write_bundle(bundle, Path(scratch) / f"{name}.pans")
         for wave in (COMMANDS, AFTERWARDS):
-            for job in pool.map(lambda one: run_once(*one, scratch), wave.items()):
+            for job in pool.map(lambda one: run_once(one[0], one[1], scratch), wave.items()):
                 jobs.append(job)
                 report(len(jobs) / len({**COMMANDS, **AFTERWARDS}))
     return {
@@ -75,7 +75,7 @@ def bundles() -> Iterator[tuple[str, Bundle]]:
         yield name, _made(name, classes, shape, Shown(256, levels, 4 / 255), back_end=back_end)
     for name, outcomes, photons in (("numbers", 3, 0.1), ("pairs", 4, 0.2)):
         leaves = np.full((1 + outcomes, 10), 0.1)
-        walk = Automaton([0], [1], 1, 1 + np.arange(outcomes)[None], leaves, counts=name == "numbers")
+        walk = reachable_automaton([0], [1], 1, 1 + np.arange(outcomes)[None], leaves, counts=name == "numbers")
         lit = np.arange(784) % 9 == np.arange(2 if name == "pairs" else 1)[:, None]
         yield name, _made(name, ten, (28, 28), Shown(2, lit.astype(int), photons), automaton=walk)
 

@@ -138,8 +138,8 @@ class _Place(caching.UserProvidedCacheLocator):  # type: ignore[misc]
     @classmethod
     def from_function(cls, function: Any, file: str) -> _Place | None:
         """Return the place for a function of pans, None for others."""
-        first, package, *_ = [*function.__module__.split("."), ""]
-        return cls(function, file) if first == "pans" and package in OTHERS else None
+        name = str(function.__module__)
+        return cls(function, file) if name.startswith("pans.") and name.split(".")[1] in OTHERS else None
 
 
 caching.CacheImpl._locator_classes.insert(0, _Place)
