@@ -20,6 +20,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, check_non_negative, validate_data
 
+from pans.runtime.bundle.format import bundle_bytes, parse_bundle
 from pans.runtime.bundle.model import Bundle, load_bundle, with_expected, write_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
@@ -179,18 +180,14 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         """What a copy in another process needs: the bundle as bytes, which are checked when they are read."""
         state = dict(super().__getstate__())
         if "bundle_" in state:
-            with TemporaryDirectory() as folder:
-                write_bundle(state.pop("bundle_"), path := Path(folder) / "sensor.pans")
-                state["_bundle"] = path.read_bytes()
+            state["_bundle"] = bundle_bytes(state.pop("bundle_"))
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         held = state.pop("_bundle", None)
         super().__setstate__(state)
         if held is not None:
-            with TemporaryDirectory() as folder:
-                (path := Path(folder) / "sensor.pans").write_bytes(held)
-                self.bundle_ = load_bundle(path)[0]
+            self.bundle_ = parse_bundle(held, "the bundle of a PansClassifier")
 
     # ---- between arrays and the trainer ----
 
@@ -213,6 +210,8 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
     def _trained(self, task: Task, path: Path) -> Bundle:
         """Train and export, with what `pans train` chooses for own images where nothing is asked for."""
         encoder = self.encoder or choose_encoder(self.profile_)[0]
+        if encoder == AUTOMATON and self.shots != 1:
+            raise ValueError(f"shots is {self.shots}, allowed with an automaton: 1")
         recipe = choose_training(task, Variation(), encoder)
         photons = recipe.photons if self.photons is None and self.illumination is None else self.photons
         given: dict[str, Any] = {"photons": photons, "illumination": self.illumination, "seed": self.seed_}

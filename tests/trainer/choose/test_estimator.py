@@ -82,6 +82,7 @@ def test_it_is_a_model_like_any_other() -> None:
     assert search.best_params_ == {"photons": 4}
     again = copy.deepcopy(search.best_estimator_)  # through the bytes of its bundle, as in another process
     np.testing.assert_array_equal(again.predict(IMAGES), search.predict(IMAGES))
+    assert again.bundle_.sha256 == search.best_estimator_.bundle_.sha256
 
 
 def test_more_clicks_than_can_be_enumerated_are_sampled() -> None:
@@ -97,6 +98,7 @@ def test_more_clicks_than_can_be_enumerated_are_sampled() -> None:
         ({"scale": 16}, -IMAGES, "Negative values"),
         ({"scale": 0}, IMAGES, "scale is 0"),
         ({"scale": 16, "image_shape": (8, 9)}, IMAGES, "image_shape is"),
+        ({"scale": 16, "shots": 2}, IMAGES, "shots is 2"),
     ],
 )
 def test_what_does_not_fit_is_refused(changed: dict[str, Any], images: Any, words: str) -> None:
