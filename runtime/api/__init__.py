@@ -14,7 +14,6 @@ rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.tra
 
 from __future__ import annotations
 
-from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -175,6 +174,7 @@ def run(
     `profile` is by default the one that a `sim:` URL names. The result has `summary` (`accuracy`, `verdict`, ...; `as_json()` is what
     the command prints), `confusion`, and the paths `recording` and `report`. DeviceError and LinkError if the device cannot be armed.
     """
+    from dataclasses import fields
     from tempfile import TemporaryDirectory
 
     from pans.runtime.bundle.model import bundle_path
