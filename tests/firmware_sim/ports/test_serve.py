@@ -30,6 +30,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link, open_link
 from pans.runtime.link.connection import Connection
 from pans.runtime.live import Observers, RunOptions, RunResult, run_live
+from pans.runtime.timing.realtime import scheduled
 from pans.runtime.wire.messages import DeviceState
 
 PATIENCE_S = 20.0
@@ -267,8 +268,23 @@ def test_the_loop_on_a_core_of_its_own_runs_and_gives_its_priority_back(monkeypa
     """Its spinner waits on the same core: with the loop's priority it would never let the loop run."""
     monkeypatch.setattr(shell, "MAX_BACKLOG_BYTES", 10_000)
     port, before = StuckPort(), (os.sched_getscheduler(0), os.sched_getaffinity(0))
-    serve(Talker(), DeviceClock(1_000_000), port, lambda: port.waits > 100, max(before[1]))
+    serve(Talker(), DeviceClock(1_000_000), port, lambda: port.waits > 100, max(before[1]), realtime=True)
     assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == before
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="this system has no such priorities")
+def test_a_simulator_has_real_time_priority_only_where_it_is_asked_for() -> None:
+    with scheduled("SCHED_FIFO", shell.FIFO_PRIORITY):
+        wanted = os.sched_getscheduler(0)
+    for realtime, policy in ((False, os.sched_getscheduler(0)), (True, wanted)):
+        port, seen = StuckPort(), set[int]()
+
+        def stopped(port: StuckPort = port, seen: set[int] = seen) -> bool:
+            seen.add(os.sched_getscheduler(0))
+            return port.waits > 3
+
+        serve(Talker(), DeviceClock(1_000_000), port, stopped, realtime=realtime)
+        assert seen == {policy}
 
 
 # -- processes of their own --------------------------------------------------------------------------------------------

@@ -8,10 +8,14 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from pans.runtime.errors import UsageError
+from pans.runtime.live import RunOptions
+from pans.runtime.live.loop import _granted
 from pans.runtime.timing.realtime import (
     GRANTED,
     ThreadCounts,
@@ -112,6 +116,29 @@ def test_the_facts_of_a_machine_are_read(tmp_path: Path) -> None:
     assert (isolated_cores(tmp_path), isolated_cores(tmp_path / "nothing")) == ({2, 3}, frozenset())
     assert steal_ms(tmp_path) == 200_000 / os.sysconf("SC_CLK_TCK")
     assert steal_ms(tmp_path / "nothing") is None
+
+
+@pytest.mark.parametrize(
+    ("simulated", "told", "options", "asked"),
+    [
+        (False, False, {}, True),
+        (False, False, {"realtime": False}, False),
+        (True, False, {}, False),
+        (False, True, {}, False),  # a simulator behind a port, as the device says
+        (True, True, {"realtime_simulated": True}, True),
+        (True, True, {"realtime_simulated": True, "realtime": False}, False),
+    ],
+)
+def test_real_time_is_asked_for_with_a_device_and_not_with_a_simulated_one(
+    simulated: bool, told: bool, options: dict[str, bool], asked: bool
+) -> None:
+    link = SimpleNamespace(virtual=False, simulated=simulated, now_ns=time.perf_counter_ns)
+    welcome = SimpleNamespace(facts={"simulated": told})
+    reader = SimpleNamespace(thread_id=None)
+    connection = SimpleNamespace(link=link, reader=reader, session=SimpleNamespace(welcome=welcome))
+    run: Any = SimpleNamespace(connection=connection, config=RunOptions(**options), realtime={})
+    with _granted(run):
+        assert ("sched_fifo" in run.realtime, "mlockall" in run.realtime) == (asked, asked)
 
 
 @pytest.mark.parametrize("wanted", [False, True])
