@@ -74,16 +74,13 @@ def as_given(args: argparse.Namespace, task: Task) -> Task:
 
 
 def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Prepared:
-    """Choose what the options leave open, say what was read and chosen, and why, and warn; write what the sensor will see."""
+    """Choose what the options leave open, say what was read and chosen, and why, and warn."""
     from pans.trainer.choose.own import prepared
     from pans.trainer.choose.recipe import warnings_of
-    from pans.trainer.choose.results import seen_sheet
 
     for line in [f"{task.name}:", *task.account.lines()] if task.account else ():
         say(line)
     say(f"{task.name}: {len(task.train)} images to train on, {len(task.test)} held out, {len(task.classes)} classes")
-    write_file(sheets_of(args)[0], seen_sheet(task), force=args.force or args.resume)
-    say(f"what the sensor will see: {sheets_of(args)[0]}")
     vary = not any(getattr(args, name) for name in CHANGES)
     encoder = args.encoder or "active"
     chosen = prepared(task, encoder, seed=args.seed or 0, equal=not args.keep_shares, vary=vary)
@@ -135,13 +132,13 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
 def finish(
     args: argparse.Namespace, task: Task, chosen: Prepared, profile: Profile, done: Finished
 ) -> tuple[dict[str, Any], list[str]]:
-    """Judge the sensor beside a camera, write what it confuses, name the next commands; return keys of the answer, and lines.
+    """Judge the sensor beside a camera, write what it sees and confuses, name the next commands; return keys of the answer, and lines.
 
     `chosen` holds the changed copies too: the camera knows what the sensor was trained on.
     """
     from pans.trainer.baselines.rows import equal_light_figures
     from pans.trainer.choose.own import CAMERAS, folds_needed, judged, other_folds
-    from pans.trainer.choose.results import confused_sheet, results_of
+    from pans.trainer.choose.results import confused_sheet, results_of, seen_sheet
 
     bundle, seed = done.bundle, args.seed or 0
     with displayed_parts() as report:
@@ -154,10 +151,12 @@ def finish(
     if args.encoder != AUTOMATON:  # whose own words tell it
         warn_of_budget(args, results.clicks, results.photons, results.illumination)
     warn_of_camera(results)
-    lines, picture = [*results.lines(), *done.words], confused_sheet(results)
+    seen, confused = sheets_of(args)
+    write_file(seen, seen_sheet(task), force=args.force or args.resume)
+    lines, picture = [*results.lines(), *done.words, f"  what the sensor sees: {seen}"], confused_sheet(results)
     if picture is not None:
-        write_file(sheets_of(args)[1], picture, force=args.force)
-        lines.append(f"  the images behind these pairs: {sheets_of(args)[1]}")
+        write_file(confused, picture, force=args.force)
+        lines.append(f"  the images behind these pairs: {confused}")
     account = {"read": task.account.as_json()} if task.account else {}
     cameras = {name: equal_light_figures(one) for name, one in zip(CAMERAS, parts[0].cameras) if one is not None}
     return {"results": results.as_json(), **account, **cameras}, [*lines, next_commands(args, profile.name)]

@@ -56,7 +56,8 @@ def check_each(folder: Path) -> list[int]:
     numbers: list[int] = []
     for path in parts_in(folder):
         found = read_recording(path)
-        assert replay(found, found.bundle())[:2] == (found.n_decisions, found.decisions_sha256), path
+        again = replay(found, found.bundle())
+        assert (again.decisions, again.sha256) == (found.n_decisions, found.decisions_sha256), path
         assert first_decision(found) == (found.decisions()["index"][0] if found.n_decisions else len(numbers))
         numbers += found.decisions()["index"].tolist()
     assert all(verdict.ok for verdict in verify_parts(folder)), verify_parts(folder)

@@ -216,7 +216,8 @@ def test_train_and_evaluate_commands_agree(tmp_path, pans):
     said = pans("train", tmp_path / "bars.npz", *shape, "-o", out)
     assert {"bundle", "accuracy_mean", "clicks_mean", "photons_mean", "seconds"} <= set(said)
     assert said["score_difference"] <= 1e-5
-    assert sorted(os.listdir(tmp_path)) == ["bars.npz", "bars.pans"]  # no checkpoint stays
+    pictures = ["bars-confused.png", "bars-seen.png"]
+    assert sorted(os.listdir(tmp_path)) == [*pictures, "bars.npz", "bars.pans"]  # no checkpoint stays
     found = pans("evaluate", out, "--task", tmp_path / "bars.npz", "--exact")
     assert found["objects"] == 80  # trained on this very file: only what was held out
     assert found["accuracy_mean"] == pytest.approx(said["accuracy_mean"])
