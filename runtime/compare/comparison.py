@@ -22,6 +22,7 @@ from pans.runtime.pages.page import flat
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import Kind
 from pans.runtime.record.parts import find_parts
+from pans.runtime.wire.messages import NO_OBJECT
 
 from .statistics import (
     LEAST_US,
@@ -77,9 +78,9 @@ class Side:
 
     @property
     def scene(self) -> str:
-        """The scene that a simulated instrument was given, "" where none is named."""
+        """The scene that a simulated instrument was given, or says that it shows; "" where none is named."""
         query = str(self.header.get("device_url", "")).partition("?")[2]
-        return (parse_qs(query).get("scene") or [""])[0]
+        return (parse_qs(query).get("scene") or [str(self.summary.get("device", {}).get("scene", ""))])[0]
 
     @property
     def latency_us(self) -> F64 | None:
@@ -101,7 +102,12 @@ def read_side(path: str | Path) -> Side:
         return Side(place, {}, summary, None, None, True)
     found = [read_recording(one, salvage=True) for one in _recordings(place)]
     decisions, timings = _rows(found)
-    return Side(place, found[0].header, found[-1].summary, decisions, timings, all(one.complete for one in found))
+    summary = found[-1].summary
+    if distinct := int(summary.get("device", {}).get("objects", 0)):  # then the first one is shown again
+        numbers = decisions["object"].copy()
+        decisions = decisions.copy()
+        decisions["object"] = np.where(numbers == NO_OBJECT, numbers, numbers % np.uint32(distinct))
+    return Side(place, found[0].header, summary, decisions, timings, all(one.complete for one in found))
 
 
 def _rows(recordings: list[Recording]) -> tuple[NDArray[np.void], NDArray[np.void]]:

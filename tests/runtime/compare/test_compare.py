@@ -63,13 +63,20 @@ def test_samples_where_nothing_says_that_the_objects_are_the_same(runs: Path) ->
     names = {change.name for change in compare(first, later).changes}
     assert names == {"device_url", "device.name", "device.seed", "device.serial"}  # no date, no hash of its own
     assert "80 and 80 distinct objects" in compare(first, second, "different").findings[0].method
-    real = replace(first, header={**first.header, "device_url": "serial:/dev/ttyACM0"})
+    unnamed = replace(first, header={**first.header, "device_url": "sim:oled-qcmos"})  # the device tells its default
+    assert "both runs show the scene" in compare(unnamed, second).why
+    real = replace(unnamed, summary={**first.summary, "device": {"serial": "A1"}})
     assert "--objects same" in compare(real, second).why
     assert compare(real, second, "same").paired
     moved = first.decisions.copy()
     moved["truth"] = np.roll(moved["truth"], 1)
     why = compare(replace(first, decisions=moved), second, "same").why
     assert re.match(r"\d+ of 80 objects of the same number have another true class", why)
+
+
+def test_an_object_that_is_shown_again_is_the_same(tmp_path: Path) -> None:
+    assert main([*fixed_run(230), "--out", str(tmp_path / "run")]) == 0
+    assert read_side(tmp_path / "run").decisions["object"].tolist() == [*range(200), *range(30)]
 
 
 def test_summaries_are_compared_without_pairs(runs: Path, tmp_path: Path, pans: Pans) -> None:
