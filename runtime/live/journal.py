@@ -41,9 +41,10 @@ class Journal:
     def note(self, kind: str, **facts: Any) -> None:
         """Note one event: its kind and what belongs to it, units in the names."""
         event = {"kind": kind, **facts}
-        if kind in TROUBLE:
+        troubles = kind in TROUBLE or facts.get("level") in ("warning", "alarm")  # the dark counts' have levels
+        if troubles:
             self.trouble = event
-        log_event(kind, facts, logging.WARNING if kind in TROUBLE else logging.INFO)
+        log_event(kind, facts, logging.WARNING if troubles else logging.INFO)
         if len(self.events) < MAX_EVENTS and self._kept[kind] < MAX_OF_A_KIND:
             self._kept[kind] += 1
             self.events.append(event)

@@ -24,7 +24,7 @@ from .page import render
 from .run import accuracy_interval
 
 SPARKS, LOG_MAX_BYTES = 24, 1 << 24  # stretches of a small picture; of a larger recording there is none
-DAY_S = 86400.0
+UNITS = (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0))  # of the time axis: the longest of which two fit
 Run = Any  # of operate/runs.py, a package that comes later
 
 
@@ -106,15 +106,16 @@ _TRENDS: tuple[tuple[str, str, Figure], ...] = (
 
 
 def _trend(runs: Sequence[Run], title: str, words: str, figure: Figure) -> tuple[Any, str] | None:
-    """One figure of all runs over days; None where fewer than two know it."""
+    """One figure of all runs over time; None where fewer than two know it."""
     found = [(run.started.timestamp(), *values) for run in runs if (values := figure(run.summary)) is not None]
     if len(found) < 2:
         return None
     when, value, low, high = np.array(sorted(found)).T
-    days = (when - when[0]) / DAY_S
+    unit, unit_s = next(one for one in UNITS if when[-1] - when[0] >= 2 * one[1] or one is UNITS[-1])
+    since = (when - when[0]) / unit_s
     first, top = datetime.fromtimestamp(when[0]).astimezone(), float(high.max())
     share = title.startswith(("accuracy", "late"))
-    x = Axis(f"days since {first:%Y-%m-%d %H:%M}", -0.02 * days[-1], 1.02 * days[-1] or 1.0)
+    x = Axis(f"{unit} since {first:%Y-%m-%d %H:%M}", -0.02 * since[-1], 1.02 * since[-1] or 1.0)
     y = Axis(title, 0.0, 1.0 if title == "accuracy" else 1.1 * top or 1.0, text=percent if share else number)
-    curve = Curve(days, value, low=low, high=high, dots=True)
+    curve = Curve(since, value, low=low, high=high, dots=True)
     return chart(f"{title} of {len(value)} runs", x, y, curves=[curve]), words
