@@ -36,6 +36,7 @@ TOLD = 0.25  # of the way from chance to certainty is what a camera must tell of
 LEAST_TOLD = 0.02  # less is chance
 LEAST_GREY = 1e-3  # mean transmission: of darker images the budget would be without bound
 EXPOSURES, STATES = 32, 128  # of an automaton trained on so few images; more states learn them by heart
+FEW_STATES = 64  # where a class is so small that five sensors are trained, each in a third of the time
 EXPOSURES_PER_PHOTON = 1.2  # more exposures for more light
 FIRST_PRICE = (
     0.2  # nats per photoelectron of the first exposure, at most; and so many times what a camera learns from one:
@@ -125,7 +126,9 @@ def choose_training(task: Task, variation: Variation, encoder: str, light: Light
     kept = max(1, n // KEPT_PART)
     objects = n if variation == Variation() else max(n, min(OBJECTS, OBJECTS_PER_IMAGE * n, PIXELS_MAX // pixels))
     budget = light.photons, float(f"{light.photons / max(task.train.images.mean() / 255, LEAST_GREY):.2g}")
-    exposures = max(EXPOSURES, round(EXPOSURES_PER_PHOTON * light.photons))
+    exposures, states = max(EXPOSURES, round(EXPOSURES_PER_PHOTON * light.photons)), STATES
+    if np.bincount(task.train.labels).min() < FEW_PER_CLASS:
+        exposures, states = EXPOSURES, FEW_STATES
     batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
     reasons = [
         f"{objects} training images from {n}: {variation}; these changes made left-out images more likely, or cost nothing"
@@ -133,8 +136,8 @@ def choose_training(task: Task, variation: Variation, encoder: str, light: Light
     if variation == Variation():
         reasons = [f"{n} training images as they are: every change of them made left-out images less likely"]
     if encoder == "automaton":
-        reasons.append(f"{exposures} exposures of at most {STATES} states: more would learn so few images by heart")
-        made = Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), exposures, STATES)
+        reasons.append(f"{exposures} exposures of at most {states} states: more would learn so few images by heart")
+        made = Recipe(encoder, objects, kept, *budget, batch, 6, tuple(reasons), exposures, states)
         return replace(made, **light.prices)
     epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
     reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
@@ -237,7 +240,10 @@ class _Judge:
     def told(self, photons: float) -> float:
         """Return how far from chance (0) to certainty (1) the recalls of left-out images are, on average, at so many photons."""
         self.photons, chance = photons, 1 / len(self.task.classes)
-        right = [self._joint(*part, Variation())[1] for part in zip(self.parts, self.known)]
+        mild = Variation(
+            **{name: TRIES[name][0] for name in MILD if name in TRIES}
+        )  # few images alone would tell too little
+        right = [self._joint(*part, mild)[1] for part in zip(self.parts, self.known)]
         return (balanced(np.concatenate(right), self.labels)[0] - chance) / (1 - chance)
 
     def losses(self, variation: Variation) -> F64:

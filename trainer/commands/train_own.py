@@ -169,8 +169,8 @@ def warn_of_camera(results: SensorResults) -> None:
         if camera is not None and camera.balanced_accuracy_gain <= CLEAR_SE * camera.balanced_accuracy_gain_se:
             gain = f"{100 * camera.balanced_accuracy_gain:+.1f} ± {100 * camera.balanced_accuracy_gain_se:.1f} points"
             warn(
-                f"the sensor is not better than an ideal camera at equal {name} ({gain} of balanced accuracy). Objects that differ little "
-                "before a bright ground tell a camera as much: try darker ground, more contrast, or less light"
+                f"the sensor is not better than an ideal camera at equal {name} ({gain} of balanced accuracy). Try "
+                "more images of the small classes, more contrast, a darker ground, or less light"
             )
 
 
