@@ -173,6 +173,8 @@ def enlarged(task: Task, variation: Variation, wanted: int, kept: int, seed: int
     if variation == Variation():
         totals = np.full(len(counts), counts.max())
     copied = _repeated(labels[:n], np.minimum(totals, most // len(counts)) - counts)
+    if not (len(copied) or equal):
+        return task
     drawn = varied(images[copied], variation, [seed]) if len(copied) else images[:0]
     back = np.bincount(labels[n:], minlength=len(counts))
     again = n + _repeated(labels[n:], back.max() - back) if equal else copied[:0]

@@ -94,7 +94,8 @@ def wedges(n, seed):
     return Objects(images.astype(np.uint8), labels)
 
 
-def test_images_in_all_directions_are_turned():
+def test_images_in_all_directions_are_turned(monkeypatch):
+    monkeypatch.setattr(recipe, "TRIES", {"turn_deg": (8.0, 25.0, 180.0)})
     task = Task("wedges", ("wedge", "bar"), wedges(30, 1), wedges(10, 2), "0" * 64, "drawn")
     choice = choose_variation(task)
     assert choice.variation.turn_deg == 180
