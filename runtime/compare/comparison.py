@@ -102,12 +102,12 @@ def read_side(path: str | Path) -> Side:
         return Side(place, {}, summary, None, None, True)
     found = [read_recording(one, salvage=True) for one in _recordings(place)]
     decisions, timings = _rows(found)
-    summary = found[-1].summary
-    if distinct := int(summary.get("device", {}).get("objects", 0)):  # then the first one is shown again
+    told = found[-1].summary
+    if distinct := int(told.get("device", {}).get("objects", 0)):  # then the first one is shown again
         numbers = decisions["object"].copy()
         decisions = decisions.copy()
         decisions["object"] = np.where(numbers == NO_OBJECT, numbers, numbers % np.uint32(distinct))
-    return Side(place, found[0].header, summary, decisions, timings, all(one.complete for one in found))
+    return Side(place, found[0].header, told, decisions, timings, all(one.complete for one in found))
 
 
 def _rows(recordings: list[Recording]) -> tuple[NDArray[np.void], NDArray[np.void]]:
