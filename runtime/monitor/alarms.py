@@ -39,11 +39,10 @@ class Alarm:
 
 
 class Alarms:
-    """The last KEPT alarms of a run, the oldest first, in `all`; `number` grows with each change."""
+    """The last KEPT alarms of a run, the oldest first, in `all`."""
 
     def __init__(self) -> None:
         self.all: deque[Alarm] = deque(maxlen=KEPT)
-        self.number = 0
         self._open: dict[str, Alarm] = {}
         self._counted: dict[str, int] = {}
         self._grew_s: dict[str, float] = {}
@@ -58,16 +57,13 @@ class Alarms:
         present = self._present(history, now_s)
         for name in [name for name in self._open if name not in present or picture["ended"]]:
             self._open.pop(name).end_s = min(now_s, self._grew_s.get(name, now_s))
-            self.number += 1
         for name, (level, cause) in {} if picture["ended"] else present.items():
             if name not in self._open:
                 self._open[name] = self._add(Alarm(name, level, now_s, None, cause))
-            elif self._open[name].cause != cause:
-                self._open[name].cause, self.number = cause, self.number + 1
+            self._open[name].cause = cause
 
     def _add(self, alarm: Alarm) -> Alarm:
         self.all.append(alarm)
-        self.number += 1
         return alarm
 
     def _present(self, history: History, now_s: float) -> dict[str, tuple[str, str]]:

@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from importlib.resources import files
-from ipaddress import ip_address
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -53,7 +52,7 @@ from tornado.web import OutputTransform, RequestHandler
 
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.safe_text import one_line
-from pans.runtime.watch.metrics import is_public
+from pans.runtime.watch.metrics import is_loopback, is_public
 
 from .alarms import Alarms
 from .figures import (
@@ -452,7 +451,7 @@ class _Door(Router):
     def find_handler(self, request: Any, **kwargs: Any) -> Any:
         """Return who answers."""
         origin = request.headers.get("Origin")
-        if self._local and not _is_here(request.host_name):
+        if self._local and not is_loopback(request.host_name.strip("[]")):
             return _refusal(request, 403, "This page is for the machine that it runs on.")
         if PATHS.fullmatch(request.path) is None or request.method not in ("GET", "HEAD"):
             return _refusal(request, 404, "There is no such page.")
@@ -462,13 +461,6 @@ class _Door(Router):
             full = f"{SESSIONS_MAX} pages follow this run already. Close one, wait 15 seconds and try again."
             return _refusal(request, 503, full)
         return self._app.find_handler(request, **kwargs)
-
-
-def _is_here(name: str) -> bool:
-    try:
-        return ip_address(name.strip("[]")).is_loopback
-    except ValueError:
-        return name == "localhost"
 
 
 def _refusal(request: Any, status: int, words: str) -> Any:

@@ -71,6 +71,10 @@ class Recording:
         """Whether the clicks are simulated, as the link said at the start or the device by the end."""
         return bool(self.header.get("simulated") or self.summary.get("simulated"))
 
+    def __repr__(self) -> str:
+        told = ", SIMULATED" * self.simulated + ", cut off" * (not self.complete)
+        return f"<Recording {self.path.name}: {self.n_decisions} decisions{told}>"
+
     def _repr_html_(self) -> str:
         """Return what a notebook shows: what was run, and how it ended."""
         names = ("verdict", "accuracy", "clicks_mean", "photons_mean", "late", "lost")

@@ -1,5 +1,6 @@
 """The whole way, in virtual time, against the simulated instrument: decisions, losses, recordings, replays, refusals, dark counts."""
 
+import logging
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -27,6 +28,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link
 from pans.runtime.live import RunOptions, RunResult, run_live
 from pans.runtime.live.dark_run import DarkRun
+from pans.runtime.live.journal import Journal
 from pans.runtime.record import read_recording
 
 PROFILE = load_profile("oled-qcmos")
@@ -193,3 +195,12 @@ def test_a_state_of_the_detector_is_no_change_of_light(present: list[str]) -> No
     run.core.guard.health.present = present
     dark.look(run, output)
     assert dark.light.take.called == (not present)
+
+
+@pytest.mark.parametrize(("level", "word"), [("notice", "INFO"), ("warning", "WARNING"), ("alarm", "WARNING")])
+def test_dark_counts_that_change_are_a_warning(level: str, word: str, caplog: pytest.LogCaptureFixture) -> None:
+    journal = Journal(None)
+    with caplog.at_level(logging.INFO):
+        journal.note("dark_state", level=level)
+    assert [record.levelname for record in caplog.records] == [word]
+    assert (journal.trouble is not None) == (word == "WARNING")
