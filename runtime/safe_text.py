@@ -18,7 +18,7 @@ from typing import Any
 
 LINE_MAX = 2000  # characters of one line of foreign text
 FILE_NAME_MAX = 100
-_MARKDOWN = re.compile(r"([\\`*_{}\[\]<>()#|~&!$^])")
+_MARKDOWN = re.compile(r"([\\`*_{}\[\]<>#|~&!$^])")  # no parentheses: they begin nothing without a bracket before them
 _FORMULA = tuple("=+-@\t\r＝＋－＠")  # what spreadsheets take for a formula; the wide forms too
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?([eE][+-]?\d+)?")
 _NO_FILE_NAME = re.compile(r"[^A-Za-z0-9._-]+")

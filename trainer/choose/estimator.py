@@ -25,6 +25,7 @@ from pans.runtime.bundle.model import Bundle, load_bundle, with_expected, write_
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.device import one_thread
 from pans.trainer.evaluate.accuracy import Measured, light_of
 from pans.trainer.evaluate.held_out import HeldOut, as_trained, measure, trials_needed
 from pans.trainer.evaluate.walks import MeasuredWalks, leaf_chances
@@ -100,6 +101,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
 
     # ---- what scikit-learn asks for ----
 
+    @one_thread()
     def fit(self, X: ArrayLike, y: ArrayLike) -> PansClassifier:
         """Train on images `X`, (n, pixels) or (n, height, width), of the classes `y`, (n,).
 
@@ -129,6 +131,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         chosen = self.predict_proba(X).argmax(axis=1)
         return self.classes_[chosen]
 
+    @one_thread()
     def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
         """Return the posterior of every class, float64 (n, classes), given the clicks that `predict` decides on."""
         objects = self._asked(X)
@@ -147,6 +150,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         """Return the accuracy that `score` has on average over all clicks that may come: `measure(X, y).accuracy_mean`."""
         return float(self.measure(X, y).accuracy_mean or 0.0)
 
+    @one_thread()
     def measure(self, X: ArrayLike, y: ArrayLike) -> Measured | MeasuredWalks:
         """Return accuracy, clicks, photons and illumination per decision on images `X` of the classes `y`, with their errors.
 

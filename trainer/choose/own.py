@@ -26,6 +26,7 @@ from pans.trainer.adaptive.train import train_automaton
 from pans.trainer.adaptive.tune import Progress
 from pans.trainer.baselines.common import Report, Trials, silent
 from pans.trainer.baselines.rows import at_equal_light
+from pans.trainer.device import one_thread
 from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, decision_shares, light_of, sampled_shares
 from pans.trainer.evaluate.held_out import DEFAULT_TRIALS
 from pans.trainer.evaluate.walks import walks_of
@@ -119,6 +120,7 @@ def _reporting(words: str, report: Report) -> Callable[[Progress], None]:
     return lambda step: report(f"{words}: {step.stage}, accuracy {100 * step.accuracy:.1f} %", step.done / step.steps)
 
 
+@one_thread()
 def train_own(
     images: ArrayLike | str | Path,
     labels: Sequence[Any] | NDArray[Any] | None = None,

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import pans
 from pans.runtime.decide.backends import make_decider
@@ -33,6 +34,21 @@ def test_the_checks_of_scikit_learn_pass(estimator: Any, check: Any) -> None:
 @parametrize_with_checks([PansClassifier(**FIXED, scale="largest")])
 def test_they_pass_of_fixed_patterns_too(estimator: Any, check: Any) -> None:
     check(estimator)
+
+
+def test_it_computes_on_one_thread_and_leaves_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many small steps: on two threads `fit` took 13 times as long."""
+    used, before = [], torch.get_num_threads()
+    trained = PansClassifier._trained
+    monkeypatch.setattr(
+        PansClassifier, "_trained", lambda *given: (used.append(torch.get_num_threads()), trained(*given))[1]
+    )
+    torch.set_num_threads(2)
+    try:
+        PansClassifier(**SMALL, scale="largest").fit(IMAGES[:30], DIGITS[:30])
+        assert (used, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module", params=["automaton", "active"])

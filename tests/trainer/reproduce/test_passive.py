@@ -10,6 +10,7 @@ from trainings import columns_task
 
 from pans.runtime.cli import main
 from pans.runtime.instrument.profile import load_profile
+from pans.trainer.device import one_thread
 from pans.trainer.model.heads import MlpHead
 from pans.trainer.options import Options
 from pans.trainer.reproduce import passive
@@ -33,15 +34,13 @@ def quiet(name, cache, **how):
 @pytest.fixture
 def few_cells(monkeypatch):
     """120 cells and four epochs on one thread, as the command does."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     small = dataclasses.replace(recipe("cells", CELLS, 0.0), epochs=4, starts=1, batch=50, hidden=8, clicks=None)
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     monkeypatch.setattr(passive, "load_task", lambda name, _, *, data_seed: draw_task(name, data_seed, 120, 60))
     passive.load.cache_clear()
-    yield
+    with one_thread():
+        yield
     passive.load.cache_clear()
-    torch.set_num_threads(threads)
 
 
 def test_a_barcode_cell_is_judged_on_all_strings_and_kept(tmp_path, monkeypatch):
