@@ -108,8 +108,11 @@ def test_an_automaton_walks_by_the_clicks_of_the_table(
     profile = profile_with(tmp_path / "binary.toml", BINARY | PATIENT)
     with serving("--profile", str(profile), pixels=2, peak_hz=2000.0) as (_, url):
         words = ("--device", url, "--profile", profile, "--decisions", objects, "--drive", drive)
-        words += ("--out", tmp_path / "run", "--no-realtime")
-        found = json_of(capsys, f"run {tmp_path / 'small.pans'}", *words, code=0)
+        for attempt in range(3):  # on a busy computer the host names a state too late, and the run says so
+            out = ("--out", tmp_path / f"run{attempt}", "--no-realtime")
+            found = json_of(capsys, f"run {tmp_path / 'small.pans'}", *words, *out, code=None)
+            if not found.get("late_slots"):
+                break
     assert (found["verdict"], found["wrong_patterns"]) == ("PASS", 0)
     walk, images = bundle.automaton, np.random.default_rng(2).random((200, 2, 2))[:objects]
     dwell = np.asarray(walk.dwell) / walk.dwell_steps
