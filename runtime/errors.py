@@ -6,8 +6,15 @@ measurements, not exceptions: they are counted, flagged and reported. Exceptions
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
+
+# a command in backticks, which stays, or an option of `pans train` and its value
+_OPTION = re.compile(
+    r"`pans [^`]*`|(?:pans train )?--([a-z][a-z-]*)"
+    r"(?: ([0-9][\w.:]*|[A-Z]\b|active|automaton|coherent|local|host|[a-z0-9]+(?:-[a-z0-9]+)+))?"
+)
 
 
 class PansError(Exception):
@@ -80,3 +87,33 @@ def as_usage_error() -> Iterator[None]:
         yield
     except ValueError as error:
         raise UsageError(str(error)) from error
+
+
+@contextmanager
+def in_python_words(keywords: Container[str] | None = None) -> Iterator[None]:
+    """Let an error that is raised within name keywords of a call instead of options of a command; those not in `keywords` are in `options`.
+
+    >>> with in_python_words(["features"]):
+    ...     raise PlanError("12 patterns, --shots is 2", remedy="--features 10, or fewer")
+    Traceback (most recent call last):
+        ...
+    pans.runtime.errors.PlanError: 12 patterns, options["shots"] is 2
+      remedy: features=10, or fewer
+    """
+
+    def keyword(found: re.Match[str]) -> str:
+        if found[1] is None:
+            return found[0]
+        name, value = found[1].replace("-", "_"), found[2]
+        if value is not None and value[0].islower():
+            value = f'"{value}"'
+        if keywords is None or name in keywords:
+            return name if value is None else f"{name}={value}"
+        return f'options["{name}"]' if value is None else f'options={{"{name}": {value}}}'
+
+    try:
+        yield
+    except PansError as error:
+        error.message, error.remedy = (_OPTION.sub(keyword, text) for text in (error.message, error.remedy))
+        error.args = (error.message,)
+        raise

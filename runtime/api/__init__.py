@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime import __version__ as __version__
-from pans.runtime.errors import UsageError, as_usage_error
+from pans.runtime.errors import UsageError, as_usage_error, in_python_words
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -202,7 +202,8 @@ def run(
             force=force,
             **more,
         )
-        return run_once(options, loaded)
+        with in_python_words():
+            return run_once(options, loaded)
 
 
 def _written(bundle: Bundle, folder: Path) -> Path:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from math import isqrt
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,9 +23,12 @@ from sklearn.utils.validation import check_is_fitted, check_non_negative, valida
 
 from pans.runtime.bundle.format import bundle_bytes, parse_bundle
 from pans.runtime.bundle.model import Bundle, load_bundle, with_expected, write_bundle
+from pans.runtime.cli.reading_bar import work_bar
 from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import in_python_words
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.baselines.common import Report, silent
 from pans.trainer.device import one_thread
 from pans.trainer.evaluate.accuracy import Measured, light_of
 from pans.trainer.evaluate.held_out import HeldOut, as_trained, measure, trials_needed
@@ -34,12 +38,14 @@ from pans.trainer.export.writer import export_trained
 from pans.trainer.options import EXACT_FEATURES_MAX, AutomatonOptions, Options, stated_tolerance
 from pans.trainer.tasks.changes import Variation
 from pans.trainer.tasks.registry import Objects, Task
-from pans.trainer.train.loop import train
+from pans.trainer.train.loop import EpochReport, train
 
+from .own import reporting
 from .recipe import choose_encoder, choose_training
 
 AUTOMATON = "automaton"
 LARGEST = "largest"  # of `scale`
+KEYWORDS = ("profile", "encoder", "features", "photons", "illumination", "epochs", "shots")  # others are `options`
 GROW_EPOCHS = 4  # few images make few steps: 2 were worse on held-back digits
 AT_ONCE = 256  # objects: the chances of all leaves stand in memory
 
@@ -60,6 +66,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
     - `image_shape`: height and width, where X is flat. None: a square where there is one, else a row.
     - `options`: further fields of `pans.trainer.options.Options` (of an automaton: `AutomatonOptions`), such as {"states": 64}.
     - `random_state`: seed of the training and of the clicks, as everywhere in scikit-learn.
+    - `verbose`: 1 displays a bar while `fit` trains, on a terminal or in a notebook.
 
     `predict` and `predict_proba` draw clicks. A fitted sensor draws the same ones for the same image, so that two calls agree and neither
     the order of the images nor the batch matters. An image that X holds several times has other clicks each time: to see the noise,
@@ -94,13 +101,16 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         image_shape: tuple[int, int] | None = None,
         options: Mapping[str, Any] | None = None,
         random_state: Any = None,
+        verbose: int = 0,
     ) -> None:
         self.profile, self.encoder, self.features = profile, encoder, features
         self.photons, self.illumination, self.epochs, self.shots = photons, illumination, epochs, shots
         self.scale, self.image_shape, self.options, self.random_state = scale, image_shape, options, random_state
+        self.verbose = verbose
 
     # ---- what scikit-learn asks for ----
 
+    @in_python_words(KEYWORDS)
     @one_thread()
     def fit(self, X: ArrayLike, y: ArrayLike) -> PansClassifier:
         """Train on images `X`, (n, pixels) or (n, height, width), of the classes `y`, (n,).
@@ -122,8 +132,8 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         digest = hashlib.sha256(objects.images.tobytes() + objects.labels.tobytes()).hexdigest()
         names = tuple(str(name) for name in self.classes_)
         task = Task("arrays", names, objects, objects, digest, "none held out", source="arrays given to PansClassifier")
-        with TemporaryDirectory() as folder:
-            self.bundle_ = self._trained(task, Path(folder) / "sensor.pans")
+        with TemporaryDirectory() as folder, work_bar() if self.verbose else nullcontext(silent) as report:
+            self.bundle_ = self._trained(task, Path(folder) / "sensor.pans", report)
         return self
 
     def predict(self, X: ArrayLike) -> NDArray[Any]:
@@ -211,7 +221,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         grey = np.rint(np.minimum(X / self.scale_, 1.0) * 255).astype(np.uint8)
         return Objects(grey.reshape(len(X), *self.image_shape_), labels.astype(np.int64))
 
-    def _trained(self, task: Task, path: Path) -> Bundle:
+    def _trained(self, task: Task, path: Path, report: Report) -> Bundle:
         """Train and export, with what `pans train` chooses for own images where nothing is asked for."""
         encoder = self.encoder or choose_encoder(self.profile_)[0]
         if encoder == AUTOMATON and self.shots != 1:
@@ -226,7 +236,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
             sizes = {"exposures": self.features or recipe.exposures, "states": recipe.states, "copies": 0, "soft": 0.0}
             sizes["grow_epochs"] = GROW_EPOCHS
             wanted = AutomatonOptions(**(given | sizes | dict(self.options or {})))
-            grown = train_automaton(task, self.profile_, wanted)
+            grown = train_automaton(task, self.profile_, wanted, report=reporting(report))
             bundle = export_automaton(path, grown, task, self.profile_, **about).bundle
             expected = {**(bundle.expected or {}), "split": "the training images"}  # none were held out
             write_bundle(with_expected(bundle, expected), path, force=True)
@@ -234,7 +244,13 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         features = self.features or recipe.features
         given |= {"features": features, "encoder": encoder, "shots": self.shots, "conserving": encoder != "active"}
         given["estimator"] = "exact" if features <= EXACT_FEATURES_MAX else "local"
-        trained = train(task, self.profile_, Options(**(given | dict(self.options or {}))))
+        asked = Options(**(given | dict(self.options or {})))
+
+        def tell(epoch: EpochReport) -> None:
+            done = (epoch.restart * asked.epochs + epoch.epoch) / (asked.epochs * asked.restarts)
+            report(f"epoch {epoch.epoch} of {asked.epochs}, loss {epoch.loss:.3f}", done)
+
+        trained = train(task, self.profile_, asked, report=tell)
         return export_trained(path, trained, task, self.profile_, **about).bundle
 
     def _draws(self, images: NDArray[np.uint8]) -> Iterator[np.random.Generator]:

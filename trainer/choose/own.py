@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.cli.reading_bar import work_bar
-from pans.runtime.errors import UsageError, as_usage_error
+from pans.runtime.errors import UsageError, as_usage_error, in_python_words
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.ranges import Range
 from pans.trainer.adaptive.train import train_automaton
 from pans.trainer.adaptive.tune import Progress
-from pans.trainer.baselines.common import Report, Trials, silent
+from pans.trainer.baselines.common import Report, Trials, named, silent
 from pans.trainer.baselines.rows import at_equal_light
 from pans.trainer.device import one_thread
 from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, decision_shares, light_of, sampled_shares
@@ -99,27 +100,51 @@ def judged(bundle: Bundle, varied: Task, profile: Profile, seed: int = 0, report
 
 
 def other_folds(
-    task: Task, profile: Profile, options: AutomatonOptions, folds: int, *, equal: bool, report: Report = silent
+    task: Task,
+    profile: Profile,
+    options: AutomatonOptions,
+    folds: int,
+    *,
+    equal: bool,
+    first_s: float,
+    report: Report = silent,
 ) -> list[Judged]:
-    """Train and judge the sensors of all folds but the first, which is `task` itself."""
-    found = []
-    for number, fold in enumerate(fold_tasks(task)[1:folds], start=2):
-        words = f"sensor {number} of {folds}"
-        report(f"{words}: choosing", 0.0)
-        chosen = prepared(fold, "automaton", seed=options.seed, equal=equal)
-        recipe = replace(options, batch=chosen.recipe.batch, **chosen.prices())
-        trained = train_automaton(
-            chosen.task, profile, recipe, held_back=chosen.task.kept, report=_reporting(words, report)
-        )
-        bundle = bundle_of(trained, fold, profile, f"fold-{number}", {})
-        found.append(judged(bundle, chosen.task, profile, options.seed))
+    """Train and judge the sensors of all folds but the first, which is `task` itself; fewer where Ctrl-C interrupts.
+
+    `report` has the time that is left, at first by the seconds that the first sensor took, `first_s`.
+    """
+    found: list[Judged] = []
+    began_s, each_s = time.perf_counter(), first_s
+
+    def tell(what: str, _part: float) -> None:
+        spent_s, rest = time.perf_counter() - began_s, folds - 2 - len(found)
+        left_s = max(each_s * (folds - 1) - spent_s, each_s * rest, 1.0)
+        report(f"sensor {len(found) + 2} of {folds}: {what}, {about(left_s)} left", spent_s / (spent_s + left_s))
+
+    with suppress(KeyboardInterrupt):
+        for fold in fold_tasks(task)[1:folds]:
+            tell("choosing", 0.0)
+            chosen = prepared(fold, "automaton", seed=options.seed, equal=equal)
+            recipe = replace(options, batch=chosen.recipe.batch, **chosen.prices())
+            varied = chosen.task
+            trained = train_automaton(varied, profile, recipe, held_back=varied.kept, report=reporting(tell))
+            bundle = bundle_of(trained, fold, profile, f"fold-{len(found) + 2}", {})
+            found.append(judged(bundle, varied, profile, options.seed))
+            each_s = (time.perf_counter() - began_s) / len(found)
     return found
 
 
-def _reporting(words: str, report: Report) -> Callable[[Progress], None]:
-    return lambda step: report(f"{words}: {step.stage}, accuracy {100 * step.accuracy:.1f} %", step.done / step.steps)
+def about(seconds: float) -> str:
+    """Return a time as a person says it: "about 40 s", "about 6 min"."""
+    return f"about {seconds:.0f} s" if seconds < 100 else f"about {seconds / 60:.0f} min"
 
 
+def reporting(report: Report) -> Callable[[Progress], None]:
+    """Return what takes an automaton's progress and says it to `report`."""
+    return lambda step: report(f"{step.stage}, accuracy {100 * step.accuracy:.1f} %", step.done / step.steps)
+
+
+@in_python_words()
 @one_thread()
 def train_own(
     images: ArrayLike | str | Path,
@@ -144,7 +169,7 @@ def train_own(
     all of it: the name of a task (`pans data list`; `data_dir` as there), a folder of class folders with photos, or a .npz file.
     `photons` and `illumination` are the budget of a decision (default: chosen from the images). `out` is the bundle to write, which is
     not replaced; without it the bundle is in `sensor` alone. With `folds` 2 to 5 so many sensors are trained and judged (default 5 where
-    a class has fewer than 10 held-out images, else 1). `progress` displays a bar on a terminal or in a notebook; a function is called
+    a class has fewer than 10 held-out images, else 1); Ctrl-C after the first returns the results so far, with a warning. `progress` displays a bar on a terminal or in a notebook; a function is called
     with words and the part that is done. `options` are other fields of `AutomatonOptions`. UsageError for what does not fit. Fixed
     patterns are `pans.PansClassifier`'s.
 
@@ -175,14 +200,17 @@ def train_own(
             )
             number = folds_needed(task) if folds is None else int(FOLDS.checked(folds, "folds"))
             trained = train_automaton(
-                chosen.task, device, asked, held_back=chosen.task.kept, report=_reporting("training", report)
+                chosen.task, device, asked, held_back=chosen.task.kept, report=reporting(named("training", report))
             )
             facts = chosen.facts | {"options": asdict(trained.options)}
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(out) if out is not None else Path(folder) / f"{name}.pans"
                 exported = export_automaton(path, trained, task, device, name=path.stem, provenance=facts)
             parts = [judged(exported.bundle, chosen.task, device, seed, report)]
-            parts += other_folds(task, device, trained.options, number, equal=equal, report=report)
+            first_s = time.perf_counter() - started
+            parts += other_folds(task, device, trained.options, number, equal=equal, first_s=first_s, report=report)
+    if len(parts) < number:
+        warnings.warn(f"interrupted: {number - len(parts)} of {number} sensors are missing", stacklevel=4)
     return results_of(
         parts,
         task.classes,
@@ -190,6 +218,7 @@ def train_own(
         bundle=None if out is None else path,
         sha256=exported.sha256,
         sensor=exported.bundle,
+        missing=number - len(parts),
     )
 
 

@@ -78,6 +78,7 @@ class SensorResults(Result):
     camera_at_equal_illumination: CameraResults | None
     confusion: F64
     folds: int  # sensors, each judged on images that it has not seen; 1: one, on the held-out images
+    folds_missing: int  # sensors that were to be judged too when the training was interrupted
     seconds: float  # of the training and the comparison
     bundle: Path | None
     sha256: str = ""
@@ -131,6 +132,8 @@ class SensorResults(Result):
         total, how = sum(self.images.values()), "held-out images"
         if self.folds > 1:
             how = f"images, each judged by one of {self.folds} sensors that had not seen it (classes are small)"
+        if self.folds_missing:
+            how += f"; interrupted, {self.folds_missing} more sensors are missing"
         rows = [
             ("", "sensor", list(known)),
             ("balanced accuracy, %", _with_error(self, "balanced_accuracy"), _each(known, "balanced_accuracy")),
@@ -192,8 +195,9 @@ def results_of(
     bundle: Path | None,
     sha256: str,
     sensor: Bundle | None = None,
+    missing: int = 0,
 ) -> SensorResults:
-    """Return the results of all images that the `parts` judged."""
+    """Return the results of all images that the `parts` judged, of which so many are `missing`."""
     labels = np.concatenate([part.objects.labels for part in parts])
     shares = np.concatenate([part.shares for part in parts])
     confusion = np.zeros((len(classes), len(classes)))
@@ -222,6 +226,7 @@ def results_of(
         camera_at_equal_illumination=cameras[1],
         confusion=confusion,
         folds=len(parts),
+        folds_missing=missing,
         seconds=seconds,
         bundle=bundle,
         sha256=sha256,

@@ -136,10 +136,14 @@ def _train(args: argparse.Namespace) -> int:
     if chosen is not None and task.target == "class":
         options = training.options if isinstance(training, AutomatonTraining) else None
         done = Finished(training.bundle, digest, options, started, training.budget_words)
-        more, lines = finish(args, task, chosen, profile, done)
+        try:
+            more, lines = finish(args, task, chosen, profile, done)
+        except KeyboardInterrupt:
+            words = f"interrupted: the camera's figures are missing; pans evaluate {args.out} computes them"
+            more, lines = {"interrupted": True}, [*lines, words]
         payload |= more
     emit(args, payload, "\n".join([f"{args.out}  {digest[:12]}  trained in {seconds:.0f} s", *lines]))
-    return EXIT_FINE
+    return EXIT_INTERRUPTED if payload.get("interrupted") else EXIT_FINE
 
 
 def _refuse_foreign(args: argparse.Namespace, automaton: bool, own: bool) -> None:

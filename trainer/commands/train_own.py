@@ -6,7 +6,7 @@ import argparse
 import shlex
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -137,29 +137,41 @@ def finish(
     `chosen` holds the changed copies too: the camera knows what the sensor was trained on.
     """
     from pans.trainer.baselines.rows import equal_light_figures
-    from pans.trainer.choose.own import CAMERAS, folds_needed, judged, other_folds
+    from pans.trainer.choose.own import CAMERAS, about, folds_needed, judged, other_folds
     from pans.trainer.choose.results import confused_sheet, results_of, seen_sheet
 
-    bundle, seed = done.bundle, args.seed or 0
+    seen, confused = sheets_of(args)
+    write_file(seen, seen_sheet(task), force=args.force or args.resume)
+    folds = 1 if done.options is None else args.folds or folds_needed(task)
+
+    def so_far() -> SensorResults:
+        seconds, missing = time.perf_counter() - done.started, folds - len(parts)
+        return results_of(parts, task.classes, seconds=seconds, bundle=args.out, sha256=done.sha256, missing=missing)
+
     with displayed_parts() as report:
-        parts = [judged(bundle, chosen.task, profile, seed, report)]
-        if done.options is not None:
-            folds, equal = args.folds or folds_needed(task), not args.keep_shares
-            parts += other_folds(task, profile, done.options, folds, equal=equal, report=report)
-    seconds = time.perf_counter() - done.started
-    results = results_of(parts, task.classes, seconds=seconds, bundle=args.out, sha256=done.sha256)
+        parts = [judged(done.bundle, chosen.task, profile, args.seed or 0, report)]
+    if done.options is not None and folds > 1:
+        first = replace(so_far(), folds_missing=0)
+        say("\n".join(first.lines()))
+        say(
+            f"{args.out} is whole. Its classes are small: {folds - 1} more sensors are trained for the figures alone, which takes "
+            f"{about(first.seconds * (folds - 1))}; Ctrl-C ends with the figures so far"
+        )
+        with displayed_parts() as report:
+            equal, first_s = not args.keep_shares, first.seconds
+            parts += other_folds(task, profile, done.options, folds, equal=equal, first_s=first_s, report=report)
+    results = so_far()
     if args.encoder != AUTOMATON:  # whose own words tell it
         warn_of_budget(args, results.clicks, results.photons, results.illumination)
     warn_of_camera(results)
-    seen, confused = sheets_of(args)
-    write_file(seen, seen_sheet(task), force=args.force or args.resume)
     lines, picture = [*results.lines(), *done.words, f"  what the sensor sees: {seen}"], confused_sheet(results)
     if picture is not None:
         write_file(confused, picture, force=args.force)
         lines.append(f"  the images behind these pairs: {confused}")
     account = {"read": task.account.as_json()} if task.account else {}
     cameras = {name: equal_light_figures(one) for name, one in zip(CAMERAS, parts[0].cameras) if one is not None}
-    return {"results": results.as_json(), **account, **cameras}, [*lines, next_commands(args, profile.name)]
+    found = {"results": results.as_json(), **account, **cameras, "interrupted": len(parts) < folds}
+    return found, [*lines, next_commands(args, profile.name)]
 
 
 def warn_of_camera(results: SensorResults) -> None:

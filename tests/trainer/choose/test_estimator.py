@@ -1,6 +1,7 @@
 """`pans.PansClassifier`: scikit-learn's own checks, clicks that are drawn, and what it says against independent sums."""
 
 import copy
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 
 import pans
 from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import PlanError
+from pans.trainer.choose import estimator
 from pans.trainer.choose.estimator import PansClassifier
 
 sklearn = pytest.importorskip("sklearn")
@@ -49,6 +52,17 @@ def test_it_computes_on_one_thread_and_leaves_their_number(monkeypatch: pytest.M
         assert (used, torch.get_num_threads()) == ([1], 2)
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("given", [SMALL, FIXED])
+def test_verbose_says_how_far_the_training_is(monkeypatch: pytest.MonkeyPatch, given: dict[str, Any]) -> None:
+    told: list[float] = []
+    monkeypatch.setattr(estimator, "work_bar", lambda: nullcontext(lambda _words, part: told.append(part)))
+    PansClassifier(**given, scale=16).fit(IMAGES[:30], DIGITS[:30])
+    assert not told
+    PansClassifier(**given, scale=16, verbose=1).fit(IMAGES[:30], DIGITS[:30])
+    assert told == sorted(told)
+    assert told[-1] == 1
 
 
 @pytest.fixture(scope="module", params=["automaton", "active"])
@@ -120,6 +134,20 @@ def test_more_clicks_than_can_be_enumerated_are_sampled() -> None:
 def test_what_does_not_fit_is_refused(changed: dict[str, Any], images: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         PansClassifier(**(SMALL | changed)).fit(images, NAMES)
+
+
+@pytest.mark.parametrize(
+    ("given", "remedy"),
+    [
+        ({"profile": "wdm-snspd", "features": 70}, "features=32, or fewer"),
+        ({"features": 40, "options": {"states": 60_000}}, 'options={"states": '),
+    ],
+)
+def test_a_remedy_names_the_keywords_of_the_call(given: dict[str, Any], remedy: str) -> None:
+    with pytest.raises(PlanError) as found:
+        PansClassifier(**(SMALL | {"scale": 16} | given)).fit(IMAGES[:30], DIGITS[:30])
+    assert found.value.remedy.startswith(remedy)
+    assert "--" not in str(found.value)
 
 
 def test_classes_that_it_has_not_seen_are_refused(sensor: PansClassifier) -> None:

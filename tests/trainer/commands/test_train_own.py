@@ -97,6 +97,34 @@ def test_a_messy_folder_is_trained_on_by_one_command(tmp_path, monkeypatch, pans
     assert np.load("p.npz")["images"].shape == (11, 16, 16)
 
 
+@pytest.mark.parametrize("whole", [0, 1])
+def test_an_interrupted_training_leaves_its_sensor_and_the_results_so_far(letters, pans, monkeypatch, whole):
+    """Ctrl-C while the sensor after so many is judged; the first one is written before that."""
+    monkeypatch.setattr(recipe, "TRIES", {"turn_deg": (25.0,)})
+    done, judged = [], own.judged
+
+    def judged_until(*given):
+        if len(done) == whole:
+            raise KeyboardInterrupt
+        done.append(judged(*given))
+        return done[-1]
+
+    monkeypatch.setattr(own, "judged", judged_until)
+    assert main(["train", letters, *QUICK, "--folds", "4", "-o", "letters.pans", "--json"]) == 130
+    said = pans.said()
+    answer = json.loads(said.out)
+    assert answer["interrupted"]
+    assert load_bundle("letters.pans")[1] == answer["sha256"]
+    if not whole:
+        assert "results" not in answer
+        return
+    found = answer["results"]
+    assert (found["folds"], found["folds_missing"], sum(found["images"].values())) == (1, 3, 30)
+    first, rest = said.err.split("letters.pans is whole")
+    assert "SIMULATED, 30 held-out images" in first
+    assert "3 more sensors are trained for the figures alone, which takes about" in rest
+
+
 def test_as_is_chooses_nothing(letters, pans):
     assert "--features is missing" in pans.refuses("train", letters, "--as-is", "-o", "letters.pans")
     words = ["train", letters, "--as-is", "--encoder", "automaton", "--photons", "5", *QUICK, "-o", "letters.pans"]
