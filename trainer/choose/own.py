@@ -169,9 +169,9 @@ def train_own(
     all of it: the name of a task (`pans data list`; `data_dir` as there), a folder of class folders with photos, or a .npz file.
     `photons` and `illumination` are the budget of a decision (default: chosen from the images). `out` is the bundle to write, which is
     not replaced; without it the bundle is in `sensor` alone. With `folds` 2 to 5 so many sensors are trained and judged (default 5 where
-    a class has fewer than 10 held-out images, else 1); Ctrl-C after the first returns the results so far, with a warning. `progress` displays a bar on a terminal or in a notebook; a function is called
-    with words and the part that is done. `options` are other fields of `AutomatonOptions`. UsageError for what does not fit. Fixed
-    patterns are `pans.PansClassifier`'s.
+    a class has fewer than 10 held-out images, else 1); Ctrl-C then returns the results so far, with a warning. `progress` displays a bar
+    on a terminal or in a notebook; a function is called with words and the part that is done. `options` are other fields of
+    `AutomatonOptions`. UsageError for what does not fit. Fixed patterns are `pans.PansClassifier`'s.
 
     >>> import numpy as np
     >>> images = np.zeros((60, 4, 4), np.uint8)
