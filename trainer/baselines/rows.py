@@ -97,7 +97,7 @@ Level = tuple[Light, int, Trials, dict[str, Any]]  # asked for, readouts per obj
 
 def _stopping(task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report) -> Iterator[Level]:
     from .end_to_end import masks_that_stop
-    from .exposures import SHORTEST, exposure_net, log_chances
+    from .networks import SHORTEST, exposure_net, log_chances
     from .stopping import held_back, of_network, stopping
 
     if options.detector != "counting" or options.dark:

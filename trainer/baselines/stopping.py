@@ -1,7 +1,7 @@
 """Measurements that stop when they are sure: counts are read again and again while light is collected, until little doubt is left.
 
 The counts are those of a frame's pixels, or of masks that are displayed in turn, again and again. Doubt has two sources: a network that
-knows the exposure (exposures.py, end_to_end.py), and the exact posterior over the training objects. The source and its rule, from which
+knows the exposure (networks.py, end_to_end.py), and the exact posterior over the training objects. The source and its rule, from which
 doubt on it stops at which exposure, are chosen for each level of light on training objects that neither knew. SIMULATED: ideal detectors
 without dark counts, which can be read at any time.
 

@@ -8,7 +8,7 @@ import pytest
 from trainings import kept_task
 
 from pans.trainer.baselines.common import measure, silent
-from pans.trainer.baselines.exposures import SHORTEST, exposure_net, log_chances
+from pans.trainer.baselines.networks import SHORTEST, exposure_net, log_chances
 from pans.trainer.baselines.stopping import (
     GRID,
     SURE,
