@@ -44,9 +44,8 @@ WORDS = {"cnn": "noise-aware CNN", "mlp": "noise-aware MLP"} | dict.fromkeys(
 )
 
 SHORTEST, LONGEST = 3.0, 600.0  # exposures of the network of all exposures, uniform in the logarithm
-EPOCHS_OF_TASK = {
-    "fashion-mnist": 60
-}  # of that: 12 minutes of one core; 30 are 0.2 to 0.9 points worse on images held back
+# of that network: 12 minutes of one core; 30 are 0.2 to 0.9 points worse on images held back
+EPOCHS_OF_TASK = {"fashion-mnist": 60}
 OTHER_EPOCHS = 12
 STRENGTHS = {"mnist": 1.0}  # of the distortions of its training images
 OTHER_STRENGTH = 0.3

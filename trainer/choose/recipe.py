@@ -27,20 +27,16 @@ from .results import F64, balanced
 OBJECTS = 8000  # training images with their varied copies, at most: more took longer and gained little
 OBJECTS_PER_IMAGE = 16  # and of few images as many
 PIXELS_MAX = 1 << 24  # of all of them: what trains within minutes on one core
-PHOTONS = (
-    10.0,
-    20.0,
-    40.0,
-)  # what a camera detects of a decision's budget of light, where none is asked for: the least that tells enough
+# what a camera detects of a decision's budget of light, where none is asked for: the least that tells enough
+PHOTONS = (10.0, 20.0, 40.0)
 TOLD = 0.25  # of the way from chance to certainty is what a camera must tell of left-out images
 LEAST_TOLD = 0.02  # less is chance
 LEAST_GREY = 1e-3  # mean transmission: of darker images the budget would be without bound
 EXPOSURES, STATES = 32, 128  # of an automaton trained on so few images; more states learn them by heart
 FEW_STATES = 64  # where a class is so small that five sensors are trained, each in a third of the time
 EXPOSURES_PER_PHOTON = 1.2  # more exposures for more light
-FIRST_PRICE = (
-    0.2  # nats per photoelectron of the first exposure, at most; and so many times what a camera learns from one:
-)
+# nats per photoelectron of the first exposure, at most; and so many times what a camera learns from one
+FIRST_PRICE = 0.2
 PUBLIC_NATS = 1.1  # that a camera learns of the public sets at 10 photons, for which prices of light were found
 PRICE_OF_TOLD = 2.0  # dearer light stays off where bright objects tell little, and no training turns it on again
 STEPS_PER_EPOCH = 40  # fewer steps than that hardly move the patterns
@@ -60,9 +56,8 @@ TRIES: dict[str, tuple[Any, ...]] = {  # one after the other: the best of each g
     "stretch": (0.15,),
     "bend": (0.02,),
 }
-FRAMES_LIGHT = (
-    2.0  # times the light of a decision: shapes count, but a left-out image need not be matched pixel by pixel
-)
+# times the light of a decision: shapes count, but a left-out image need not be matched pixel by pixel
+FRAMES_LIGHT = 2.0
 WORLD = 5000  # images of the world, changed copies included
 LEFT_OUT_PART = 5
 LEFT_OUT_MAX = 400
@@ -70,9 +65,8 @@ FRAMES = 400  # of all left-out images, several of each where they are few
 LOSS_MAX = 4.0  # nats: one photon where no image of the class has light must not outweigh all others
 FLOOR = 5e-3  # least transmission in the posterior
 GAIN_SE = 0.5  # standard errors, over the images, of the mean gain that a change must bring
-MILD = frozenset(
-    ("turn_deg", "shift", "size")
-)  # of which the least is taken unless it clearly costs: else few images are learnt by heart
+# of which the least is taken unless it clearly costs: else few images are learnt by heart
+MILD = frozenset(("turn_deg", "shift", "size"))
 STEP_SE = 1.0  # and a larger one beyond a smaller: needless turns cost the sensor 5 points of `shapes`
 
 
@@ -240,9 +234,8 @@ class _Judge:
     def told(self, photons: float) -> float:
         """Return how far from chance (0) to certainty (1) the recalls of left-out images are, on average, at so many photons."""
         self.photons, chance = photons, 1 / len(self.task.classes)
-        mild = Variation(
-            **{name: TRIES[name][0] for name in MILD if name in TRIES}
-        )  # few images alone would tell too little
+        # few images alone would tell too little
+        mild = Variation(**{name: TRIES[name][0] for name in MILD if name in TRIES})
         right = [self._joint(*part, mild)[1] for part in zip(self.parts, self.known)]
         return (balanced(np.concatenate(right), self.labels)[0] - chance) / (1 - chance)
 
