@@ -28,7 +28,7 @@ from pans.trainer.adaptive.tune import Progress
 from pans.trainer.baselines.common import Report, Trials, named, silent
 from pans.trainer.baselines.rows import at_equal_light
 from pans.trainer.device import one_thread
-from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, decision_shares, light_of, sampled_shares
+from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, decision_shares, light_of
 from pans.trainer.evaluate.held_out import DEFAULT_TRIALS
 from pans.trainer.evaluate.walks import walks_of
 from pans.trainer.export.automaton import bundle_of, export_automaton
@@ -90,9 +90,7 @@ def judged(bundle: Bundle, varied: Task, profile: Profile, seed: int = 0, report
         photons, clicks = light.photoelectrons.sum(axis=1), light.probability.sum(axis=1)
         sent = np.full(len(objects), light.illumination)
         exact = (bundle.largest + 1) ** bundle.n_features <= EXACT_OUTCOMES_MAX
-        shares = (
-            decision_shares(bundle, light) if exact else sampled_shares(bundle, light, trials=DEFAULT_TRIALS, seed=seed)
-        )
+        shares = decision_shares(bundle, light, None if exact else DEFAULT_TRIALS, seed)
     cameras: dict[str, Trials] = {}
     if varied.light == "transmission" and photons.mean() >= LEAST_PHOTONS:
         cameras = at_equal_light(varied, float(photons.mean()), float(sent.mean()), report, seed=seed)

@@ -313,9 +313,16 @@ def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *,
     )
 
 
-def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
-    """Return P(decided class | object), float64 (n, classes), by enumeration of all count vectors, (shots + 1)**d_f of clicks."""
-    return np.clip(_expected(bundle, light, _decided(_scores_of_all(bundle, shots)), shots), 0.0, 1.0)
+def decision_shares(bundle: Bundle, light: Light, trials: int | None = None, seed: int = 0) -> F64:
+    """Return P(decided class | object) of one shot, float64 (n, classes): by enumeration of all words, or the shares of `trials`."""
+    if trials is None:
+        return np.clip(_expected(bundle, light, _decided(_scores_of_all(bundle, 1)), 1), 0.0, 1.0)
+    decider, rng = make_decider(bundle), np.random.default_rng(seed)
+    objects = np.arange(len(light.probability))
+    decided = np.zeros((len(objects), bundle.n_classes), np.int64)
+    for _ in range(trials):
+        decided[objects, decider.decide_batch(light.counts(1, rng), 1)] += 1
+    return decided / trials
 
 
 def _decided(scores: NDArray[np.float32]) -> F64:
@@ -352,16 +359,6 @@ def _expected(bundle: Bundle, light: Light, of_outcome: F64, shots: int) -> F64:
         else:  # of several shots, afterpulses and crosstalk are in the mean
             found[part] = outcome_probabilities(chances[part], shots) @ of_outcome
     return found
-
-
-def sampled_shares(bundle: Bundle, light: Light, *, shots: int = 1, trials: int, seed: int) -> F64:
-    """Return the share of `trials` decisions per object and class, float64 (n, classes)."""
-    decider, rng = make_decider(bundle, shots=shots), np.random.default_rng(seed)
-    objects = np.arange(len(light.probability))
-    decided = np.zeros((len(objects), bundle.n_classes), np.int64)
-    for _ in range(trials):
-        decided[objects, decider.decide_batch(light.counts(shots, rng), shots)] += 1
-    return decided / trials
 
 
 def evaluate_sampled(

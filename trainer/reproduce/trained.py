@@ -14,7 +14,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.evidence import log_softmax
-from pans.trainer.evaluate.accuracy import Light, decision_shares, light_of, sampled_shares
+from pans.trainer.evaluate.accuracy import Light, decision_shares, light_of
 from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.tasks.registry import Objects, load_task
 
@@ -195,9 +195,7 @@ def _matrix(row: TrainedRow, data_dir: str | None) -> Row:
 
 def shares_of(bundle: Bundle, lit: Light, trials: int) -> F64:
     """Return P(decided class | object), (n, classes): exact where all outcomes can be enumerated, else of so many trials."""
-    if enumerable(bundle, len(lit.probability)):
-        return decision_shares(bundle, lit)
-    return sampled_shares(bundle, lit, trials=trials, seed=1)
+    return decision_shares(bundle, lit, None if enumerable(bundle, len(lit.probability)) else trials, seed=1)
 
 
 def named_confusions(matrix: F64, classes: list[str]) -> Row:

@@ -14,7 +14,7 @@ from pans.firmware_sim.scene.detector_model import detector_model
 from pans.runtime.core.calibration import CalibrationCore, calibration_exposure_us, counts_of, design_run, profile_level
 from pans.runtime.decide import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.trainer.evaluate.accuracy import Light, evaluate_exactly, evaluate_sampled, light_of, sampled_shares
+from pans.trainer.evaluate.accuracy import Light, decision_shares, evaluate_exactly, evaluate_sampled, light_of
 from pans.trainer.evaluate.readings import Numbers
 
 PROFILE = load_profile("dmd-qcmos")
@@ -66,7 +66,7 @@ def test_drawn_numbers_have_the_exact_chances() -> None:
     error = exact.accuracy_std / math.sqrt(500)
     assert abs(drawn.accuracy_mean - exact.accuracy_mean) < 4 * error
     assert drawn.clicks_mean == pytest.approx(exact.clicks_mean, abs=0.03)
-    shares = sampled_shares(BUNDLE, light, trials=200, seed=2)
+    shares = decision_shares(BUNDLE, light, trials=200, seed=2)
     assert shares.sum(axis=1).tolist() == pytest.approx([1.0] * 40)
 
 
