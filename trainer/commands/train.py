@@ -1,6 +1,6 @@
 """`pans train`: train patterns and head, or an automaton, through a profile, and export a bundle. All accuracies here are SIMULATED.
 
-What both kinds of training share is here; `train_fixed.py` and `train_automaton.py` hold one class each, with the same methods. Heavy
+What both kinds of training share is here; `trainings.py` holds a class for each, with the same methods. Heavy
 packages are imported when the command runs, not before.
 """
 
@@ -35,8 +35,7 @@ from .evaluate import warn_of_majority
 from .train_own import AUTOMATON, Finished, as_given, choose, finish, is_own, set_encoder, sheets_of
 
 if TYPE_CHECKING:
-    from .train_automaton import AutomatonTraining
-    from .train_fixed import FixedTraining
+    from .trainings import AutomatonTraining, FixedTraining
 
 SHARED = tuple(name for name in option_names(Options) if name in option_names(AutomatonOptions))
 ONLY_AUTOMATA = (*(name for name in option_names(AutomatonOptions) if name not in SHARED), "teacher", "start")
@@ -95,8 +94,7 @@ def _train(args: argparse.Namespace) -> int:
     from pans.trainer.tasks.registry import load_task
     from pans.trainer.train.checkpoint import timed
 
-    from .train_automaton import AutomatonTraining
-    from .train_fixed import FixedTraining
+    from .trainings import AutomatonTraining, FixedTraining
 
     profile = load_profile(args.profile or ("ideal" if automaton else "oled-qcmos"))
     reading = replace(reading_from(args), side=args.resize or 0) if args.as_is else reading_from(args)

@@ -17,7 +17,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.budget import check_automaton_options, started_from
 from pans.trainer.adaptive.machine import machine_of
 from pans.trainer.adaptive.train import train_automaton
-from pans.trainer.commands.train_automaton import budget_off
+from pans.trainer.commands.trainings import budget_off
 from pans.trainer.evaluate.accuracy import outcome_law_of
 from pans.trainer.evaluate.dose import within_cap
 from pans.trainer.evaluate.held_out import HeldOut
