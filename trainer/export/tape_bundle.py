@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle, write_bundle
+from pans.runtime.cli.option_fields import add_options, option, options_from
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.evaluate.readings import outcome_probabilities
 from pans.trainer.tasks.barcode import CLASSES, N_BARS, all_strings
@@ -34,25 +36,30 @@ def bar_patterns(pixels_per_bar: int, lit_px: int) -> NDArray[np.uint8]:
     return lit.reshape(N_BARS, -1)
 
 
-def word_probabilities(photons: float, dark: float) -> F64:
-    """Return P(word | string), float64 (strings, words): bit i of a word is the click of bar i, `photons` of a bright bar."""
-    return outcome_probabilities(-np.expm1(-(photons * all_strings()[0] + dark)), 1)
-
-
 def exact_table(photons: float, dark: float) -> tuple[NDArray[np.float32], float, float]:
     """Return log posteriors float32 (words, 2) for uniform strings, and the exact accuracy and mean clicks of deciding by them."""
-    _, labels = all_strings()
-    given = word_probabilities(photons, dark) / len(labels)
+    bars, labels = all_strings()
+    given = outcome_probabilities(-np.expm1(-(photons * bars + dark)), 1) / len(labels)  # bit i of a word: bar i clicks
     joint = np.stack([given[labels == label].sum(axis=0) for label in range(len(CLASSES))], axis=1)
     clicks = float((given.sum(axis=0) * np.array([int(word).bit_count() for word in range(len(joint))])).sum())
     posterior = joint / np.maximum(joint.sum(axis=1, keepdims=True), 1e-300)
     return np.log(np.maximum(posterior, FLOOR)).astype(np.float32), float(joint.max(axis=1).sum()), clicks
 
 
-def tape_bundle(
-    profile: Profile, *, photons: float, dark: float, pixels_per_bar: int, lit_px: int, exposure_us: float
-) -> tuple[Bundle, dict[str, Any]]:
-    """Return the bundle, for exposures of `exposure_us`, and its exact figures; ValueError where the projector is not bright enough."""
+@dataclass(frozen=True, slots=True)
+class Tape:
+    """How a tape is lit, and what a detector has of it."""
+
+    photons: float = option(8.0, "photoelectrons of a bright bar (default 8)")
+    dark: float = option(0.0, "dark photoelectrons per exposure (default 0)")
+    pixels_per_bar: int = option(8, "default 8")
+    lit_px: int = option(2, "lit pixels in the middle of a bar (default 2)")
+    exposure_us: float = option(5.0, "default 5")
+
+
+def tape_bundle(profile: Profile, tape: Tape) -> tuple[Bundle, dict[str, Any]]:
+    """Return the bundle and its exact figures; ValueError where the projector is not bright enough."""
+    photons, dark, lit_px, exposure_us = tape.photons, tape.dark, tape.lit_px, tape.exposure_us
     levels = profile.projector.levels
     top = profile.projector.peak_photoelectrons_hz * exposure_us * 1e-6
     level = round(photons / lit_px / top * (levels - 1))
@@ -74,8 +81,8 @@ def tape_bundle(
         name=f"tape, one bar per pattern, dark {dark:g}",
         task="barcode",
         classes=CLASSES,
-        image_shape=(1, N_BARS * pixels_per_bar),
-        optics=Shown(levels, bar_patterns(pixels_per_bar, lit_px).astype(np.uint16) * level, top / (levels - 1)),
+        image_shape=(1, N_BARS * tape.pixels_per_bar),
+        optics=Shown(levels, bar_patterns(tape.pixels_per_bar, lit_px).astype(np.uint16) * level, top / (levels - 1)),
         back_end=BackEnd(table=table),
         provenance={
             "made_by": "pans.trainer.export.tape_bundle",
@@ -91,22 +98,11 @@ def main() -> None:
     """Write the bundle and print its exact figures as JSON."""
     parser = argparse.ArgumentParser(description="a bundle for a tape of bars: one bar per pattern, exact table")
     parser.add_argument("--profile", default="flow-snspd", help="hardware profile (default flow-snspd)")
-    parser.add_argument("--photons", type=float, default=8.0, help="photoelectrons of a bright bar (default 8)")
-    parser.add_argument("--dark", type=float, default=0.0, help="dark photoelectrons per exposure (default 0)")
-    parser.add_argument("--pixels-per-bar", type=int, default=8, help="default 8")
-    parser.add_argument("--lit-px", type=int, default=2, help="lit pixels in the middle of a bar (default 2)")
-    parser.add_argument("--exposure-us", type=float, default=5.0, help="default 5")
+    add_options(parser, Tape)
     parser.add_argument("-o", "--out", type=Path, required=True, help="the bundle to write")
     parser.add_argument("--force", action="store_true", help="replace it if it exists")
     args = parser.parse_args()
-    bundle, figures = tape_bundle(
-        load_profile(args.profile),
-        photons=args.photons,
-        dark=args.dark,
-        pixels_per_bar=args.pixels_per_bar,
-        lit_px=args.lit_px,
-        exposure_us=args.exposure_us,
-    )
+    bundle, figures = tape_bundle(load_profile(args.profile), options_from(args, Tape))
     write_bundle(bundle, args.out, force=args.force)
     print(json.dumps({"bundle": str(args.out), **figures}))
 

@@ -30,7 +30,7 @@ from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.replaying import replay
 from pans.runtime.wire.messages import DARK_PATTERN
-from pans.trainer.export.tape_bundle import exact_table, tape_bundle
+from pans.trainer.export.tape_bundle import Tape, exact_table, tape_bundle
 
 PROFILE = load_profile("flow-snspd")
 
@@ -101,9 +101,7 @@ def run_tape(
     )
     (folder / "flow.toml").write_text(f'kind = "tape"\nbars_per_s = 50000.0\nblock_us = 500.0\n{more}')
     profile = load_profile(str(folder / "tape-profile.toml"))
-    bundle, figures = tape_bundle(
-        profile, photons=8.0, dark=max(dark, 0.0), pixels_per_bar=8, lit_px=2, exposure_us=5.0
-    )
+    bundle, figures = tape_bundle(profile, Tape(dark=max(dark, 0.0)))
     write_bundle(bundle, folder / "tape.pans")
     device = f"sim:{folder / 'tape-profile.toml'}?scene={folder / 'tape.toml'}&seed=9&pace=fast"
     words = (folder / "tape.pans", "--device", device, "--flow", folder / "flow.toml", "--out", folder)
