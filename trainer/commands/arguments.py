@@ -12,6 +12,7 @@ from math import floor
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import say, warn
+from pans.runtime.cli.reading_bar import work_bar
 from pans.runtime.errors import UsageError
 from pans.runtime.images import SIDE_PX, Reading
 from pans.runtime.instrument.profile import Profile
@@ -132,7 +133,7 @@ def displayed_progress(quantity: str) -> Iterator[Show]:
         def show(words: str, value: float, done: int, steps: int, _due: bool) -> None:
             values.append(value)
             bar.update(line, completed=done, total=steps, description="done")
-            live.update(Group(bar, Text(words), Text(f"{quantity} {curve(values)}" if quantity else "")))
+            live.update(Group(bar, Text(words), Text(f"{quantity} {curve(values)}")))
 
         yield show
 
@@ -141,13 +142,14 @@ def displayed_progress(quantity: str) -> Iterator[Show]:
 def displayed_parts() -> Iterator[Callable[[str, float], None]]:
     """Yield a `Report` of pieces of work: a bar on a terminal, else a line per quarter of each piece; both on stderr."""
     last = 0
-    with displayed_progress("") as show:
+    with work_bar() as bar:
 
         def report(what: str, done: float) -> None:
             nonlocal last
             quarter = floor(4 * done)
-            due = quarter > last and not what.startswith("posterior")
+            if quarter > last and not (what.startswith("posterior") or sys.stderr.isatty()):
+                say(f"  {25 * quarter} %  {what}")
             last = quarter
-            show(f"  {25 * quarter} %  {what}", done, round(1000 * done), 1000, due)
+            bar(what, done)
 
         yield report

@@ -26,7 +26,7 @@ from pans.runtime.ranges import Range
 from pans.runtime.safe_text import one_line
 from pans.trainer.options import LEAST_PHOTONS, Conditions
 
-from .arguments import add_data_dir, displayed_parts, displayed_progress, needing, warn_of_laws
+from .arguments import add_data_dir, displayed_parts, needing, warn_of_laws
 
 if TYPE_CHECKING:
     from pans.trainer.evaluate.accuracy import Measured, MeasuredPictures
@@ -383,8 +383,8 @@ def bleaching_given(args: argparse.Namespace) -> Bleaching:
 @contextmanager
 def _counted(what: str) -> Iterator[Callable[[int, int], None]]:
     """Yield a report of how many are done, of how many."""
-    with displayed_progress(f"{what}s") as show:
-        yield lambda n, of: show(f"{what} {n} of {of}", n, n, of, n == of)
+    with displayed_parts() as report:
+        yield lambda n, of: report(f"{what} {n} of {of}", n / of)
 
 
 def _over_draws(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> Answer:
