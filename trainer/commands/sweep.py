@@ -69,8 +69,8 @@ def _run(args: argparse.Namespace) -> int:
 
     def objective(trial: Any) -> float:
         trained = train(task, profile, suggest(trial, base))
-        say(f"trial {trial.number}: validation loss {trained.validation_loss:.4f}  {trial.params}")
-        return trained.validation_loss
+        say(f"trial {trial.number}: validation loss {min(trained.validation_losses):.4f}  {trial.params}")
+        return min(trained.validation_losses)
 
     finished = optuna.trial.TrialState.COMPLETE
     try:

@@ -188,9 +188,7 @@ def solve(options: Options, profile: Profile) -> Trained:
     head = new_head(options, 2, (1, N_BARS), random)
     fit_head(head, p, labels, cross_entropy, random, shots=options.shots)
     losses = tuple(1 - one.accuracy for one in found)
-    return Trained(
-        shown, best.patterns.float().numpy(), encoder, head, p.mean(dim=0), law, min(losses), losses, options
-    )
+    return Trained(shown, encoder, head, p.mean(dim=0), law, losses, options)
 
 
 def search(task: Task, profile: Profile, options: Options, size: int) -> Trained:
@@ -216,7 +214,7 @@ def search(task: Task, profile: Profile, options: Options, size: int) -> Trained
     head = new_head(options, 2, task.image_shape, random)
     fit_head(head, p, labels.repeat(len(views)), cross_entropy, random, rate=options.head_rate)
     losses = tuple(wrong.tolist())
-    return Trained(None, None, in_pixels(encoder, fields), head, p.mean(dim=0), law, min(losses), losses, options)
+    return Trained(None, in_pixels(encoder, fields), head, p.mean(dim=0), law, losses, options)
 
 
 def descend(shown: Tensor, labels: Tensor, law: Law, options: Options) -> Tensor:

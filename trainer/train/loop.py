@@ -131,12 +131,10 @@ class Trained:
     """A finished model: the shown patterns, the head in evaluation mode, the law it was trained for."""
 
     quantised: QuantisedPatterns | None  # of active sensing; None of a passive encoder
-    float_patterns: Any  # float32 (d_f, pixels) numpy: the patterns before they became whole levels; None likewise
     encoder: Encoder
     head: Heads
     click_mean: Tensor  # mean of what the head is given of every pattern over the training objects, float64 (d_f,)
     law: Law | CountLaw
-    validation_loss: float
     validation_losses: tuple[float, ...]  # of all restarts
     options: Options
 
@@ -353,7 +351,7 @@ class Run:
 
     def finish(self, losses: tuple[float, ...]) -> Trained:
         """Freeze the optics (active: as levels), then fit the head to what they show of all training objects."""
-        quantised, floats = None, None
+        quantised = None
         if isinstance(self.encoder, ActiveIllumination):
             if self.encoder.levels != self.profile.projector.levels:  # too few epochs for the stage of whole levels
                 self.encoder.start_quantising(self.profile.projector.levels)
@@ -379,7 +377,7 @@ class Run:
         mean, law = self.readings.mean(p).mean(dim=0).cpu(), self.law()
         self.encoder.cpu()  # what follows is export and judgement
         self.head.cpu()
-        return Trained(quantised, floats, self.encoder, self.head, mean, law, min(losses), losses, self.options)
+        return Trained(quantised, self.encoder, self.head, mean, law, losses, self.options)
 
     # ---- checkpoints ----
 

@@ -177,7 +177,7 @@ def test_a_followed_training_ends_where_an_ordinary_one_does(task):
     course = follow(task, profile, SMALL, patterns_after=(1, 6))
     plain = train(task, profile, SMALL)
     assert np.array_equal(course.trained.quantised.pattern_levels, plain.quantised.pattern_levels)
-    assert course.trained.validation_loss == plain.validation_loss
+    assert min(course.trained.validation_losses) == min(plain.validation_losses)
     columns = course.columns
     assert columns["loss"][-1] < columns["loss"][0]
     assert list(course.patterns) == [1, 6]
