@@ -11,7 +11,7 @@ from trainings import columns_task, short_fits  # noqa: F401 - a fixture
 
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import Options
-from pans.trainer.reproduce import curves, dynamics, readouts, ways
+from pans.trainer.reproduce import curves, readouts, ways
 from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
 from pans.trainer.train.history import follow
 from pans.trainer.train.loop import train
@@ -186,36 +186,36 @@ def test_a_followed_training_ends_where_an_ordinary_one_does(task):
 
 def test_a_stage_tells_how_uneven_patterns_are():
     epochs = {key: [1.0, 2.0] for key in ("held_out", "held_out_first_200", "clicks", "photons", "illumination")}
-    even = dynamics.stage_row(epochs, 1, np.ones((2, 10)))
+    even = curves.stage_row(epochs, 1, np.ones((2, 10)))
     assert (even["peak"], even["half_of_light"], even["dark_pixels"]) == (1, pytest.approx(50), 0)
     spot = np.zeros((2, 10))
     spot[0, 3] = 20.0
-    uneven = dynamics.stage_row(epochs, 2, spot)
+    uneven = curves.stage_row(epochs, 2, spot)
     assert (uneven["peak"], uneven["least"], uneven["most"], uneven["value"]) == (20, 0.0, 2.0, 2.0)
     assert (uneven["half_of_light"], uneven["dark_pixels"]) == pytest.approx((5, 95))
 
 
 @pytest.mark.usefixtures("short_fits")
 def test_pages_of_trainings_are_made_once_and_collected(task, asked, tmp_path, monkeypatch):
-    monkeypatch.setattr(dynamics, "load_task", lambda *_: task)
-    monkeypatch.setattr(dynamics, "CELLS", {dynamics.SHORT: ((3, 0.0), (3, 0.1)), dynamics.PAPER: ((3, 0.1),)})
-    monkeypatch.setattr(dynamics, "SHOWN", (3, 0.1))
-    monkeypatch.setattr(dynamics, "STAGES", (1, 6))
-    more = {dynamics.SHORT: 0, dynamics.PAPER: 1}
+    monkeypatch.setattr(curves, "load_task", lambda *_: task)
+    monkeypatch.setattr(curves, "CELLS", {curves.SHORT: ((3, 0.0), (3, 0.1)), curves.PAPER: ((3, 0.1),)})
+    monkeypatch.setattr(curves, "SHOWN", (3, 0.1))
+    monkeypatch.setattr(curves, "STAGES", (1, 6))
+    more = {curves.SHORT: 0, curves.PAPER: 1}
 
-    def options(_features, alpha, schedule=dynamics.SHORT):
+    def options(_features, alpha, schedule=curves.SHORT):
         return dataclasses.replace(SMALL, alpha=alpha, epochs=SMALL.epochs + more[schedule])
 
-    monkeypatch.setattr(dynamics, "options_of", options)
+    monkeypatch.setattr(curves, "options_of", options)
     page, _ = asked
-    assert dynamics.evolution_page(dataclasses.replace(page, collect=True)).rows == []
-    made = dynamics.alpha_page(page)
+    assert curves.evolution_page(dataclasses.replace(page, collect=True)).rows == []
+    made = curves.alpha_page(page)
     free, held, longer = of_table(made.rows, "alpha")
     assert held["illumination"] < free["illumination"]
     assert (held["of_epochs"], longer["of_epochs"]) == (6, 7)
     assert held["ahead"] == pytest.approx(held["value"] - free["value"])
     assert "ahead" not in free
-    stages = dynamics.evolution_page(dataclasses.replace(page, collect=True))
+    stages = curves.evolution_page(dataclasses.replace(page, collect=True))
     assert [row["epoch"] for row in stages.rows] == [1, 6]
     write(tmp_path, "evolution", stages)
     write(tmp_path, "alpha", made)

@@ -4,7 +4,7 @@ import pytest
 
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import check_options
-from pans.trainer.reproduce import active, dynamics, passive, sequence
+from pans.trainer.reproduce import active, curves, passive, sequence
 from pans.trainer.reproduce.printed import ACTIVE, PASSIVE, recipe
 
 IDEAL = load_profile("ideal")
@@ -51,8 +51,8 @@ def test_recipes_of_the_other_tasks_can_be_trained():
 
 
 def test_recipes_of_trainings_that_are_followed_can_be_trained():
-    for schedule, cells in dynamics.CELLS.items():
+    for schedule, cells in curves.CELLS.items():
         for features, alpha in cells:
-            check_options(dynamics.options_of(features, alpha, schedule), IDEAL)
-    assert dynamics.STAGES[-1] == dynamics.options_of(*dynamics.SHOWN).epochs
+            check_options(curves.options_of(features, alpha, schedule), IDEAL)
+    assert curves.STAGES[-1] == curves.options_of(*curves.SHOWN).epochs
     check_options(sequence.OPTIONS, IDEAL)
