@@ -58,48 +58,39 @@ PATTERNS = Range(1, 4096, whole=True)
 class Options:
     """What to train. `alpha` weighs the illumination; `photons`, `clicks` and `illumination` are targets per inference, held by weights."""
 
-    features: int = option(MISSING, "number of patterns (not of an automaton)", range=PATTERNS, metavar="D")
-    alpha: float | None = option(
-        None, "weight of the illumination in the loss (default 0.0003)", range=NONE_OR_LIGHT, metavar="A"
-    )
-    photons: float | None = option(None, "photoelectrons per decision to aim for", range=LIGHT, metavar="B")
-    clicks: float | None = option(None, "clicks per decision to aim for, beside either", range=LIGHT, metavar="C")
+    features: int = option(MISSING, "number of patterns (not of an automaton)", range=PATTERNS)
+    alpha: float | None = option(None, "weight of the illumination in the loss (default 0.0003)", range=NONE_OR_LIGHT)
+    photons: float | None = option(None, "photoelectrons per decision to aim for", range=LIGHT)
+    clicks: float | None = option(None, "clicks per decision to aim for, beside either", range=LIGHT)
     estimator: str = option(
         "exact", "default: exact up to 12 patterns, else local; of pictures ste", choices=ESTIMATOR_NAMES
     )
-    epochs: int = option(
-        60, "passes over the training objects (default 60; of an automaton 6)", range=EPOCHS, metavar="E"
-    )
-    seed: int = option(0, "of everything random (default 0)", range=SEED, metavar="N")
-    restarts: int = option(1, "trainings; the best on validation stays", range=THOUSAND, metavar="R")
-    starts: int = option(
-        1, "runs of the first stage per restart; the best is trained to the end", range=THOUSAND, metavar="S"
-    )
-    warm: float = option(0.3, "part of the epochs in the first stage, if another follows", range=SHARE, metavar="W")
+    epochs: int = option(60, "passes over the training objects (default 60; of an automaton 6)", range=EPOCHS)
+    seed: int = option(0, "of everything random (default 0)", range=SEED)
+    restarts: int = option(1, "trainings; the best on validation stays", range=THOUSAND)
+    starts: int = option(1, "runs of the first stage per restart; the best is trained to the end", range=THOUSAND)
+    warm: float = option(0.3, "part of the epochs in the first stage, if another follows", range=SHARE)
     head: str = option("mlp", "digital back end (default mlp; picture where the task asks for it)", choices=HEADS)
-    hidden: int = option(512, "hidden units of the head (default 512)", range=Range(1, 65536, whole=True), metavar="H")
-    batch: int = option(512, "objects per step (default 512; of an automaton 250)", range=BATCH, metavar="B")
+    hidden: int = option(512, "hidden units of the head (default 512)", range=Range(1, 65536, whole=True))
+    batch: int = option(512, "objects per step (default 512; of an automaton 250)", range=BATCH)
     front_rate: float = 1e-2
     head_rate: float = 1e-3
     constant: bool = False  # learning rates as in the paper, instead of one cycle per estimator
     # of the light at the start; rises or falls to 1 within stage 1
-    slope: float = option(1.0, "slope annealing: light at the start times S", range=Range(1e-9, 1e6), metavar="S")
-    clamp: float = option(math.inf, "clamp photoelectrons early in training", range=LIGHT, metavar="L")
+    slope: float = option(1.0, "slope annealing: light at the start times N", range=Range(1e-9, 1e6))
+    clamp: float = option(math.inf, "clamp photoelectrons early in training", range=LIGHT)
     similarity: float = option(
-        0.0,
-        "of pictures: share of 1 - SSIM in the loss, the rest being the squared error (default 0)",
-        range=SHARE,
-        metavar="S",
+        0.0, "of pictures: share of 1 - SSIM in the loss, the rest being the squared error (default 0)", range=SHARE
     )
-    polish: float = option(0.0, "last part of the epochs, trained for decisions (default 0)", range=SHARE, metavar="P")
+    polish: float = option(0.0, "last part of the epochs, trained for decisions (default 0)", range=SHARE)
     encoder: str = "active"
     complex_field: bool = option(False, "a coherent encoder's W is complex, not real")
     conserving: bool = option(False, "a passive encoder gives no more light than it gets (default)")
     input_photons: float | None = option(
-        None, "mean photoelectrons that reach a passive encoder in one exposure", range=LIGHT, metavar="N"
+        None, "mean photoelectrons that reach a passive encoder in one exposure", range=LIGHT
     )
     dark: float | None = option(
-        None, "dark photoelectrons per exposure in training, instead of the profile's", range=NONE_OR_LIGHT, metavar="R"
+        None, "dark photoelectrons per exposure in training, instead of the profile's", range=NONE_OR_LIGHT
     )
     budget: str = option(
         "firm",
@@ -107,17 +98,14 @@ class Options:
         choices=tuple(BUDGETS),
     )
     light: float = 1.0  # of the initial patterns, times the paper's
-    mix: float = option(
-        0.0, "share of the loss of 2 to K shots, for patterns too (default 0)", range=SHARE, metavar="M"
-    )
-    shots: int = option(1, "fit the head to 1 to K shots (default 1)", range=Range(1, 64, whole=True), metavar="K")
-    shift_px: int = option(0, "move training images by up to X along the rows (default 0)", range=PIXELS, metavar="X")
-    offset_px: int = option(0, "and by up to Y across them (default 0)", range=PIXELS, metavar="Y")
+    mix: float = option(0.0, "share of the loss of several shots, for patterns too (default 0)", range=SHARE)
+    shots: int = option(1, "fit the head to 1 to N shots (default 1)", range=Range(1, 64, whole=True))
+    shift_px: int = option(0, "move training images by up to N pixels along the rows (default 0)", range=PIXELS)
+    offset_px: int = option(0, "and by up to N across them (default 0)", range=PIXELS)
     copies: int = option(
         0,
         "add N distorted copies of every training image: turned, stretched, bent a little (default 0; of an automaton for mnist 20)",
         range=UP_TO_THOUSAND,
-        metavar="N",
     )
     bleach: str | None = option(
         None,
@@ -133,16 +121,14 @@ class Options:
         2,
         "outcomes of an exposure; 3: no photon, one, two or more, on a detector that counts (default 2)",
         range=OUTCOMES,
-        metavar="K",
     )
     spread: float = option(
         0.0,
         "weight in the loss of how concentrated the light of a pattern is, for optics that are not perfect (default 0)",
         range=TENFOLD,
-        metavar="W",
     )
     illumination: float | None = option(
-        None, "photoelectrons to send per decision, summed over all pixels of all patterns", range=LIGHT, metavar="L"
+        None, "photoelectrons to send per decision, summed over all pixels of all patterns", range=LIGHT
     )
 
 
@@ -156,19 +142,14 @@ class AutomatonOptions:
 
     photons: float | None = option(None, "photoelectrons per decision to aim for", range=BUDGET)
     clicks: float | None = option(None, "clicks per decision to aim for", range=BUDGET)
-    illumination: float | None = option(None, "photoelectrons to send per decision", range=LIGHT, metavar="L")
+    illumination: float | None = option(None, "photoelectrons to send per decision", range=LIGHT)
     dose_cap: float | None = option(
         None,
         "photoelectrons that no walk sends more of: exposure by exposure every walk sends the same light",
         range=LIGHT,
-        metavar="N",
     )
-    exposures: int = option(
-        0, "exposures per decision (default: by the budget)", range=Range(0, SLOTS_MAX, whole=True), metavar="T"
-    )
-    states: int = option(
-        0, "most states per exposure (default: by the budget)", range=Range(0, STATES_MAX, whole=True), metavar="S"
-    )
+    exposures: int = option(0, "exposures per decision (default: by the budget)", range=Range(0, SLOTS_MAX, whole=True))
+    states: int = option(0, "most states per exposure (default: by the budget)", range=Range(0, STATES_MAX, whole=True))
     seed: int = option(0, "of everything random", range=SEED)
     batch: int = option(250, "objects per step", range=BATCH)
     grow_epochs: int = 2
@@ -179,8 +160,8 @@ class AutomatonOptions:
     tune_epochs: int | None = None  # of grey patterns; None: 3, or 0 through optics, where they brought nothing
     epochs: int = option(6, "of the patterns as they are displayed", range=EPOCHS)
     tune_rate: float = 0.005
-    rate: float = option(0.01, "learning rate of its last stage (default 0.01)", range=SHARE, metavar="R")
-    reroutes: int = option(2, "sweeps that move edges to better states (default 2)", range=UP_TO_THOUSAND, metavar="R")
+    rate: float = option(0.01, "learning rate of its last stage (default 0.01)", range=SHARE)
+    reroutes: int = option(2, "sweeps that move edges to better states (default 2)", range=UP_TO_THOUSAND)
     shift_px: int = option(0, "along the rows, anew in every epoch", range=PIXELS)
     offset_px: int = option(0, "and across them", range=PIXELS)
     copies: int | None = option(
@@ -188,25 +169,19 @@ class AutomatonOptions:
     )
     grey: bool = option(False, "patterns in all levels, not one bit and a brightness")
     # at full strength distortions cost more than they bring
-    strength: float = option(0.3, "of the distortions, times the usual (default 0.3)", range=TENFOLD, metavar="F")
+    strength: float = option(0.3, "of the distortions, times the usual (default 0.3)", range=TENFOLD)
     # from the second epoch of the last stage on; the rest is the log loss
-    decide: float = option(
-        0.7, "part of the last loss that counts wrong decisions (default 0.7)", range=SHARE, metavar="F"
-    )
+    decide: float = option(0.7, "part of the last loss that counts wrong decisions (default 0.7)", range=SHARE)
     exposure_price: float = option(
-        0.0, "nats per exposure; walks then end early where that pays (default 0)", range=TENFOLD, metavar="P"
+        0.0, "nats per exposure; walks then end early where that pays (default 0)", range=TENFOLD
     )
     patterns: int = option(
         0,
         "most different patterns, which states share (default: the projector's memory)",
         range=Range(0, 65_535, whole=True),
-        metavar="P",
     )
     soft: float | None = option(
-        None,
-        "weight of a network's answers in the targets (default: 0.5 for fashion-mnist, else 0)",
-        range=SHARE,
-        metavar="W",
+        None, "weight of a network's answers in the targets (default: 0.5 for fashion-mnist, else 0)", range=SHARE
     )
     teacher_epochs: int = 6  # of that network
     dark: float | None = option(None, "dark photoelectrons per exposure, instead of the profile's", range=NONE_OR_LIGHT)
@@ -218,7 +193,6 @@ class AutomatonOptions:
         1,
         "detectors that are read at once, each with a pattern of its own (default 1, at most 4)",
         range=Range(1, CHANNELS_MAX, whole=True),
-        metavar="C",
     )
     start: str | None = None  # sha256 of the bundle whose automaton is trained on, instead of one that grows
 
@@ -234,7 +208,7 @@ class BaselineOptions:
 
     paradigm: str = option(MISSING, "how the object is measured", flag="paradigm", choices=tuple(METHODS))
     method: str = option(MISSING, "; ".join(f"{k}: {', '.join(v)}" for k, v in METHODS.items()), metavar="M")
-    features: int = option(32, "patterns, masks or pairs, unless direct (default 32)", range=PATTERNS, metavar="D")
+    features: int = option(32, "patterns, masks or pairs, unless direct (default 32)", range=PATTERNS)
     patterns: str = option("binary", "of compressive sensing", choices=("binary", "hadamard"))
     detector: str = option(
         "counting", "Poisson counts, or one click at most (default counting)", choices=("counting", "binary")
@@ -242,27 +216,21 @@ class BaselineOptions:
     brightness: str = option(
         "source", "one source for all objects (default), or every object gives N photons", choices=("source", "object")
     )
-    floor: float | None = option(
-        None, "of bayes: least transmission (default: chosen)", range=Range(1e-9, 1 - 1e-9), metavar="F"
-    )
-    dark: float = option(0.0, "dark photoelectrons per readout", range=NONE_OR_LIGHT, metavar="R")
-    bits: int = option(4, "of qat: bits of a detected value (default 4)", range=Range(1, 16, whole=True), metavar="B")
+    floor: float | None = option(None, "of bayes: least transmission (default: chosen)", range=Range(1e-9, 1 - 1e-9))
+    dark: float = option(0.0, "dark photoelectrons per readout", range=NONE_OR_LIGHT)
+    bits: int = option(4, "of qat: bits of a detected value (default 4)", range=Range(1, 16, whole=True))
     epochs: int | None = option(
         None,
         "of a network (default: 5 CNN, 10 MLP and pairs, 15 end-to-end and masks, stopping by the task)",
         range=Range(1, 10_000, whole=True),
-        metavar="E",
     )
     trials: int | None = option(
-        None,
-        "readouts per object (default: bayes 2, stopping 1, others 10)",
-        range=Range(1, 100_000, whole=True),
-        metavar="N",
+        None, "readouts per object (default: bayes 2, stopping 1, others 10)", range=Range(1, 100_000, whole=True)
     )
     information: bool = option(
         False, "of bayes, on a counting detector: bits that the readouts know of the label, and Fisher's ratio"
     )
-    seed: int = option(0, "of everything random (default 0)", range=SEED, metavar="N")
+    seed: int = option(0, "of everything random (default 0)", range=SEED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,15 +242,12 @@ class Conditions:
     dark: float | None = option(
         None, "dark photoelectrons per exposure, instead of the profile's", type=float, metavar="R"
     )
-    seed: int = option(0, "of the trials (default 0)", range=SEED, metavar="N")
-    data_seed: int | None = option(
-        None, "of a drawn task (default: that of the bundle's training)", range=SEED, metavar="N"
-    )
+    seed: int = option(0, "of the trials (default 0)", range=SEED)
+    data_seed: int | None = option(None, "of a drawn task (default: that of the bundle's training)", range=SEED)
     confidence: float = option(
         0.0,
         "of an automaton: decide as soon as a class is this probable, abstain if none is at the end",
         range=CONFIDENCE_RANGE,
-        metavar="C",
     )
     imaging: Imaging | None = None  # how objects stand on the grid of the patterns; None: as the profile states
     bleaching: Bleaching = NO_BLEACHING  # what the light does to the objects, each of them fresh when it comes

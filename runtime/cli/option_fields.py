@@ -20,8 +20,9 @@ Options = TypeVar("Options")
 def option(default: Any, help: str, *, range: Range | None = None, group: str = "", **words: Any) -> Any:
     """Return a field that is an option; `words` are those of `ArgumentParser.add_argument`, or `flag`, the option's name.
 
-    Without `flag` an option is named like its field, without `type` or `range` it is of the default's type; MISSING makes it a required
-    one. A flag without `--` is an argument by place. True or False makes an option without a value; a tuple goes with action="append".
+    Without `flag` an option is named like its field, without `type` or `range` it is of the default's type, and with a range the help
+    calls its value N; MISSING makes it a required one. A flag without `--` is an argument by place. True or False makes an option
+    without a value; a tuple goes with action="append".
     `choices` may be a call that returns them, `group` is the heading in the help.
     """
     return field(default=default, metadata={"help": help, "range": range, "group": group, **words})
@@ -61,6 +62,8 @@ def _words_of(one: Field[Any], flag: str, default: Any) -> dict[str, Any]:
         words |= {"required": True} if needed else {"default": default}
     if one.metadata["range"] is not None:
         words.setdefault("type", one.metadata["range"].option)
+        if flag.startswith("-"):
+            words.setdefault("metavar", "N")
     elif isinstance(default, int | float | Path):
         words.setdefault("type", type(default))
     return words

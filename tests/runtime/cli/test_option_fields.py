@@ -19,7 +19,7 @@ class Lamp:
 
     place: Path = option_fields.option(Path(), "where", flag="place")
     serial: str = option_fields.option(MISSING, "which")
-    level: int = option_fields.option(3, "how bright", range=Range(0, 9, whole=True), metavar="N")
+    level: int = option_fields.option(3, "how bright", range=Range(0, 9, whole=True))
     rate_hz: float = option_fields.option(2.5, "how often", group="blinking")
     colour: str = option_fields.option("red", "of the light", choices=lambda: ("red", "blue"))
     names: tuple[str, ...] = option_fields.option((), "of it", flag="--name", action="append")
