@@ -63,7 +63,7 @@ class FixedTraining:
     def run(self, show: Show, checkpoint: Path) -> None:
         """Train; KeyboardInterrupt passes through, with the checkpoint on disk."""
         options = self.options
-        self.history = None if self.args.history is None else History(checkpoint, options, self.varied.sha256)
+        self.history = None if self.args.history is None else History(options.epochs)
         step, steps = max(1, options.epochs // 10), options.epochs * options.restarts
 
         def report(epoch: EpochReport) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -26,7 +26,6 @@ from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.options import Options
 from pans.trainer.tasks.registry import Task
 
-from .checkpoint import read_checkpoint
 from .data import CHUNK, TrainingData, encoder_input
 from .loop import EpochReport, Run, Trained
 
@@ -45,28 +44,25 @@ QUANTITIES = (
 class History:
     """The reports of all epochs; `write` makes the file and the pictures."""
 
-    def __init__(self, checkpoint: Path, options: Options, data_sha256: str) -> None:
+    def __init__(self, epochs: int) -> None:
         self.epochs: list[EpochReport] = []
         self.patterns: dict[int, NDArray[np.float32]] = {}  # of the first restart, after that many epochs
-        self._checkpoint, self._options, self._data_sha256 = checkpoint, options, data_sha256
-        last = max(1, options.epochs - 1)
-        self._wanted = {round(math.exp(math.log(last) * i / (STEPS_SHOWN - 1))) for i in range(STEPS_SHOWN)}
+        self._last = epochs
+        before = max(1, epochs - 1)
+        self._wanted = {round(math.exp(math.log(before) * i / (STEPS_SHOWN - 1))) for i in range(STEPS_SHOWN)}
 
     def add(self, report: EpochReport) -> None:
-        """Note one epoch. The checkpoint on disk is that of the epoch before."""
-        self.epochs.append(report)
-        before = report.epoch - 1
-        if report.restart == 0 and before in self._wanted and self._checkpoint.is_file():
-            state = read_checkpoint(self._checkpoint, self._options, self._data_sha256)["run"]
-            if state["epoch"] == before:
-                self.patterns[before] = _shown(state["encoder"]["weight"].numpy(), self._options.encoder)
+        """Note one epoch."""
+        self.epochs.append(replace(report, patterns=report.patterns[:0]))
+        if report.restart == 0 and report.epoch in self._wanted:
+            self.patterns[report.epoch] = report.patterns
 
     def write(
         self, folder: Path, last: NDArray[np.floating] | None, image_shape: tuple[int, int], *, force: bool = False
     ) -> list[Path]:
         """Write history.json, curves.png and evolution.png; `last` (d_f, pixels) are the patterns in the end."""
         if last is not None:
-            self.patterns[self._options.epochs] = np.asarray(last, np.float32)
+            self.patterns[self._last] = np.asarray(last, np.float32)
         written = write_course(folder, self.epochs, {"patterns_at": sorted(self.patterns)}, force=force)
         if self.patterns:
             draw_evolution(folder / "evolution.png", self.patterns, image_shape, force=force)
@@ -80,6 +76,8 @@ def write_course(
     """Write history.json (`reports` of either kind of training, and `more`) and curves.png into `folder`; return both paths."""
     make_folder(folder)
     facts = {"simulated": True, "epochs": [asdict(report) for report in reports], **more}
+    for epoch in facts["epochs"]:
+        epoch.pop("patterns", None)
     write_file(folder / "history.json", (json.dumps(facts, indent=1) + "\n").encode(), force=force)
     draw_curves(folder / "curves.png", reports, force=force)
     return [folder / "history.json", folder / "curves.png"]
@@ -126,13 +124,6 @@ def draw_evolution(
     save_figure(figure, path, force=force)
 
 
-def _shown(weight: NDArray[np.float32], encoder: str) -> NDArray[np.float32]:
-    """Intensities of active patterns and incoherent optics, the modulus of a coherent W."""
-    if encoder != "coherent":
-        return np.asarray(weight**2, np.float32)
-    return np.asarray(np.sqrt((weight**2).sum(axis=0)), np.float32)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
     """Columns of figures over all epochs, the patterns (d_f, pixels) after some of them, and the finished model.
@@ -158,18 +149,18 @@ def follow(task: Task, profile: Profile, options: Options, *, patterns_after: tu
     patterns: dict[int, NDArray[np.float32]] = {}
     while run.epoch < options.epochs:
         trained = run.one_epoch()
+        shown = trained.patterns
         of_training = _right(run, data.shown[:n], data.labels[:n], random)
         of_held_out = _right(run, held_out, labels, random)
-        intensity = (run.encoder.weight.detach() ** 2).cpu().numpy()
         figures = {"loss": trained.loss, "training": 100 * float(of_training.mean())}
         figures |= {"held_out": 100 * float(of_held_out.mean())}
         figures |= {"held_out_first_200": 100 * float(of_held_out[:FIRST].mean())}
         figures |= {key: getattr(trained, key) for key in ("clicks", "photons", "illumination")}
-        figures |= {"peak": float(intensity.max() / intensity.mean())}
+        figures |= {"peak": float(shown.max() / shown.mean())}
         for key, value in figures.items():
             columns.setdefault(key, []).append(float(f"{value:.5g}"))
         if run.epoch in patterns_after:
-            patterns[run.epoch] = intensity
+            patterns[run.epoch] = shown
     return Course(columns, patterns, run.finish((run.validation_loss(),)))
 
 

@@ -16,11 +16,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
@@ -120,6 +122,7 @@ class EpochReport:
     restart: int
     epoch: int
     stage: str
+    patterns: NDArray[np.float32] = field(repr=False, compare=False)  # (d_f, pixels), or the modulus of W
     loss: float
     clicks: float
     photons: float
@@ -256,7 +259,9 @@ class Run:
             sums += torch.stack([loss, clicks, photons, illumination]).detach().double()
         stage = stage_at(options, self.epoch)
         self.epoch += 1
-        return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
+        squares = self.encoder.weight.detach().cpu().square()
+        shown = squares.sum(dim=0).sqrt() if options.encoder == "coherent" else squares
+        return EpochReport(self.restart, self.epoch, stage, shown.numpy(), *(sums / len(batches)).tolist())
 
     def _several_shots(self, p: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
         """The loss of mean clicks of 2 to `shots` shots, straight-through: the more shots, the smaller its bias."""
