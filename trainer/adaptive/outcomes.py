@@ -21,10 +21,9 @@ from pans.runtime.instrument.click_law import (
     count_law,
     outcome_weights,
     outcomes_of,
-    survival_coefficients,
 )
 from pans.runtime.instrument.profile import Profile
-from pans.trainer.model.detection import counted_mean
+from pans.trainer.model.detection import counted_mean, kept_coefficients
 
 MEAN_MAX = 100.0  # beyond it no detector of a profile stays dark, and high powers of the mean leave float32
 NEGLIGIBLE = 1e-8  # c_k k!: the chance to miss that many photoelectrons, below which the term is left out
@@ -110,24 +109,14 @@ def slope_of(falls: tuple[Tensor, ...], gains: list[Tensor], law: Law) -> Tensor
     return slope
 
 
-def kept_coefficients(law: ClickLaw) -> tuple[float, ...]:
-    """Return the c_k of `1 - p = exp(-mu) sum_k c_k mu^k` that count in float32; (1.0,) is the plain Poisson law."""
-    kept, factorial = [], 1.0
-    for k, coefficient in enumerate(survival_coefficients(law).tolist()):
-        factorial *= max(1, k)
-        if coefficient * factorial > NEGLIGIBLE:
-            kept.append(coefficient)
-    return tuple(kept)
-
-
 def no_click(light: Tensor, law: ClickLaw) -> tuple[Tensor, Tensor]:
     """Return the probability of no click, and how fast it falls with `light` (photoelectrons): both of the shape of `light`.
 
     The fall is -d/d(light), which is the slope of the click probability. With the plain law and no dead time both are the same tensor.
     """
-    coefficients = kept_coefficients(law)
+    coefficients = kept_coefficients(law, NEGLIGIBLE)
     blinded = law.dead_time.reach > 0
-    if coefficients == (1.0,) and not blinded:
+    if coefficients == [1.0] and not blinded:
         dark = torch.exp(-(light + law.dark_per_exposure)) if law.dark_per_exposure else torch.exp(-light)
         return dark, dark
     mean, slope = counted_mean((light + law.dark_per_exposure).clamp(max=MEAN_MAX), law.dead_time)

@@ -2,7 +2,7 @@
 
 - **Decisions** (`conveyed`): what the posteriors that stand behind them convey of the label, per decision and per unit of light.
 - **Click words** (`word_information`): all 2**d_f click words of one shot are enumerated, so that I(label; clicks) of a set of
-  objects is a sum, not an estimate. On the training objects it is optimistic about new ones: quote the held-out figures.
+  objects is a sum, not an estimate. Posteriors are of the training objects, figures of others.
 - **Frames** (`posterior_information`): nothing can be enumerated. A posterior q gives I >= H(label) - E[-log2 q(label)],
   whatever q is; the gap is how wrong q is. The mixture over the training objects knows the noise exactly and the world only as
   far as those objects go: at few photons the bound is tight, at many it is not (a network may know more).
@@ -74,15 +74,11 @@ def surprises(scores: NDArray[np.floating[Any]]) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class Information:
-    """What click words know. `heldout_bits` is a lower bound for new objects; `bits` is exact for the training objects."""
+    """What click words know of new objects: a lower bound of the bits of the label, and the share of right decisions; mean clicks."""
 
-    photons: float
     clicks: float
-    label_bits: float  # entropy of the label: the most that could be known
     bits: float
-    bayes_accuracy: float
-    heldout_bits: float
-    heldout_bayes_accuracy: float
+    accuracy: float
 
 
 def word_joint(probability: F64, labels: I64, n_classes: int) -> F64:
@@ -126,7 +122,7 @@ def word_information(
 ) -> Information:
     """Return what the click words of an encoder know, exactly; `train` and `test` are photoelectrons per exposure (n, d_f).
 
-    `photons` and `clicks` are means over the test objects.
+    Decisions and bits are by the posteriors of the training objects; all is of the test objects.
     """
     p_train, p_test = click_probability(law, train), click_probability(law, test)
     joint = word_joint(p_train, train_labels, n_classes)
@@ -134,15 +130,10 @@ def word_information(
     log_posterior = np.log2(smooth / smooth.sum(axis=1, keepdims=True))
     decided = log_posterior.argmax(axis=1)
     heldout = word_joint(p_test, test_labels, n_classes)
-    label_bits = float(entropy_bits(heldout.sum(axis=0)))
     return Information(
-        photons=float(test.sum()) / len(test),
         clicks=float(p_test.sum()) / len(test),
-        label_bits=label_bits,
-        bits=mutual_information_bits(joint),
-        bayes_accuracy=float(joint.max(axis=1).sum()),
-        heldout_bits=label_bits + float((heldout * log_posterior).sum()),
-        heldout_bayes_accuracy=float(heldout[np.arange(len(decided)), decided].sum()),
+        bits=float(entropy_bits(heldout.sum(axis=0))) + float((heldout * log_posterior).sum()),
+        accuracy=float(heldout[np.arange(len(decided)), decided].sum()),
     )
 
 

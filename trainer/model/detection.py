@@ -45,14 +45,19 @@ def click_probability(photoelectrons: Tensor, law: Law | CountLaw, slope: float 
     if not isinstance(law, ClickLaw):
         return law(photoelectrons.double() * slope).to(photoelectrons.dtype)
     mu, _ = counted_mean((photoelectrons.double() * slope + law.dark_per_exposure).clamp(max=_MU_MAX), law.dead_time)
-    coefficients = survival_coefficients(law).tolist()
-    kept = [c for k, c in enumerate(coefficients) if c * math.factorial(k) > _NEGLIGIBLE]
+    kept = kept_coefficients(law)
     if kept == [1.0]:
         return (-torch.expm1(-mu)).to(photoelectrons.dtype)
     survival = torch.zeros_like(mu)
     for coefficient in reversed(kept):
         survival = survival * mu + coefficient
     return (1.0 - torch.exp(-mu) * survival).to(photoelectrons.dtype)
+
+
+def kept_coefficients(law: ClickLaw, negligible: float = _NEGLIGIBLE) -> list[float]:
+    """Return the c_k of `1 - p = exp(-mu) sum_k c_k mu^k` with c_k k! above `negligible`; [1.0] is the plain Poisson law."""
+    coefficients = survival_coefficients(law).tolist()
+    return [c for k, c in enumerate(coefficients) if c * math.factorial(k) > negligible]
 
 
 def counted_mean(mean: Tensor, dead_time: DeadTime) -> tuple[Tensor, Tensor]:

@@ -129,8 +129,8 @@ def _information_of_words(task: Task) -> Rows:
         ratio = fisher(p, p * (1 - p), task.test.labels)
         row: Row = {"table": "information", "way": WAYS[1], "photons": photons, "objects": len(test)}
         row |= {"trace": ratio.trace, "discriminant": ratio.discriminant, "illumination": eta * illumination}
-        right = 100 * known.heldout_bayes_accuracy
-        rows.append(row | {"bits": known.heldout_bits, "value": right, "clicks": known.clicks})
+        right = 100 * known.accuracy
+        rows.append(row | {"bits": known.bits, "value": right, "clicks": known.clicks})
     return rows
 
 
