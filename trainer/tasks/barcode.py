@@ -1,17 +1,10 @@
 """OUR sampling of the task `barcode`: does a window of ten bars contain the sequence 1010?
 
-Only 1024 strings exist: `all_strings` returns every string with its label, `weights` the probability of each, `draw` a sample as uint8
-images (1, 10): bright bars are 255, dark bars 0, without noise (transmission, so active illumination). The number of bright bars tells
-nothing beyond the prior where all strings are equally likely (best decision on it: 65.1 %, as without any light), and 57.5 % where the
-classes are.
-
-The paper (appendix "Barcode 1010 identification") gives 4000 training and 1000 test strings, two classes, and does not say how they were
-drawn. The three priors here are the natural readings. With `balanced`, three patterns were not found to reach the paper's 69.4 %
-(exact_search.py: 68.4 %), with the other two they were.
-
-- `uniform`: every string is equally likely; 357 of 1024 (34.9 %) contain the sequence (the default);
-- `balanced`: the classes are equally likely, and the strings of a class among themselves;
-- `inserted`: the classes are equally likely; a positive is a uniform string into which 1010 is written at a uniform place.
+Only 1024 strings exist: `all_strings` returns every string with its label, `weights` the probability of each by one of three priors
+(docs/reference/tasks.md; the paper, appendix "Barcode 1010 identification", does not say how its strings were drawn), `draw` a sample as
+uint8 images (1, 10): bright bars are 255, dark bars 0. The number of bright bars tells nothing beyond the prior where all strings are
+equally likely (best decision on it: 65.1 %, as without any light), and 57.5 % where the classes are. With `balanced`, three patterns were
+not found to reach the paper's 69.4 % (exact_search.py: 68.4 %), with the other two they were.
 """
 
 from __future__ import annotations

@@ -1,16 +1,13 @@
 """OUR generator of the task `cells`: one stained organelle per cell, or none, on 100 x 100 pixels, for active illumination.
 
-- membrane: a thin bright outline (1.2 to 2.2 px), uneven along the circumference, with up to 5 vesicles inside;
-- nucleolus: 1 to 4 compact spots (sigma 1.6 to 3.4 px) in a faint nucleus;
+- membrane: a thin bright outline, uneven along the circumference, with up to 5 vesicles inside;
+- nucleolus: 1 to 4 compact spots in a faint nucleus;
 - mitochondria: 10 to 22 short threads of beads in the cytoplasm around a dark nucleus;
 - null: no cell in focus: haze of cells out of focus and up to 4 specks of debris.
 
-Every cell varies in size (radius 25 to 30 px), outline, place (up to 3 px off), orientation, share of light in the stain and brightness.
-The mean of an image (6 to 12 of 255) is drawn without regard to the class: total intensity tells nothing, for the null class neither.
-
-The paper (appendix "Cell-organelle classification") derives its images from an imaging flow cytometer (Schraivogel et al., 2022), 10 000
-training and 1000 test images per class, four classes; its public release has three, without null. Ours differ in every pixel; the
-paper's null fields are "empty", so probably darker than its cells, which ours are not.
+The mean of an image is drawn without regard to the class: total intensity tells nothing, for the null class neither. The paper (appendix
+"Cell-organelle classification") has its images from an imaging flow cytometer (Schraivogel et al., 2022); its null fields are "empty", so
+probably darker than its cells, which ours are not. docs/reference/tasks.md shows ours.
 """
 
 from __future__ import annotations

@@ -1,45 +1,18 @@
 """OUR generators of the tasks whose grey levels are field amplitudes, 64 x 64 pixels: nebula, fiber, tissue, transient.
 
-`nebula`: planetary or emission nebula, in the light of one spectral line.
+docs/reference/tasks.md shows them and says what the paper has instead. Brightness is drawn without regard to the class, so that it tells
+nothing alone.
 
-- planetary: one or two elliptical shells (radius 9 to 14 px), brighter towards one side or both poles, a faint filling, often a star;
-- emission: turbulent gas (fractal noise, amplitude falling as frequency**-1.7, exponentiated) under an irregular envelope, with dark lanes.
-
-Both: place within +-2 px, any orientation, 2 to 8 field stars (3 to 12 % of the light), sky, seeing and noise; the mean intensity is drawn
-over a factor of 2.25 without regard to the class. The flat phase across the field is the paper's assumption (a compact, quasi-monochromatic
-source): real nebulae are incoherent, and for them the incoherent encoder on the square of these amplitudes is the physical one.
-
-`fiber`: is the end face of an optical fibre clean or contaminated?
-
-Light of the fundamental mode leaves the fibre: a Gaussian amplitude of radius 13 to 15 px (1/e), misaligned by up to 1.5 px, a little
-elliptical, with surface roughness and detector noise. On a contaminated end face 2 to 4 defects lie where the light is:
-
-- dirt: a round patch (sigma 2 to 4 px) that takes 0.5 to 1 of the amplitude;
-- pit: a dark ring (radius 2 to 4 px, width 1 px, depth 0.5 to 0.9) around a spot that is brighter by a third of its depth;
-- scratch: a straight line (sigma 0.8 to 1.4 px, 16 to 40 px long) that takes 0.4 to 0.8 of the amplitude.
-
-The power at the tap varies by a factor of 2 without regard to the class. Defects also shadow 10 to 35 % of the light; that is taken out, as
-behind a levelled source, or brightness alone would tell. The paper calls it a toy model.
-
-`tissue`: is tissue perfused? Laser speckle blurs where blood flows.
-
-A fully developed speckle (a circular Gaussian field behind a round pupil, grain 3 to 5 px) changes during the exposure where blood flows:
-share s of static light and the rest averaged over M independent patterns, I = s I_static + (1 - s) mean of I_1 .. I_M.
-
-- static (ischaemic): s from 0.85 to 1, M = 2: contrast (standard deviation over mean) 0.76 to 1.1;
-- perfused: s from 0 to 0.25, M from 8 to 12: contrast 0.28 to 0.44.
-
-Both: uneven light and absorption (smooth, sigma 14 px, +-20 %), brightness over a factor of 2.5 in both classes alike. No pixel and no
-linear sum of intensities differs in mean: the classes differ only in their fluctuation. An exposure that averages over flow is no single
-coherent field: an intensity mask before a bucket detector is exact, so the incoherent encoder is the physical default.
-
-`transient`: is there a small, fleeting object in a coherently lit scene?
-
-The background is a bright field that varies slowly in space (sigma of the unevenness 16 px, +-25 % in amplitude) and in total (power of
-one frame to the next: +-30 %), with fine noise (0.012 of full scale). An event is one compact object (sigma 2 to 3 px) anywhere inside
-the inner 40 x 40 pixels, which adds or removes a peak amplitude of 0.18 to 0.32 of full scale, in phase or in antiphase. It changes the
-power of a frame by 1 % (median), while the background fluctuates by 40 %. A coherent encoder can dim the slow background by interference;
-counting light cannot.
+- `nebula`: one or two elliptical shells, brighter towards one side or both poles, with a faint filling and often a star; or turbulent gas
+  (amplitude falling as frequency**-1.7, exponentiated) under an irregular envelope, with dark lanes. Both with field stars, sky, seeing
+  and noise. The flat phase is the paper's assumption: real nebulae are incoherent.
+- `fiber`: the Gaussian mode of a fibre (radius at 1/e), a little elliptical and misaligned. Contaminated end faces have dirt (a round
+  patch), pits (a dark ring around a spot that is brighter by a third of its depth) and scratches where the light is; what they shadow is
+  taken out, as behind a levelled source.
+- `tissue`: fully developed speckle behind a round pupil: a share s of static light, the rest averaged over M independent patterns. The
+  classes differ in s and M, that is in their fluctuation: no pixel and no linear sum of intensities differs in mean.
+- `transient`: a bright field that varies slowly in space and from frame to frame, with fine noise; an event adds or takes away one compact
+  object, in phase or in antiphase. A coherent encoder can dim the slow background by interference; counting light cannot.
 """
 
 from __future__ import annotations
