@@ -21,7 +21,8 @@ from pans.runtime.ranges import Range
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
 EXACT_WORDS_MAX = 1 << EXACT_FEATURES_MAX
-ESTIMATOR_NAMES = ("ste", "exact", "local", "disarm")  # estimators.py
+STRAIGHT_THROUGH = ("ste", "identity")  # from the first epoch to the last
+ESTIMATOR_NAMES = (*STRAIGHT_THROUGH, "exact", "local", "disarm", "loo")  # estimators.py
 COUNTED_ESTIMATORS = ("ste", "exact", "local")  # those that know photon numbers
 ENCODERS = ("active", "coherent", "incoherent")
 PICTURE_HEADS = ("picture", "decoder")  # heads.py

@@ -2,14 +2,16 @@
 
 Every estimator is a function `(p, target, head, loss_of, random, readings) -> loss`: chances p, clicks (n, d_f) or photon numbers (n, d_f,
 outcomes), a scalar whose value is the mean loss of the batch and whose gradient is the estimate. Heads normalise by the mean of p
-(`ste`: by that of the sampled clicks, as in the paper). The last one knows clicks alone.
+(`ste`: by that of the sampled clicks, as in the paper). The last three know clicks alone.
 
 | name | gradient in p | cost |
 | --- | --- | --- |
 | `ste` | straight-through: passed on from the sampled click. Biased unless the loss is affine in every click | 1 pass |
 | `exact` | expectation over all 2**d_f words | 2**d_f words, once per batch |
 | `local` | L(click i) - L(no click i), the other clicks sampled: unbiased | d_f + 1 passes, only the last layer in full |
+| `identity` | as `ste`, passed on to the light itself, undamped (the paper's "naive" way): for comparison alone | 1 pass |
 | `disarm` | antithetic pairs (Dong, Mnih, Tucker 2020): unbiased | 2 passes |
+| `loo` | REINFORCE, other samples as the baseline (Kool, van Hoof, Welling 2019): unbiased | `LOO_SAMPLES` passes |
 
 The true gradient is dp/dlambda * E[L(1) - L(0)], with dp/dlambda = exp(-lambda) for a plain detector (science of the paper's
 appendix on gradient estimation, which calls `ste` unbiased; it is not).
@@ -30,8 +32,10 @@ from pans.runtime.instrument.click_law import CountLaw, outcome_weights
 from .detection import Law, click_probability, sample_clicks, word_probabilities
 from .ssim import ssim
 
+LOO_SAMPLES = 4
 SHARPNESS = 2.0  # of the soft decision in `decision_loss`
 WRONG = 3.0  # cost of a wrong decision there: about what cross-entropy charges for one
+_DARK_MIN = 1e-6  # least chance of no click that `identity` divides by: float32 knows no less; beyond 13.8 photoelectrons it is damped
 _P_MIN = 1e-4  # least chance by which a score-function gradient is divided: beyond it, one event would undo an epoch
 _MU_MAX = 100.0  # beyond it every reading is the largest one
 
@@ -232,6 +236,16 @@ def local(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Genera
     return loss.mean() + gradient_only(p, slope)
 
 
+def identity(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Generator, _readings: Readings) -> Tensor:
+    """The gradient of a sampled click is given to the photoelectrons, as if d click / d lambda were 1.
+
+    The click law behind damps by exp(-lambda), the chance of no click of a plain detector: divided by that beforehand.
+    """
+    clicks = sample_clicks(p, random).detach()
+    undamped = p / (1 - p.detach()).clamp(min=_DARK_MIN)
+    return loss_of(head(clicks + (undamped - undamped.detach()), None), target).mean()
+
+
 def disarm(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Generator, _readings: Readings) -> Tensor:
     """Two words from the same random numbers, one from u and one from 1 - u; only clicks that differ get a gradient."""
     uniform = torch.rand(p.shape, generator=random, dtype=torch.float64)
@@ -244,10 +258,22 @@ def disarm(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Gener
     return 0.5 * (losses[0] + losses[1]).mean() + gradient_only(p, slope)
 
 
+def loo(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: Generator, _readings: Readings) -> Tensor:
+    """Score function times how much worse a sample is than the others."""
+    mean = p.mean(dim=0)
+    drawn = [sample_clicks(p, random).detach() for _ in range(LOO_SAMPLES)]
+    losses = torch.stack([loss_of(head(clicks, mean), target) for clicks in drawn])
+    with torch.no_grad():
+        excess = (losses - losses.mean(dim=0)) * (LOO_SAMPLES / (LOO_SAMPLES - 1))
+        variance = (p * (1 - p)).clamp(min=_P_MIN)
+        slope = torch.stack([e.unsqueeze(1) * (c - p) / variance for e, c in zip(excess, drawn)]).mean(dim=0)
+    return losses.mean() + gradient_only(p, slope)
+
+
 def gradient_only(p: Tensor, slope: Tensor) -> Tensor:
     """Return a scalar of value 0 whose gradient in p (n, ...) is `slope` / n."""
     weighted = (slope * p).sum() / len(p)
     return weighted - weighted.detach()
 
 
-ESTIMATORS: dict[str, Estimator] = {one.__name__: one for one in (ste, exact, local, disarm)}
+ESTIMATORS: dict[str, Estimator] = {one.__name__: one for one in (ste, identity, exact, local, disarm, loo)}

@@ -38,7 +38,7 @@ from pans.trainer.model.estimators import ESTIMATORS, LossOf, cross_entropy, dec
 from pans.trainer.model.exposure import exposure_us_of
 from pans.trainer.model.field_basis import in_pixels
 from pans.trainer.model.heads import Heads, new_head
-from pans.trainer.options import BUDGETS, EXACT_WORDS_MAX, Options, check_options
+from pans.trainer.options import BUDGETS, EXACT_WORDS_MAX, STRAIGHT_THROUGH, Options, check_options
 from pans.trainer.tasks.registry import Task
 
 from .checkpoint import read_checkpoint, write_checkpoint
@@ -57,7 +57,7 @@ HEAD_DRAWS = 4  # optics through which the head sees every object when it is fit
 
 def second_stage(options: Options) -> int:
     """Return the epoch at which stage 2 begins; the end when there is no stage 2."""
-    return options.epochs if options.estimator == "ste" else round(options.warm * options.epochs)
+    return options.epochs if options.estimator in STRAIGHT_THROUGH else round(options.warm * options.epochs)
 
 
 def whole_levels(options: Options) -> int:
@@ -67,7 +67,8 @@ def whole_levels(options: Options) -> int:
 
 def estimator_at(options: Options, epoch: int) -> str:
     """Return the name of the estimator of an epoch."""
-    return "ste" if epoch < second_stage(options) else options.estimator
+    first = options.estimator if options.estimator in STRAIGHT_THROUGH else "ste"
+    return first if epoch < second_stage(options) else options.estimator
 
 
 def stage_at(options: Options, epoch: int) -> str:
@@ -90,7 +91,7 @@ def rates_at(options: Options, now: float) -> tuple[float, float]:
 
 def black_at(options: Options, now: float, floor: float) -> float:
     """Return the transmission of black: 0 in stage 1, then rising to the modulator's; patterns found at once are worse by points."""
-    start = 0.3 * options.epochs if options.estimator == "ste" else second_stage(options)
+    start = 0.3 * options.epochs if options.estimator in STRAIGHT_THROUGH else second_stage(options)
     return floor * min(1.0, max(0.0, (now - start) / (0.4 * options.epochs)))
 
 

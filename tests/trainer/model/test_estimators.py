@@ -91,13 +91,33 @@ def test_similarity_loss_weighs_ssim_of_what_is_shown_against_the_error_of_the_s
     assert torch.allclose(every.diagonal(), found)
 
 
-@pytest.mark.parametrize("name", ["local", "disarm"])
+@pytest.mark.parametrize("name", ["local", "disarm", "loo"])
 def test_unbiased_estimators_meet_the_exact_gradient(name):
     light, head, labels = problem(3)
     wanted, _ = gradient("exact", light, head, labels, None)
     found, error = gradient(name, light, head, labels, torch.Generator().manual_seed(1), repeats=3000)
     assert np.all(np.abs(found - wanted) < 5 * error + 1e-12)
     assert np.max(np.abs(wanted) / (error + 1e-12)) > 20  # the test could see a bias
+
+
+def test_identity_passes_the_gradient_of_a_click_to_its_light_undamped():
+    light, law = problem()[0], ClickLaw(dark_per_exposure=0.01)
+    weights = torch.tensor([1.0, -2.0, 0.5, 3.0], dtype=torch.float64)
+
+    def affine(clicks, _mean=None):  # a loss whose gradient in each click is its weight
+        return clicks @ weights
+
+    def found(name, at):
+        at = at.clone().requires_grad_()
+        p = click_probability(at, law)
+        ESTIMATORS[name](p, None, affine, lambda scores, _: scores, torch.Generator().manual_seed(1), CLICKS).backward()
+        return at.grad * len(at)
+
+    assert torch.allclose(found("identity", light), weights.expand(N, D_F))
+    damped = torch.exp(-(light + law.dark_per_exposure))
+    assert torch.allclose(found("ste", light), weights * damped)
+    bright = torch.full((1, D_F), 60.0, dtype=torch.float64)  # e**-60: no chance of staying dark to divide by
+    assert torch.isfinite(found("identity", bright)).all()
 
 
 def test_straight_through_is_biased_by_more_than_chance():

@@ -68,7 +68,7 @@ def test_head_fits_a_joint_distribution_to_its_entropy(monkeypatch):
     assert entropy <= loss <= entropy + 1e-3
 
 
-@pytest.mark.parametrize("estimator", ["ste", "exact", "local", "disarm"])
+@pytest.mark.parametrize("estimator", ["ste", "identity", "exact", "local", "disarm", "loo"])
 def test_bars_are_learned_and_repeat_with_the_seed(task, estimator, monkeypatch):
     monkeypatch.setattr(head_fit, "STEPS", 300)
     options = replace(SMALL, estimator=estimator)
@@ -79,7 +79,8 @@ def test_bars_are_learned_and_repeat_with_the_seed(task, estimator, monkeypatch)
     words = torch.tensor([[float(w >> i & 1) for i in range(4)] for w in range(16)])
     decided = trained.head(words).argmax(dim=1)
     right = joint_distribution(p, torch.from_numpy(task.test.labels), 4)[torch.arange(16), decided].sum()
-    assert float(right) > 0.5  # by chance 0.25
+    # by chance 0.25; undamped gradients learn less where photons are few (`git show 930d92f:docs/results/ablations.md`)
+    assert float(right) > (0.35 if estimator == "identity" else 0.5)
     assert trained.quantised.pattern_levels.max() < PROFILE.projector.levels
     assert [report.epoch for report in reports] == list(range(1, 11))
     assert reports[-1].loss < reports[0].loss
@@ -192,7 +193,7 @@ def test_a_checkpoint_of_another_training_or_none_is_refused_and_never_runs_code
         ({"photons": 0.0}, "--photons"),
         ({"clicks": float("nan")}, "--clicks"),
         ({"clicks": 4.0}, "below 4"),
-        ({"estimator": "magic"}, "ste, exact, local"),
+        ({"estimator": "magic"}, "ste, identity, exact"),
         ({"encoder": "magic"}, "active, coherent"),
         ({"head": "magic"}, "mlp, deep, conv"),
         ({"dark": -1.0}, "--dark"),
