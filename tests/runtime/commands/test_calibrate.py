@@ -38,7 +38,7 @@ FOUR = "sim:dmd-four-snspd?scene=uniform&pace=fast&seed=3"
 
 def calibrated(out: Path, url: str, pans: Pans, code: int = 0) -> str:
     """What the command prints of `url`."""
-    assert main(["calibrate", "--device", url, "--seconds", "2", "-o", str(out)]) == code
+    assert main(["calibrate", "--device", url, "--seconds", "1", "-o", str(out)]) == code
     return pans.said().out
 
 
