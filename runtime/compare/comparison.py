@@ -6,8 +6,9 @@ P-values of one comparison are corrected for their number (Holm), and 0.05 is th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
@@ -19,14 +20,11 @@ from pans.runtime.container import parse_json_object, read_file
 from pans.runtime.errors import UsageError
 from pans.runtime.intervals import Z_95
 from pans.runtime.pages.page import flat
-from pans.runtime.record import Recording, read_recording
-from pans.runtime.record.format import Kind
-from pans.runtime.record.parts import find_parts
+from pans.runtime.record.parts import open_recording
 from pans.runtime.wire.messages import NO_OBJECT
 
 from .statistics import (
     LEAST_US,
-    Interval,
     fisher_exact,
     holm,
     mcnemar_exact,
@@ -41,19 +39,14 @@ ALPHA = 0.05
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 LEAST_BEYOND = 10  # decisions slower than a quantile, or nothing is said about it
 SUMMARY_MAX_BYTES = 1 << 24
-RECORDING = "run.pansrec"
 # Facts that differ between any two runs, or that follow from others.
 _ALWAYS_DIFFERENT = ("created_utc", "command", "format_version", "toml", "decisions_sha256", "tick", "part")
 _DERIVED = (
     "config.dark.guard.",
     "config.backend_choice.",
-    "options.device",
-    "options.out",
-    "options.record",
-    "options.force",
+    *(f"options.{n}" for n in ("device", "out", "record", "force")),
 )
 _FIRST = ("bundle_sha256", "profile.", "device_url")  # what a reader asks for first
-_MEANS = {"photons_mean": "photons per decision", "illumination": "illumination per decision"}
 F64 = NDArray[np.float64]
 
 
@@ -88,6 +81,9 @@ class Side:
         return None if self.timings is None else (self.timings["decided_ns"] - self.timings["device_end_ns"]) / 1000.0
 
 
+Sides = tuple[Side, Side]
+
+
 def read_side(path: str | Path) -> Side:
     """Return the run at `path`: its folder, a recording, or the JSON object that `pans run --json` printed.
 
@@ -100,41 +96,12 @@ def read_side(path: str | Path) -> Side:
             remedy = "save what `pans run --json` prints, or name the recording"
             raise UsageError(f"{place}: not a summary: it has no keys `decisions` and `verdict`", remedy=remedy)
         return Side(place, {}, summary, None, None, True)
-    found = [read_recording(one, salvage=True) for one in _recordings(place)]
-    decisions, timings = _rows(found)
-    told = found[-1].summary
+    found = open_recording(place, salvage=True)
+    decisions, told = found.decisions(), found.summary
     if distinct := int(told.get("device", {}).get("objects", 0)):  # then the first one is shown again
         numbers = decisions["object"].copy()
-        decisions = decisions.copy()
         decisions["object"] = np.where(numbers == NO_OBJECT, numbers, numbers % np.uint32(distinct))
-    return Side(place, found[0].header, told, decisions, timings, all(one.complete for one in found))
-
-
-def _rows(recordings: list[Recording]) -> tuple[NDArray[np.void], NDArray[np.void]]:
-    """Decisions and host times of the recordings, which are read once."""
-    held: dict[Kind, list[NDArray[np.void]]] = {Kind.DECISIONS: [], Kind.TIMINGS: []}
-    for one in recordings:
-        for kind, rows in one.read(*held):
-            held[kind].append(rows)
-    none = recordings[0]
-    decisions, timings = (np.concatenate(some) if some else None for some in held.values())
-    return none.decisions() if decisions is None else decisions, none.timings() if timings is None else timings
-
-
-def _recordings(place: Path) -> list[Path]:
-    if place.is_file():
-        return [place]
-    if (place / RECORDING).is_file():
-        return [place / RECORDING]
-    if parts := find_parts(place):
-        return list(parts)
-    whole = sorted(place.glob("*.pansrec")) if place.is_dir() else []
-    if len(whole) != 1:
-        words = (
-            f"{len(whole)} recordings in this folder, expected one run" if place.is_dir() else "no such file or folder"
-        )
-        raise UsageError(f"{place}: {words}", remedy="name a run's folder, a recording or a summary")
-    return whole
+    return Side(place, found.header, told, decisions, found.timings(), found.complete)
 
 
 # ---- what is found ----
@@ -180,7 +147,7 @@ class Finding:
     def as_json(self) -> dict[str, Any]:
         """Return it JSON-able; what is not finite becomes None."""
         facts = {
-            key: None if isinstance(one, float) and not np.isfinite(one) else one for key, one in asdict(self).items()
+            name: None if isinstance(one, float) and not np.isfinite(one) else one for name, one in asdict(self).items()
         }
         return facts | {"difference_is": "a / b" if self.is_ratio else "a - b", "significant": self.significant}
 
@@ -257,30 +224,43 @@ def _pairing(first: Side, second: Side, pairing: str) -> tuple[bool, str]:
 
 # ---- figures ----
 
+_BURSTS = "decisions as two Poisson counts; bursts look surer than they are"
+_COUNTS = (  # name, unit, keys of the count and of its total in the summary, how it was tested
+    ("late", "per decision", ("late",), ("decisions",), _BURSTS),
+    ("lost", "per exposure", ("lost",), ("stream", "exposures"), _BURSTS.replace("decisions", "exposures")),
+    *[
+        (
+            "dark_rate",
+            "clicks per dark exposure",
+            ("dark", "clicks"),
+            ("dark", "exposures"),
+            "dark exposures as two Poisson counts, exact",
+        )
+    ],
+)
+
 
 def _findings(first: Side, second: Side, paired: bool) -> Iterator[Finding]:
     sides = (first, second)
-    if (accuracy := _accuracy(first, second, paired)) is not None:
+    if (accuracy := _accuracy(sides, paired)) is not None:
         yield accuracy
-    yield from _abstained(first, second)
-    yield _clicks(first, second)
-    for name, unit in _MEANS.items():
-        values = [side.summary.get(name) for side in sides]
-        if name == "illumination":
-            values = [side.summary.get("illumination_mean", value) for side, value in zip(sides, values)]
-        yield _untested(name, unit, values)
-    for name, unit in (("late", "decisions"), ("lost", "exposures")):
-        totals = [
-            (side.summary if name == "late" else side.summary.get("stream") or {}).get(unit) or 0 for side in sides
-        ]
-        counts = [int(side.summary.get(name) or 0) for side in sides]
-        if any(counts) and all(totals):
-            yield _counted(name, f"per {unit[:-1]}", unit, counts, totals, "; bursts look surer than they are")
-    darks = [side.summary.get("dark") or {} for side in sides]
-    if all(dark.get("exposures") for dark in darks):
-        counts, totals = ([int(dark[key]) for dark in darks] for key in ("clicks", "exposures"))
-        yield _counted("dark_rate", "clicks per dark exposure", "dark exposures", counts, totals, ", exact")
-    yield from _latencies(first, second)
+    yield from _abstained(sides)
+    yield _clicks(sides)
+    yield _untested("photons_mean", "photons per decision", _told(sides, "photons_mean"))
+    shown, light = _told(sides, "illumination_mean"), _told(sides, "illumination")  # of an automaton the states shown
+    yield _untested("illumination", "illumination per decision", [a if b is None else b for a, b in zip(light, shown)])
+    for name, unit, count, total, method in _COUNTS:
+        counts, totals = ([int(one or 0) for one in _told(sides, *keys)] for keys in (count, total))
+        if all(totals) and (any(counts) or name == "dark_rate"):
+            four = counts[0], totals[0], counts[1], totals[1]
+            rates, how = (counts[0] / totals[0], counts[1] / totals[1]), "{} of {} and {} of {} ".format(*four) + method
+            yield Finding(name, unit, *rates, *rate_ratio(*four), True, poisson_rates(*four), how)
+    yield from _latencies(sides)
+
+
+def _told(sides: Sides, *keys: str) -> list[Any]:
+    """What the summaries say below nested keys; None where one says nothing."""
+    return [reduce(lambda one, key: (one or {}).get(key), keys, side.summary) for side in sides]
 
 
 def _untested(name: str, unit: str, values: list[Any], why: str = "not tested", *, is_ratio: bool = False) -> Finding:
@@ -291,44 +271,38 @@ def _untested(name: str, unit: str, values: list[Any], why: str = "not tested", 
     return Finding(name, unit, one, two, apart, None, None, is_ratio, None, why)
 
 
-def _counted(name: str, unit: str, of: str, counts: list[int], totals: list[int], more: str) -> Finding:
-    """Two Poisson counts, each of so many."""
-    four = counts[0], totals[0], counts[1], totals[1]
-    method = "{} of {} and {} of {} {} as two Poisson counts{}".format(*four, of, more)
-    return Finding(
-        name, unit, counts[0] / totals[0], counts[1] / totals[1], *rate_ratio(*four), True, poisson_rates(*four), method
-    )
+Column = Callable[[NDArray[np.void]], NDArray[Any]]
 
 
-def _of_objects(decisions: NDArray[np.void], values: NDArray[Any]) -> dict[int, float]:
-    """The mean of the decisions' `values` for each object."""
-    objects, at = np.unique(decisions["object"], return_inverse=True)
-    return dict(zip(objects.tolist(), (np.bincount(at, weights=values) / np.maximum(np.bincount(at), 1)).tolist()))
+def _of_objects(sides: Sides, value: Column, chosen: Column | None = None) -> list[dict[int, float]]:
+    """The mean `value` of the (`chosen`) decisions about each object, on both sides; empty where a side has no decisions."""
+    found = []
+    for side in sides:
+        if side.decisions is None:
+            return []
+        rows = side.decisions if chosen is None else side.decisions[chosen(side.decisions)]
+        objects, at = np.unique(rows["object"], return_inverse=True)
+        found.append(dict(zip(objects.tolist(), (np.bincount(at, value(rows)) / np.bincount(at)).tolist())))
+    return found
 
 
-def _accuracy(first: Side, second: Side, paired: bool) -> Finding | None:
-    values = [side.summary.get("accuracy") for side in (first, second)]
-    sizes = [int(side.summary.get("objects") or 0) for side in (first, second)]
-    if first.decisions is not None and second.decisions is not None:
-        known = [rows[rows["truth"] >= 0] for rows in (first.decisions, second.decisions)]
-        shares = [_of_objects(rows, rows["label"] == rows["truth"]) for rows in known]
+def _accuracy(sides: Sides, paired: bool) -> Finding | None:
+    values, sizes = _told(sides, "accuracy"), [int(one or 0) for one in _told(sides, "objects")]
+    if shares := _of_objects(sides, lambda rows: rows["label"] == rows["truth"], lambda rows: rows["truth"] >= 0):
         if paired:
             return _paired_accuracy(*shares)
         sizes = [len(one) for one in shares]
         values = [sum(one.values()) / len(one) if one else None for one in shares]
     if None in values or not all(sizes):
         return None
-    shares_ = [float(value or 0.0) for value in values]
-    method = f"two shares of {sizes[0]} and {sizes[1]} distinct objects"
-    return _two_shares("accuracy", shares_, [p * n for p, n in zip(shares_, sizes)], sizes, method)
+    return _two_shares("accuracy", values, sizes, f"two shares of {sizes[0]} and {sizes[1]} distinct objects")
 
 
-def _two_shares(name: str, shares: list[float], right: list[float], sizes: list[int], method: str) -> Finding:
+def _two_shares(name: str, shares: list[float], sizes: list[int], method: str) -> Finding:
+    right = [share * n for share, n in zip(shares, sizes)]
     between = newcombe_difference(right[0], sizes[0], right[1], sizes[1])  # of the shares that are shown
     p = fisher_exact(round(right[0]), sizes[0], round(right[1]), sizes[1])
-    return Finding(
-        name, "share", shares[0], shares[1], *between, False, p, f"{method}, Fisher exact; interval by Newcombe"
-    )
+    return Finding(name, "share", *shares, *between, False, p, f"{method}, Fisher exact; interval by Newcombe")
 
 
 def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Finding:
@@ -340,40 +314,36 @@ def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Findi
     return Finding("accuracy", "share", float(one.mean()), float(two.mean()), *between, False, p, method)
 
 
-def _abstained(first: Side, second: Side) -> Iterator[Finding]:
-    shares, sizes = [], []
-    for side in (first, second):
-        abstained, decisions = (int(side.summary.get(name) or 0) for name in ("abstained", "decisions"))
-        if not decisions:
-            return
-        sizes.append(max(1, decisions // max(1, int(side.summary.get("trials") or 1))))
-        shares.append(abstained / decisions)
-    if any(shares):
-        right = [share * n for share, n in zip(shares, sizes)]
-        yield _two_shares("abstained", shares, right, sizes, "two shares, the trials of an object count once")
+def _abstained(sides: Sides) -> Iterator[Finding]:
+    abstained, decisions, trials = (
+        [int(n or 0) for n in _told(sides, key)] for key in ("abstained", "decisions", "trials")
+    )
+    if all(decisions) and any(abstained):
+        sizes = [max(1, n // max(1, times)) for n, times in zip(decisions, trials)]
+        shares = [some / n for some, n in zip(abstained, decisions)]
+        yield _two_shares("abstained", shares, sizes, "two shares, the trials of an object count once")
 
 
-def _clicks(first: Side, second: Side) -> Finding:
-    unit = "clicks per decision"
-    if first.decisions is not None and second.decisions is not None:
-        one, two = (
-            np.array([*_of_objects(rows, rows["clicks"]).values()]) for rows in (first.decisions, second.decisions)
-        )
-        if min(len(one), len(two)) > 1:
-            apart = float(one.mean() - two.mean())
-            half = Z_95 * float(np.sqrt(one.var(ddof=1) / len(one) + two.var(ddof=1) / len(two)))
-            method = f"means of {len(one)} and {len(two)} objects; interval by their spread"
-            between = Interval(apart, apart - half, apart + half)
-            return Finding("clicks_mean", unit, float(one.mean()), float(two.mean()), *between, False, None, method)
-    return _untested("clicks_mean", unit, [side.summary.get("clicks_mean") for side in (first, second)])
+def _clicks(sides: Sides) -> Finding:
+    unit, means = (
+        "clicks per decision",
+        [np.array([*one.values()]) for one in _of_objects(sides, lambda rows: rows["clicks"])],
+    )
+    if min(map(len, means), default=0) < 2:
+        return _untested("clicks_mean", unit, _told(sides, "clicks_mean"))
+    (one, two), apart = means, float(means[0].mean() - means[1].mean())
+    half = Z_95 * float(np.sqrt(one.var(ddof=1) / len(one) + two.var(ddof=1) / len(two)))
+    method = f"means of {len(one)} and {len(two)} objects; interval by their spread"
+    between = (apart, apart - half, apart + half)
+    return Finding("clicks_mean", unit, float(one.mean()), float(two.mean()), *between, False, None, method)
 
 
-def _latencies(first: Side, second: Side) -> Iterator[Finding]:
-    one, two = first.latency_us, second.latency_us
+def _latencies(sides: Sides) -> Iterator[Finding]:
+    one, two = (side.latency_us for side in sides)
     for name, q in QUANTILES.items():
         if one is None or two is None:
-            values = [(side.summary.get("latency_us") or {}).get(name.replace(".", "")) for side in (first, second)]
-            if None not in values and min(float(value or 0) for value in values) >= LEAST_US:
+            values = _told(sides, "latency_us", name.replace(".", ""))
+            if None not in values and min(map(float, values)) >= LEAST_US:
                 yield _untested(f"latency_{name}", "us", values, "not tested: no single latencies", is_ratio=True)
         elif (
             min(len(one), len(two)) * (1 - q) >= LEAST_BEYOND

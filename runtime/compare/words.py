@@ -6,28 +6,14 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from pans.runtime.pages.page import render
-from pans.runtime.pages.run import Decisions
-from pans.runtime.pages.timing import Durations, latency_chart
+from pans.runtime.pages.page import render, words
+from pans.runtime.pages.run import Decisions, Durations, latency_chart
 from pans.runtime.safe_text import one_line
 
 from .comparison import ALPHA, Change, Comparison, Finding, Side
 
 SAME = "Bundle, profile, options and device are the same."
-
-NAMES = {
-    "accuracy": "accuracy",
-    "abstained": "abstained",
-    "clicks_mean": "clicks per decision",
-    "photons_mean": "photons per decision",
-    "illumination": "illumination per decision",
-    "late": "late decisions",
-    "lost": "lost exposures",
-    "dark_rate": "dark clicks per exposure",
-    "latency_p50": "latency p50",
-    "latency_p99": "latency p99",
-    "latency_p99.9": "latency p99.9",
-}
+CUT = "cut, no summary"
 
 
 def value_of(finding: Finding, value: float | None) -> str:
@@ -71,30 +57,33 @@ def verdict_of(finding: Finding) -> str:
 
 def conclusion(comparison: Comparison) -> str:
     """Return one sentence on what differs by more than chance."""
-    differing = [NAMES.get(one.name, one.name) for one in comparison.findings if one.significant]
     if not any(one.significant is not None for one in comparison.findings):
         return "Nothing could be tested."
-    if not differing:
-        return f"No difference is larger than chance (p-values below {ALPHA:g} after a correction for their number, or 95 % intervals)."
-    return f"Larger than chance (p-values below {ALPHA:g} after a correction for their number, or 95 % intervals): {', '.join(differing)}."
+    differing = ", ".join(_title(one) for one in comparison.findings if one.significant)
+    how = f"(p-values below {ALPHA:g} after a correction for their number, or 95 % intervals)"
+    return f"Larger than chance {how}: {differing}." if differing else f"No difference is larger than chance {how}."
+
+
+def _title(finding: Finding) -> str:
+    return str(words()["figures"].get(finding.name, finding.name))
+
+
+def _row(one: Finding) -> tuple[str, str, str, str, str]:
+    """Name, both sides, their difference and whether it is beyond chance."""
+    return _title(one), value_of(one, one.first), value_of(one, one.second), difference_of(one), verdict_of(one)
 
 
 def comparison_words(comparison: Comparison) -> str:
     """Return all of it as lines for a terminal: results first, then what was different about the runs."""
-    first, second = comparison.first, comparison.second
+    sides = {"A": comparison.first, "B": comparison.second}
     lines = [
-        *(["SIMULATED"] if first.simulated or second.simulated else []),
-        f"A  {one_line(first.path)}: {one_line(first.summary.get('verdict', 'cut, no summary'))}",
-        f"B  {one_line(second.path)}: {one_line(second.summary.get('verdict', 'cut, no summary'))}",
-        "",
-        conclusion(comparison),
-        f"Objects: {'paired' if comparison.paired else 'two samples'}; {one_line(comparison.why)}",
-        "",
+        *(["SIMULATED"] if any(side.simulated for side in sides.values()) else []),
+        *(f"{a}  {one_line(side.path)}: {one_line(side.summary.get('verdict', CUT))}" for a, side in sides.items()),
+        *("", conclusion(comparison)),
+        *(f"Objects: {'paired' if comparison.paired else 'two samples'}; {one_line(comparison.why)}", ""),
+        *("  {:<26}A {}, B {}; {}; {}".format(*_row(one)) for one in comparison.findings),
+        *("", "What changed:" if comparison.changes else SAME),
     ]
-    for one in comparison.findings:
-        sides = f"A {value_of(one, one.first)}, B {value_of(one, one.second)}"
-        lines.append(f"  {NAMES.get(one.name, one.name):<26}{sides}; {difference_of(one)}; {verdict_of(one)}")
-    lines += ["", "What changed:" if comparison.changes else SAME]
     for change in sorted(comparison.changes, key=_is_hash):
         texts = (one_line(text or "-", 60) for text in (change.first, change.second))
         lines.append(f"  {one_line(change.name)}: {' -> '.join(texts)}")
@@ -114,32 +103,13 @@ def comparison_page(comparison: Comparison) -> bytes:
         sides=sides,
         comparison=comparison,
         conclusion=conclusion(comparison),
-        rows=[
-            (
-                NAMES.get(one.name, one.name),
-                value_of(one, one.first),
-                value_of(one, one.second),
-                difference_of(one),
-                verdict_of(one),
-            )
-            for one in comparison.findings
-        ],
-        methods=[f"{NAMES.get(one.name, one.name)}: {one.method}." for one in comparison.findings],
+        rows=[_row(one) for one in comparison.findings],
+        methods=[f"{_title(one)}: {one.method}." for one in comparison.findings],
         charts=[drawn for name, side in sides.items() for drawn in _charts(name, side)],
-        facts=[(name, *(_facts(side)[name] for side in sides.values())) for name in _facts(comparison.first)],
         changes=[(one.name, one.first or "-", one.second or "-") for one in sorted(comparison.changes, key=_is_hash)],
         same=SAME,
+        cut=CUT,
     )
-
-
-def _facts(side: Side) -> dict[str, str]:
-    made = side.summary.get("decisions", 0 if side.decisions is None else len(side.decisions))
-    return {
-        "run": str(side.path),
-        "date": str(side.header.get("created_utc", "unknown"))[:19].replace("T", " "),
-        "verdict": str(side.summary.get("verdict", "cut, no summary")),
-        "decisions": f"{made:,}",
-    }
 
 
 def _charts(name: str, side: Side) -> Iterator[tuple[Any, str]]:

@@ -17,7 +17,7 @@ from pans.runtime.registration.measure import Registration
 from pans.runtime.registration.parameters import DARK, N_GEOMETRY, PARAMETERS, flat_basis
 from pans.runtime.report.file_facts import file_facts
 
-from .charts import Axis, Bars, Curve, Mark, chart, percent, whole
+from .charts import Axis, Curve, Mark, chart, percent, whole
 from .page import picture, render
 from .rates import Rates
 
@@ -31,52 +31,53 @@ def bundle_page(path: Path) -> bytes:
     bundle, sha256 = load_bundle(path)
     facts = file_facts(path)
     provenance = {"SHA-256": sha256, **facts.pop("provenance", {})}
-    walks = None if bundle.automaton is None else _automaton(bundle, bundle.automaton)
-    shown = optics(bundle) if walks is None else None
-    return render("bundle.html", bundle=bundle, facts=facts, provenance=provenance, optics=shown, automaton=walks)
+    if (automaton := bundle.automaton) is None:
+        shown: dict[str, Any] = {"optics": optics(bundle)}
+    else:
+        shown = {"states": first_states(bundle, automaton), "sure": _sure_chart(automaton)}
+    return render("bundle.html", bundle=bundle, facts=facts, provenance=provenance, **shown)
 
 
 def optics(bundle: Bundle, rates: Rates | None = None) -> dict[str, Any]:
     """Return the fixed patterns, or the rows of passive optics, as pictures with lines; with a run's `rates` what a click on each means."""
-    if bundle.analyser is None:
-        values, unit = (
-            bundle.patterns().reshape(-1, *bundle.image_shape),
-            "photoelectrons per exposure and unit transmission",
-        )
-    else:
-        values = np.abs(bundle.analyser.matrix).astype(np.float64).reshape(-1, *bundle.image_shape)
-        unit = "modulus of W"
+    what, unit = "pattern", "photoelectrons per exposure and unit transmission"
+    values = bundle.patterns() if bundle.analyser is None else np.abs(bundle.analyser.matrix).astype(np.float64)
+    if bundle.analyser is not None:
+        what, unit = "row", "modulus of W"
     pictures = []
-    for number, value in enumerate(values[:PATTERNS_MAX]):
+    for number, value in enumerate(values.reshape(-1, *bundle.image_shape)[:PATTERNS_MAX]):
         lines = [] if rates is None else rates.meaning(number, bundle.classes)
         if bundle.analyser is None:
             lines.append(f"light {value.sum():.4g}, brightest pixel {value.max():.3g}")
-        pictures.append((f"{'pattern' if bundle.analyser is None else 'row'} {number}", picture(value), lines))
+        pictures.append((f"{what} {number}", picture(value), lines))
     return {"pictures": pictures, "n": len(values), "unit": unit, "bundle": bundle, "measured": rates is not None}
 
 
-def _automaton(bundle: Bundle, automaton: Automaton) -> dict[str, Any]:
-    """What the first states show and what a click there means, how many states each step has, and how sure they are."""
+def first_states(bundle: Bundle, automaton: Automaton, rates: Rates | None = None) -> list[tuple[str, str, list[str]]]:
+    """Return what the first states show, as pictures with lines: the next state and the most probable class after each outcome.
+
+    With a run's `rates` also which share of its walks came to a state, and how often it clicked.
+    """
     pictures = []
     for state in range(min(STATES_SHOWN, automaton.n_states)):
-        lines = [f"{what}: {words}" for what, words in outcomes(automaton, state, bundle.classes).items()]
-        lines.insert(0, f"step {int(automaton.depth[state]) + 1}")
-        pictures.append((f"state {state}", picture(state_picture(bundle, automaton, state)), lines))
-    sure = automaton.posteriors.max(axis=1)
-    steps = [sure[: automaton.n_states][automaton.depth == slot] for slot in range(automaton.n_slots)]
-    x, counts = Axis("step of the walk", 0.5, len(steps) + 0.5, text=whole), [len(values) for values in steps]
-    bars = [Bars(np.arange(len(steps) + 1) + 0.5, counts)]
+        lines = [] if rates is None else [rates.of_state(state)]
+        lines += [f"{what}: {words}" for what, words in outcomes(automaton, state, bundle.classes).items()]
+        name = f"state {state}, step {int(automaton.depth[state]) + 1}"
+        pictures.append((name, picture(state_picture(bundle, automaton, state)), lines))
+    return pictures
+
+
+def _sure_chart(automaton: Automaton) -> Any:
+    """How sure the states of each step are: median and quartiles of their largest probability."""
+    sure = automaton.posteriors[: automaton.n_states].max(axis=1)
+    steps = [sure[automaton.depth == slot] for slot in range(automaton.n_slots)]
     low, middle, high = np.array([np.quantile(values, (0.25, 0.5, 0.75)) for values in steps]).T
     curve = Curve(np.arange(1, len(steps) + 1), middle, low=low, high=high)
-    y = Axis("largest probability", 0.0, 1.0, text=percent)
-    return {
-        "pictures": pictures,
-        "states": chart(
-            "Number of states in each step", x, Axis("states", 0.0, 1.05 * max(counts)), bars=bars, height=190
-        ),
-        "sure": chart("Largest probability of a class in the states of each step", x, y, curves=[curve], height=190),
-        "leaves": float(np.median(sure[automaton.n_states :])),
-    }
+    x, y = (
+        Axis("step of the walk", 0.5, len(steps) + 0.5, text=whole),
+        Axis("largest probability", 0.0, 1.0, text=percent),
+    )
+    return chart("Largest probability of a class in the states of each step", x, y, curves=[curve], height=190)
 
 
 def state_picture(bundle: Bundle, automaton: Automaton, state: int) -> F64:
@@ -87,7 +88,7 @@ def state_picture(bundle: Bundle, automaton: Automaton, state: int) -> F64:
 
 
 def outcomes(automaton: Automaton, state: int, classes: tuple[str, ...]) -> dict[str, str]:
-    """Return outcome -> the most probable class after it in `state`, the one with most clicks first."""
+    """Return outcome -> the next state and the most probable class after it in `state`, the one with most clicks first."""
     if automaton.counts:
         last = automaton.n_outcomes - 1
         names = [*(f"{number} photons" for number in range(last)), f"{last} photons or more"]
@@ -97,8 +98,9 @@ def outcomes(automaton: Automaton, state: int, classes: tuple[str, ...]) -> dict
         names = ["no click", "click"]
     found = {}
     for outcome in reversed(range(len(names))):
-        after = automaton.posteriors[int(automaton.successors[state, outcome])]
-        found[names[outcome]] = f"{classes[int(after.argmax())]} {100 * float(after.max()):.0f} %"
+        to = int(automaton.successors[state, outcome])
+        after, where = automaton.posteriors[to], f"state {to}" if to < automaton.n_states else "the end"
+        found[names[outcome]] = f"{where}, {classes[int(after.argmax())]} {100 * float(after.max()):.0f} %"
     return found
 
 
@@ -117,16 +119,14 @@ def clicked_words(word: int, channels: int) -> str:
 
 def measured_page(path: Path) -> bytes:
     """Return the page of a calibration or a registration."""
-    facts = file_facts(path)
-    parameters, channels = facts.pop("parameters", {}), facts.pop("channels", None) or []
-    return render(
-        "measured.html", facts=facts, parameters=_parameters(parameters), channels=channels, pictures=[], charts=[]
-    )
+    return _measured(file_facts(path), [], [])
 
 
-def _parameters(found: dict[str, Any]) -> list[tuple[str, dict[str, float], str]]:
+def _measured(facts: dict[str, Any], pictures: list[Any], charts: list[Any]) -> bytes:
     units = {one.name: one.unit for one in PARAMETERS}
-    return [(name, row, units.get(name, "")) for name, row in found.items()]
+    rows = [(name, row, units.get(name, "")) for name, row in facts.pop("parameters", {}).items()]
+    more = {"channels": facts.pop("channels", None) or [], "pictures": pictures, "charts": charts}
+    return render("measured.html", facts=facts, parameters=rows, **more)
 
 
 def write_registration_page(
@@ -138,15 +138,12 @@ def write_registration_page(
     facts = registration_values(found, bench.shape) | {"kind": "registration", "device": {"simulated": simulated}}
     stated, seen = bench.target.reshape(bench.shape), bench.appearance(found.values[:N_GEOMETRY]).reshape(bench.shape)
     field = (1.0 + found.values[7:DARK] @ flat_basis(bench.shape)).reshape(bench.shape)
+    ends = float(field.min()), float(field.max())
     pictures = [
         ("as stated", picture(stated, high=1.0), ["on the pattern grid"]),
         ("as seen", picture(seen, high=1.0), ["moved, turned, blurred"]),
         ("seen - stated", picture(seen - stated, -1.0, 1.0), ["black to white: -1 to 1"]),
-        (
-            "flat field",
-            picture(field, float(field.min()), float(field.max())),
-            [f"{field.min():.3f} to {field.max():.3f}"],
-        ),
+        ("flat field", picture(field, *ends), ["{:.3f} to {:.3f}".format(*ends)]),
     ]
     expected, share, deviation = pattern_residuals(bench, measurement.observed, found.values)
     top = float(max(expected.max(), share.max(), 1e-3))
@@ -154,17 +151,12 @@ def write_registration_page(
     x, y = Axis("expected share of clicks", 0.0, top), Axis("measured share of clicks", 0.0, top)
     words = "share of exposures that clicked against the share that the model expects, a dot for each pattern"
     agreement = chart(words, x, y, curves=curves)
-    dots = Curve(np.arange(len(deviation)), np.clip(deviation, -FAR, FAR), dots=True)
-    x, y = (
-        Axis("pattern", 0.0, float(max(len(deviation) - 1, 1)), text=whole),
-        Axis("residual (standard errors)", -FAR, FAR),
-    )
-    marks = [Mark(2.0, "+2"), Mark(-2.0, "-2")]
+    dots, last = Curve(np.arange(len(deviation)), np.clip(deviation, -FAR, FAR), dots=True), max(len(deviation) - 1, 1)
+    x, y = Axis("pattern", 0.0, float(last), text=whole), Axis("residual (standard errors)", -FAR, FAR)
+    marks = [Mark(2.0, "2 standard errors"), Mark(-2.0, "")]
     left = chart("residual of every pattern in standard errors", x, y, curves=[dots], marks=marks)
-    rows = _parameters(facts.pop("parameters"))
     charts = [
         (agreement, "Every pattern's share of clicks."),
         (left, "Measured less expected clicks over their standard error."),
     ]
-    page = render("measured.html", facts=facts, parameters=rows, channels=[], pictures=pictures, charts=charts)
-    write_file(path, page, force=force)
+    write_file(path, _measured(facts, pictures, charts), force=force)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import io
-import math
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +23,6 @@ from pans.runtime.cli.finding import missing_extra
 from pans.runtime.safe_text import html, one_line
 
 WIDTH, HEIGHT = 440, 240  # pixels
-POINTS_MAX = 500  # of a curve
 BLUES = ("#eef3fa", "#5e94cd", "#08265c")  # light to dark, so that more is darker on paper too
 # A colour that stands for a variable of page.css, and is replaced by it.
 _INKS = {
@@ -107,7 +105,10 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Points that are joined (or `dots`), NaN where there is none; `low` and `high` are the ends of a band around it."""
+    """Points that are joined (or `dots`), NaN where there is none; `low` and `high` are the ends of a band around it.
+
+    Of a joined curve matplotlib leaves out the points that nobody could tell apart.
+    """
 
     x: ArrayLike
     y: ArrayLike
@@ -116,15 +117,6 @@ class Curve:
     low: ArrayLike | None = None
     high: ArrayLike | None = None
     dots: bool = False
-
-    def thinned(self) -> list[NDArray[np.float64] | None]:
-        """Return x, y, low and high with at most POINTS_MAX points; outliers stay."""
-        given = (self.x, self.y, self.low, self.high)
-        arrays = [None if one is None else np.asarray(one, np.float64) for one in given]
-        if len(y := np.asarray(self.y, np.float64)) <= POINTS_MAX:
-            return arrays
-        kept = extremes(y, POINTS_MAX // 2)
-        return [None if one is None else one[kept] for one in arrays]
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,33 +132,11 @@ class Bars:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A straight line at `at` across the chart, with its name."""
+    """A straight line at `at` across the chart, with its name for the legend."""
 
     at: float
     name: str
     upright: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Node:
-    """A picture of a tree: its level, place from left (0) to right (1), lines below it, and the numbers of the nodes after it, -1: none."""
-
-    level: int
-    place: float
-    picture: NDArray[np.float64]
-    lines: tuple[str, ...]
-    leads: tuple[int, ...]
-
-
-def extremes(values: NDArray[np.float64], stretches: int) -> NDArray[np.int64]:
-    """Return the places of the least and the largest of `values` in each of `stretches` parts, in order, without doubles; NaN is neither.
-
-    >>> extremes(np.array([0.0, 1.0, 9.0, 1.0, 0.0, 0.0]), 2).tolist()
-    [0, 2, 3, 4]
-    """
-    parts = np.array_split(np.arange(len(values)), stretches)
-    low, high = np.where(np.isnan(values), np.inf, values), np.where(np.isnan(values), -np.inf, values)
-    return np.unique([int(part[ends.argmin()]) for part in parts if len(part) for ends in (low[part], -high[part])])
 
 
 def chart(
@@ -200,59 +170,31 @@ def chart(
             axes.set_axisbelow(True)
         named: list[tuple[Any, str]] = []
         for bar in bars:
-            edges = np.asarray(bar.edges, np.float64)
-            named.append(
-                (
-                    axes.bar(edges[:-1], bar.heights, np.diff(edges), bar.base, align="edge", color=_INKS[bar.kind]),
-                    bar.name,
-                )
-            )
-        for curve in curves:
-            named.append((_curve(axes, curve), curve.name))
+            edges, ink = np.asarray(bar.edges, np.float64), _INKS[bar.kind]
+            drawn_bars = axes.bar(edges[:-1], bar.heights, np.diff(edges), bar.base, align="edge", color=ink)
+            named.append((drawn_bars, bar.name))
+        named += [(_curve(axes, curve), curve.name) for curve in curves]
         for mark in marks:
-            _mark(axes, mark, x, y)
-        if len(told := [(artist, one_line(name)) for artist, name in named if name]) > 1:
+            line = axes.axvline if mark.upright else axes.axhline
+            named.append((line(mark.at, color=_INKS["bad"], ls=(0, (4, 3)), lw=1), mark.name))
+        if (told := [(artist, one_line(name)) for artist, name in named if name]) and (marks or len(told) > 1):
             columns = 2 if max(len(name) for _, name in told) < 20 else 1
-            where = {
-                "loc": "outside upper left",
-                "ncols": columns,
-                "frameon": False,
-                "handlelength": 1.6,
-                "borderpad": 0,
-            }
-            figure.legend(*zip(*told), **where)
+            where = {"loc": "outside upper left", "ncols": columns, "frameon": False, "borderpad": 0}
+            figure.legend(*zip(*told), handlelength=1.6, **where)
     return drawn()
 
 
 def _curve(axes: Any, curve: Curve) -> Any:
-    x, y, low, high = curve.thinned()
-    colour = _INKS[curve.kind]
+    x, y, low, high = curve.x, np.asarray(curve.y), curve.low, curve.high
+    colour, one = _INKS[curve.kind], np.isfinite(y).sum() == 1
     if low is not None and high is not None:
-        if curve.dots or len(np.atleast_1d(curve.x)) == 1:
+        if curve.dots or one:
             axes.vlines(x, low, high, colors=colour, alpha=0.6, lw=1.2)
         else:
             axes.fill_between(x, low, high, color=colour, alpha=0.22, lw=0)
-    if curve.dots or np.isfinite(np.asarray(y)).sum() == 1:
+    if curve.dots or one:
         return axes.plot(x, y, "o", color=colour, ms=4)[0]
     return axes.plot(x, y, ls=_DASHES[curve.kind], color=colour, lw=1.8)[0]
-
-
-def _mark(axes: Any, mark: Mark, x: Axis, y: Axis) -> None:
-    (axes.axvline if mark.upright else axes.axhline)(mark.at, color=_INKS["bad"], ls=(0, (4, 3)), lw=1)
-    one = x if mark.upright else y
-    low, at, high = ((math.log(v) if one.log else v) for v in (one.low, mark.at, one.high))
-    far = (at - low) / ((high - low) or 1.0) > 0.6
-    if mark.upright:
-        place, align = {"xy": (mark.at, 1), "xycoords": ("data", "axes fraction")}, ("right" if far else "left", "top")
-        shift = (-4 if far else 4, -2)
-    else:
-        place, align = (
-            {"xy": (1, mark.at), "xycoords": ("axes fraction", "data")},
-            ("right", "top" if far else "bottom"),
-        )
-        shift = (0, -3 if far else 2)
-    where = {"xytext": shift, "textcoords": "offset points", "ha": align[0], "va": align[1]}
-    axes.annotate(one_line(mark.name), **place, **where, color=_INKS["bad"], fontsize=12)
 
 
 def _heat(figure: Any, axes: Any, extent: tuple[float, ...], heat: NDArray[np.float64]) -> None:
@@ -260,37 +202,8 @@ def _heat(figure: Any, axes: Any, extent: tuple[float, ...], heat: NDArray[np.fl
     top = float(np.nanmax(heat)) if np.isfinite(heat).any() else 1.0
     shades = {"cmap": colours, "vmin": 0.0, "vmax": top or 1.0, "interpolation": "none"}
     image = axes.imshow(heat, extent=extent, origin="lower", aspect="auto", **shades)
-    figure.colorbar(image, ax=axes, pad=0.02, fraction=0.06, format=lambda value, _: number(value)).outline.set_visible(
-        False
-    )
-
-
-def tree(label: str, nodes: Sequence[Node]) -> Any:
-    """Return pictures at the places of their nodes, the first level on top, with lines between them: solid to the last of `leads`."""
-    levels, widest = max(one.level for one in nodes) + 1, max(np.bincount([one.level for one in nodes]))
-    size, step = min(80, WIDTH / widest - 6), min(80, WIDTH / widest - 6) + 58
-    height = round(levels * step)
-    with _figure(label, height, layout="none") as (figure, drawn):
-        line = needed("matplotlib.lines").Line2D
-        for one in nodes:
-            top = height - one.level * step
-            for outcome, lead in enumerate(one.leads):
-                if lead >= 0:
-                    ends = (
-                        (one.place, nodes[lead].place),
-                        ((top - size - 34) / height, (height - nodes[lead].level * step) / height),
-                    )
-                    last = outcome == len(one.leads) - 1
-                    figure.add_artist(
-                        line(*ends, color=_INKS["b" if last else "soft"], lw=1.8, ls="-" if last else (0, (4, 3)))
-                    )
-            axes = figure.add_axes((one.place - size / WIDTH / 2, (top - size) / height, size / WIDTH, size / height))
-            axes.imshow(one.picture, cmap="gray", vmin=0.0, interpolation="none")
-            axes.set_axis_off()
-            for number_, text in enumerate(one.lines):
-                where = one.place, (top - size - 13 - 15 * number_) / height
-                figure.text(*where, text, ha="center", fontsize=12)
-    return drawn()
+    bar = figure.colorbar(image, ax=axes, pad=0.02, fraction=0.06, format=lambda value, _: number(value))
+    bar.outline.set_visible(False)
 
 
 def spark(label: str, shares: Sequence[float]) -> Any:

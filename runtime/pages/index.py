@@ -18,10 +18,10 @@ from pans.runtime.container import open_regular, skim_blocks
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.record.format import LIMITS, Kind
 from pans.runtime.record.log import LogReader
+from pans.runtime.report.words import accuracy_interval
 
 from .charts import Axis, Curve, chart, number, percent, spark
 from .page import render
-from .run import accuracy_interval
 
 SPARKS, LOG_MAX_BYTES = 24, 1 << 24  # stretches of a small picture; of a larger recording there is none
 UNITS = (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0))  # of the time axis: the longest of which two fit
@@ -30,7 +30,7 @@ Run = Any  # of operate/runs.py, a package that comes later
 
 def index_page(root: Path, runs: Sequence[Run], beside: Path) -> bytes:
     """Return the page of the runs in `root`, the newest first, with links from the folder `beside`."""
-    rows = [{"run": run, "summary": run.summary, "link": _link(run, beside), "spark": _spark(run)} for run in runs]
+    rows = [(run, run.summary, accuracy_interval(run.summary), _link(run, beside), _spark(run)) for run in runs]
     trends = [drawn for drawn in (_trend(runs, *one) for one in _TRENDS) if drawn is not None]
     return render("index.html", root=root, rows=rows, trends=trends, simulated=any(run.simulated for run in runs))
 
@@ -72,40 +72,42 @@ def accuracy_over(recordings: Sequence[Path]) -> list[float]:
 
 # ---- trends ----
 
-Figure = Callable[[Mapping[str, Any]], tuple[float, float, float] | None]
+Ends = tuple[float, float, float] | None  # a figure with its interval
 
 
-def _accuracy(summary: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    ends = accuracy_interval(summary)
-    return None if ends is None or summary.get("accuracy") is None else (summary["accuracy"], *ends)
+def _accuracy(one: Mapping[str, Any]) -> Ends:
+    ends = accuracy_interval(one)
+    return None if ends is None or one.get("accuracy") is None else (one["accuracy"], *ends)
 
 
-def _dark(summary: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    dark = summary.get("dark") or {}
+def _dark(one: Mapping[str, Any]) -> Ends:
+    dark = one.get("dark") or {}
     return (dark["clicks"] / dark["exposures"], dark["low"], dark["high"]) if dark.get("exposures") else None
 
 
-def _alone(value: Any) -> tuple[float, float, float] | None:
-    return None if value is None else (float(value), float(value), float(value))
+def _clicks(one: Mapping[str, Any]) -> Ends:
+    return None if one.get("clicks_mean") is None else (float(one["clicks_mean"]),) * 3
 
 
-_TRENDS: tuple[tuple[str, str, Figure], ...] = (
-    ("accuracy", "Accuracy of each run with its 95 % interval.", _accuracy),
-    ("dark clicks per dark exposure", "Dark rate of each run with its 95 % interval.", _dark),
-    (
-        "clicks per decision",
-        "Light level: clicks of a decision, on average.",
-        lambda one: _alone(one.get("clicks_mean")),
-    ),
-    (
-        "late decisions, share",
-        "Share of decisions that were late.",
-        lambda one: _alone(one["late"] / one["decisions"] if one.get("decisions") else None),
-    ),
+def _late(one: Mapping[str, Any]) -> Ends:
+    return (one["late"] / one["decisions"],) * 3 if one.get("decisions") else None
+
+
+_TRENDS: tuple[tuple[str, str, Callable[[Mapping[str, Any]], Ends], Callable[[float], str]], ...] = (
+    ("accuracy", "Accuracy of each run with its 95 % interval.", _accuracy, percent),
+    ("dark clicks per dark exposure", "Dark rate of each run with its 95 % interval.", _dark, number),
+    ("clicks per decision", "Light level: clicks of a decision, on average.", _clicks, number),
+    ("late decisions, share", "Share of decisions that were late.", _late, percent),
 )
 
 
-def _trend(runs: Sequence[Run], title: str, words: str, figure: Figure) -> tuple[Any, str] | None:
+def _trend(
+    runs: Sequence[Run],
+    title: str,
+    words: str,
+    figure: Callable[[Mapping[str, Any]], Ends],
+    text: Callable[[float], str],
+) -> tuple[Any, str] | None:
     """One figure of all runs over time; None where fewer than two know it."""
     found = [(run.started.timestamp(), *values) for run in runs if (values := figure(run.summary)) is not None]
     if len(found) < 2:
@@ -114,8 +116,7 @@ def _trend(runs: Sequence[Run], title: str, words: str, figure: Figure) -> tuple
     unit, unit_s = next(one for one in UNITS if when[-1] - when[0] >= 2 * one[1] or one is UNITS[-1])
     since = (when - when[0]) / unit_s
     first, top = datetime.fromtimestamp(when[0]).astimezone(), float(high.max())
-    share = title.startswith(("accuracy", "late"))
     x = Axis(f"{unit} since {first:%Y-%m-%d %H:%M}", -0.02 * since[-1], 1.02 * since[-1] or 1.0)
-    y = Axis(title, 0.0, 1.0 if title == "accuracy" else 1.1 * top or 1.0, text=percent if share else number)
+    y = Axis(title, 0.0, 1.0 if title == "accuracy" else 1.1 * top or 1.0, text=text)
     curve = Curve(since, value, low=low, high=high, dots=True)
     return chart(f"{title} of {len(value)} runs", x, y, curves=[curve]), words

@@ -86,21 +86,14 @@ def sentence_of(event: Mapping[str, Any]) -> str:
     'The device was found again after 812 ms (2 attempts).'
     """
     kind = str(event.get("kind", "?"))
-    if kind == "blame":
-        return _blame(event)
+    facts = {key: _plain(value) for key, value in event.items()}
+    facts["doubt"] = "" if event.get("sure", True) else ", not surely"
     try:
-        said = words()["sentences"][kind].format_map({key: _plain(value) for key, value in event.items()})
-        return said.replace("..", ".").strip()
+        said = words()["sentences"][f"{kind} {event['what']}" if kind == "blame" else kind].format_map(facts)
+        return str(said).replace("..", ".").strip()
     except (KeyError, IndexError, ValueError):
-        facts = ", ".join(f"{key} {_plain(value)}" for key, value in event.items() if key != "kind")
-        return f"{kind.replace('_', ' ')}{': ' if facts else ''}{facts}"
-
-
-def _blame(event: Mapping[str, Any]) -> str:
-    late = event.get("what") == "late"
-    what = f"{event.get('decisions', 1)} late decisions" if late else f"{event.get('exposures', 0)} missing exposures"
-    sure = "" if event.get("sure", True) else ", not surely"
-    return f"The cause of {what} is {event.get('cause', 'unknown')}{sure}: {event.get('why', '')}."
+        rest = ", ".join(f"{key} {_plain(value)}" for key, value in event.items() if key != "kind")
+        return f"{kind.replace('_', ' ')}{': ' if rest else ''}{rest}"
 
 
 def _plain(value: Any) -> str:

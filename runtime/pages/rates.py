@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -87,9 +88,8 @@ class Rates:
         self.n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
         self.what = "channel" if self.parallel else "step of the walk" if walks else "pattern"
         self.over = Stretches(**{"clicks": (self.n,), "exposures": (self.n,), "dark clicks": (), "dark exposures": ()})
-        self.state_clicks, self.state_exposures = np.zeros(
-            (2, 0 if plan.automaton is None else plan.automaton.n_states)
-        )
+        n_states = 0 if plan.automaton is None else plan.automaton.n_states
+        self.state_clicks, self.state_exposures = np.zeros((2, n_states))
         self.class_clicks, self.class_exposures = np.zeros((2, self.n, 0 if walks else n_classes))
         self._truths: dict[int, int] = {}
 
@@ -103,9 +103,8 @@ class Rates:
             self._first = int(item.message_tick[0])
         cycles = np.maximum(item.message_tick - self._first, 0) * (plan.tick_us / plan.cycle_us)
         where, dark = self.over.at(cycles.astype(np.int64)), is_dark(item.pattern)
-        clicks = (
-            item.clicks[:, : self.n] if self.parallel else np.asarray(item.clicks.any(axis=1))[:, None]
-        )  # in any of the channels
+        # in any of the channels, where one pattern after the other is shown
+        clicks = item.clicks[:, : self.n] if self.parallel else item.clicks.any(axis=1, keepdims=True)
         sums = self.over.sums
         sums["dark clicks"] += np.bincount(where[dark], clicks[dark].sum(axis=1), BINS)
         sums["dark exposures"] += np.bincount(where[dark], minlength=BINS) * (self.n if self.parallel else 1)
@@ -176,6 +175,24 @@ class Rates:
             marks=[] if expected is None else [Mark(expected, f"expected {expected:.3g}")],
             height=190,
         )
+
+    def begin_of(self, event: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a state of the detector in dark exposures with `begun_s` and `noticed_s`, seconds since the first exposure, about.
+
+        They are None where the recording has too few dark exposures: frames without an object may have told instead.
+        """
+        counts = np.cumsum(np.append(0.0, self.over.sums["dark exposures"][: self.over.used]))
+        counts /= self.n if self.parallel else 1
+        numbers = int(event["since_dark_exposure"]), int(event["dark_exposure"])
+        begun, noticed = np.interp(numbers, counts, self._edges(self.over)).tolist()
+        known = numbers[1] <= counts[-1]
+        return {**event, "begun_s": begun if known else None, "noticed_s": noticed if known else None}
+
+    def of_state(self, state: int) -> str:
+        """Return which share of the walks came to a state of the automaton, and how often it clicked."""
+        exposures, clicks = float(self.state_exposures[state]), float(self.state_clicks[state])
+        share = f"{100 * exposures / max(float(self.state_exposures[0]), 1.0):.0f} % of the walks"
+        return f"{share}, clicked in {100 * clicks / exposures:.0f} %" if exposures else "never shown"
 
     def meaning(self, number: int, classes: tuple[str, ...]) -> list[str]:
         """Return how often pattern `number` clicked, and with which classes most and least often: counted, not modelled."""

@@ -1,68 +1,56 @@
 """The page of a run: its recording is read once, block by block, while sums of bounded size add up; the rest is that of its summary.
 
 Before that it was checked, and its commands were read for the plan. The messages are read for the rates; the blocks that come in between
-go to who sums them up. Only objects in flow need one reading more: their passages come from a replay. Verdict,
-faults and figures are those that the run recorded; a cut recording has none, and says so.
+go to who sums them up: decisions, events, durations, and an automaton's walks. Only objects in flow need one reading more: their passages
+come from a replay. Verdict, faults and figures are those that the run recorded; a cut recording has none, and says so.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.flow.matching import abort_reason
-from pans.runtime.intervals import Z_95, wilson_interval
+from pans.runtime.intervals import wilson_interval
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import iter_exposures
 from pans.runtime.record.format import Kind
 from pans.runtime.record.parts import first_decision
 from pans.runtime.record.recording import ROWS_AT_ONCE
 from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.report.words import exposure_words, figure_rows, flow_rows, mean_words, repeat_words
+from pans.runtime.report.words import figure_rows, flow_rows, stage_rows, walk_rows
+from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 
-from .bundle import optics
-from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, whole
-from .page import points, render, sentence_of, words
+from .bundle import first_states, optics
+from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, span, whole
+from .page import render, sentence_of, words
 from .rates import BINS, Rates, Stretches
-from .timing import Clock, Durations, latency_chart
-from .walks import Walks
 
 CONFUSION_MAX = 40  # classes
 ACCURACY_BINS, OBJECTS_PER_BIN = 60, 20
 SHOWN, OF_A_KIND = 200, 30  # events
+LEAST_US = 1.0  # of the axis of latencies
+NO_TIME_US = 0.05  # p99 of the host's own time
+CONFIDENCE_BINS = 10
+_NOT_WALKED = int(DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE)
+WHOLE, IN_HOST = "end of exposure to decision", "in the host, to the decision"
+_STAGES = {  # name of a stage -> where it begins and ends
+    WHOLE: ("device_end_ns", "decided_ns"),
+    "on the link": ("device_end_ns", "arrival_ns"),
+    IN_HOST: ("arrival_ns", "decided_ns"),
+    "to the recorder": ("decided_ns", "recorded_ns"),
+}
 F64 = NDArray[np.float64]
-
-
-class Reading:
-    """One pass over a recording: what `iter_exposures` asks of one, and rows of other kinds to those who take them, many at once."""
-
-    def __init__(self, recording: Recording, takers: Mapping[Kind, Callable[[Any], None]]) -> None:
-        self._recording, self._takers = recording, takers
-
-    def messages(self) -> Iterator[tuple[int, bytes]]:
-        """Yield the device's messages."""
-        held: dict[Kind, list[Any]] = {kind: [] for kind in self._takers}
-        sizes = Counter[Kind]()
-        for kind, content in self._recording.read(Kind.MESSAGES, *self._takers):
-            if kind == Kind.MESSAGES:
-                yield from content
-            elif kind == Kind.EVENTS:
-                self._takers[kind](content)
-            else:
-                held[kind].append(content)
-                sizes[kind] += len(content)
-                if sizes[kind] >= ROWS_AT_ONCE:
-                    self._takers[kind](np.concatenate(held[kind]))
-                    held[kind], sizes[kind] = [], 0
-        for kind, rows in held.items():
-            if rows:
-                self._takers[kind](np.concatenate(rows))
+I64 = NDArray[np.int64]
+Rows = NDArray[np.void]
 
 
 class Decisions:
@@ -86,7 +74,7 @@ class Decisions:
         if ((found >= 0) & (found < self.n)).all():
             self.over.add(name, found, weights)
 
-    def take(self, rows: NDArray[np.void]) -> None:
+    def take(self, rows: Rows) -> None:
         """Take the next rows, DECISION_DTYPE (n,)."""
         if self._first_tick is None:
             self._first_tick = int(rows["tick"][0])
@@ -167,6 +155,7 @@ class Events:
         self._decisions = decisions
         self.kinds: Counter[str] = Counter()
         self.shown: list[Mapping[str, Any]] = []
+        self.dark: list[Mapping[str, Any]] = []  # states of the detector that began
         self.late, self.lost = Counter[str](), Counter[str]()
         self.first_case: dict[str, str] = {}
 
@@ -177,22 +166,151 @@ class Events:
             self.kinds[kind] += 1
             if len(self.shown) < SHOWN and self.kinds[kind] <= OF_A_KIND and kind != "session":
                 self.shown.append(event)
+                if kind == "dark_state" and event.get("state") != "over":
+                    self.dark.append(event)
             if kind == "blame":
-                cause = str(event.get("cause", "?"))
-                self.first_case.setdefault(cause, str(event.get("why", "")))
-                if event.get("what") == "late":
-                    n = int(event.get("decisions", 1))
-                    self.late[cause] += n
-                    self._decisions.add(f"late {cause}", [int(event.get("first_decision", -1))], [n])
-                else:
-                    self.lost[cause] += int(event.get("exposures", 1))
+                self._take_blame(event)
             elif kind in ("gate_refused", "gate_expired") and "decision" in event:
                 self._decisions.add(kind, [int(event["decision"])])
+
+    def _take_blame(self, event: Mapping[str, Any]) -> None:
+        cause, late = str(event.get("cause", "?")), event.get("what") == "late"
+        where = f"decision {event.get('first_decision')}" if late else f"exposure {event.get('first_exposure')}"
+        doubt = "" if event.get("sure", True) else ", not surely"
+        self.first_case.setdefault(cause, f"from {where} on{doubt}: {event.get('why', '')}")
+        if late:
+            n = int(event.get("decisions", 1))
+            self.late[cause] += n
+            self._decisions.add(f"late {cause}", [int(event.get("first_decision", -1))], [n])
+        else:
+            self.lost[cause] += int(event.get("exposures", 1))
 
     def causes(self) -> list[tuple[str, int, int, str]]:
         """Return cause, late decisions, lost exposures and the first case of each, the most frequent first."""
         both = (self.late + self.lost).most_common()
-        return [(cause, self.late[cause], self.lost[cause], self.first_case.get(cause, "")) for cause, _ in both]
+        return [(cause, self.late[cause], self.lost[cause], self.first_case[cause]) for cause, _ in both]
+
+
+class Durations:
+    """Histograms of the latencies of all decisions, whole and by stage; at most 3.2 % too long, their maximum exact."""
+
+    def __init__(self) -> None:
+        self.stages = {name: LatencyHistogram() for name in _STAGES}
+
+    @property
+    def n(self) -> int:
+        """Decisions."""
+        return self.stages[IN_HOST].total
+
+    def take(self, rows: Rows) -> None:
+        """Take the next rows, TIMING_DTYPE (n,)."""
+        for name, (start, end) in _STAGES.items():
+            self.stages[name].add_many(rows[end].astype(np.int64) - rows[start].astype(np.int64))
+
+    def is_virtual(self) -> bool:
+        """Whether the host took no time at all, as in virtual time: then latencies say nothing."""
+        return self.stages[IN_HOST].summary()["p99"] < NO_TIME_US
+
+    def rows(self, summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+        """Return name and quantiles of the whole and of each stage, as the run summed them up where it did."""
+        if "stage_latency_us" in summary:
+            return stage_rows(summary)
+        found = {name: one.summary() for name, one in self.stages.items()}
+        told = {"latency_us": found.pop(WHOLE), "stage_latency_us": found}
+        return stage_rows({**told, "clock": {"worst_uncertainty_us": 0.0}})
+
+
+def survival(histogram: LatencyHistogram) -> tuple[F64, F64]:
+    """Return times in microseconds and the share of durations that are at least about as long."""
+    counts, n = histogram.counts, max(histogram.total, 1)
+    buckets = np.flatnonzero(counts)
+    beyond = np.cumsum(counts[::-1])[::-1][buckets] / n
+    edges = np.minimum([upper_edge(bucket) for bucket in buckets.tolist()], histogram.max_ns)
+    return np.maximum(edges / 1000, LEAST_US), np.asarray(beyond, np.float64)
+
+
+def latency_chart(durations: Durations, deadline_us: float | None, label: str = "Latency") -> Any:
+    """Return the shares of decisions above each time, with the deadline."""
+    curves = [Curve(*survival(one), name, kind) for (name, one), kind in zip(durations.stages.items(), "abcd")]
+    top = max([one.max_ns / 1000 for one in durations.stages.values()] + [deadline_us or 0.0, 10.0]) * 1.3
+    return chart(
+        f"{label}: share of decisions that took longer than a time",
+        Axis("longer than", LEAST_US, top, log=True, text=span),
+        Axis("share of decisions", 0.7 / durations.n, 1.0, log=True, text=percent),
+        curves=curves,
+        marks=[Mark(deadline_us, f"budget {span(deadline_us)}", upright=True)] if deadline_us else [],
+        height=320,
+    )
+
+
+class Walks:
+    """How many whole walks had each number of exposures and of clicks, int64 (numbers,), and what they said of themselves."""
+
+    def __init__(self, automaton: Automaton) -> None:
+        self._automaton = automaton
+        self.exposures, self.clicks = np.zeros(automaton.n_slots + 1, np.int64), np.zeros(1, np.int64)
+        self.probability = 0.0  # their sum
+        self.bins = np.zeros((3, CONFIDENCE_BINS))  # of those with label and truth: how many, probabilities, right ones
+
+    def take(self, rows: Rows) -> None:
+        """Take the next rows, DECISION_DTYPE (n,)."""
+        some = rows[(rows["flags"] & _NOT_WALKED) == 0]
+        known = some[(some["truth"] >= 0) & ((some["flags"] & int(DecisionFlag.ABSTAINED)) == 0)]
+        place = np.minimum((known["probability"] * CONFIDENCE_BINS).astype(np.int64), CONFIDENCE_BINS - 1)
+        for row, weights in enumerate((None, known["probability"], known["label"] == known["truth"])):
+            self.bins[row] += np.bincount(place, weights, CONFIDENCE_BINS)
+        self.exposures, self.clicks = _added(self.exposures, some["exposures"]), _added(self.clicks, some["clicks"])
+        self.probability += float(some["probability"].sum(dtype=np.float64))
+
+    def reliability(self) -> list[tuple[float, float, float]]:
+        """Return mean probability, share of right ones and share of all, of each bin that has any."""
+        n = self.bins[0].sum()
+        return [(said / count, right / count, count / n) for count, said, right in self.bins.T.tolist() if count]
+
+    def facts(self, bundle: Bundle, rates: Rates) -> dict[str, Any]:
+        """Return what the page says of the walks; {} without any."""
+        n, automaton = int(self.exposures.sum()), self._automaton
+        if not n:
+            return {}
+        bins, told = self.reliability(), float(self.bins[0].sum())
+        return {
+            "n": n,
+            "automaton": automaton,
+            "pictures": first_states(bundle, automaton, rates),
+            "means": [float(np.average(np.arange(len(one)), weights=one)) for one in (self.exposures, self.clicks)],
+            "lengths": _counted("exposures of a walk", self.exposures[1:], 1),
+            "clicks": _counted("clicks of a walk", self.clicks, 0),
+            "probability": self.probability / n,
+            "reliability": _reliability_chart(bins) if bins else None,
+            "error": sum(share * abs(right - said) for said, right, share in bins),
+            # if every stated probability were right: of a share of m decisions sqrt(2 p (1 - p) / (pi m))
+            "chance": sum(share * float(np.sqrt(2 * p * (1 - p) / (np.pi * share * told))) for p, _, share in bins),
+        }
+
+
+def _added(counts: I64, values: NDArray[np.integer[Any]]) -> I64:
+    """Return `counts` with how often each of `values` is there; longer where they are larger."""
+    more = np.bincount(values, minlength=len(counts))
+    more[: len(counts)] += counts
+    return more
+
+
+def _counted(what: str, counts: I64, first: int) -> Any:
+    edges = first + np.arange(len(counts) + 1) - 0.5
+    x = Axis(what, float(edges[0]), float(edges[-1]), text=whole)
+    y = Axis("walks", 0.0, 1.05 * max(int(counts.max(initial=0)), 1))
+    return chart(f"How many walks had each number of {what}", x, y, bars=[Bars(edges, counts)], height=190)
+
+
+def _reliability_chart(bins: list[tuple[float, float, float]]) -> Any:
+    said, right, _ = np.array(bins).T
+    x = Axis("probability that the decision stated", 0.0, 1.0, text=percent)
+    y = Axis("share of right decisions", 0.0, 1.0, text=percent)
+    curves = [Curve([0.0, 1.0], [0.0, 1.0], "as sure as right", "b"), Curve(said, right, "decisions", "a")]
+    return chart("Share of right decisions against the probability that they stated", x, y, curves=curves, height=270)
+
+
+# ---- the page ----
 
 
 def run_page(recording: Recording) -> bytes:
@@ -201,23 +319,16 @@ def run_page(recording: Recording) -> bytes:
     plan, summary, config = recorded_plan(recording), recording.summary, recording.header["config"]
     classes = () if bundle is None else bundle.classes
     decisions = Decisions(config, recording.n_decisions, classes, first_decision(recording))
-    events, durations, clock = Events(decisions), Durations(), Clock(int(config["tick_hz"]))
+    events, durations, rates = Events(decisions), Durations(), Rates(plan, len(classes))
     walks = Walks(plan.automaton) if plan.automaton is not None else None
-
-    def decided(rows: NDArray[np.void]) -> None:
-        decisions.take(rows)
-        if walks is not None:
-            walks.take(rows)
-
-    takers = {Kind.DECISIONS: decided, Kind.TIMINGS: durations.take, Kind.CLOCK: clock.take, Kind.EVENTS: events.take}
-    rates = Rates(plan, len(classes))
-    for item in iter_exposures(cast(Recording, Reading(recording, takers)), plan):
+    takers = {Kind.DECISIONS: [decisions.take], Kind.TIMINGS: [durations.take]}
+    takers[Kind.DECISIONS] += [] if walks is None else [walks.take]
+    messages = SimpleNamespace(messages=lambda: _messages(recording, takers, events))
+    for item in iter_exposures(cast(Recording, messages), plan):
         rates.take(item)
-    budget_us = summary.get("deadline_us") or config.get("deadline_us")
-    timed = not durations.is_virtual()
+    budget_us, timed = summary.get("deadline_us") or config.get("deadline_us"), not durations.is_virtual()
     accuracy, sizes = decisions.accuracy(len(classes)) if len(classes) > 1 and decisions.known else (None, [])
     passing = _passing(recording, bundle, decisions)
-    shown = figure_rows(summary) if "verdict" in summary else []
     confusion = passing["confusion"] if passing else decisions.confusion
     return render(
         "run.html",
@@ -225,10 +336,8 @@ def run_page(recording: Recording) -> bytes:
         summary=summary,
         bundle=bundle,
         header={key: value for key, value in recording.header.items() if key not in ("profile", "command")},
-        what=_what_was_run(recording, bundle),
         reasons=[(fault, advice_on(str(fault))) for fault in summary.get("faults", ())],
-        agrees=_dark_agrees(summary.get("dark")),
-        tiles=list(_tiles(summary, timed)) if "verdict" in summary else [],
+        tiles=figure_rows(summary, timed=timed) if "verdict" in summary else [],
         decisions=decisions,
         accuracy=accuracy,
         sizes=sizes,
@@ -237,17 +346,43 @@ def run_page(recording: Recording) -> bytes:
         passing=passing,
         optics=optics(bundle, rates) if bundle is not None and plan.automaton is None else None,
         walks=walks.facts(bundle, rates) if walks is not None and bundle is not None else None,
+        walked=walk_rows(summary) if "drive" in summary else [],
         rates=rates,
+        states=[rates.begin_of(event) for event in events.dark],
         latency=durations.rows(summary) if timed else [],
         curve=latency_chart(durations, float(budget_us) if budget_us else None) if timed else None,
         causes=events.causes(),
         late=decisions.stacked("late decisions", {f"late {cause}": cause for cause in events.late}),
-        clock=clock.facts(summary),
         noted=events.kinds,
         sentences=[sentence_of(event) for event in events.shown],
         records=[(e["kind"], ", ".join(f"{k} {v}" for k, v in e.items() if k != "kind")) for e in events.shown],
-        figures=[row for row in shown if not passing or row not in passing["rows"]],
     )
+
+
+def _messages(
+    recording: Recording, takers: Mapping[Kind, Sequence[Callable[[Rows], None]]], events: Events
+) -> Iterator[tuple[int, bytes]]:
+    """Yield the device's messages; rows of other kinds go to their `takers`, those of many blocks at once, and events to `events`."""
+    held: dict[Kind, list[Rows]] = {kind: [] for kind in takers}
+    sizes = Counter[Kind]()
+
+    def pass_on(kind: Kind) -> None:
+        for take in takers[kind] if held[kind] else ():
+            take(np.concatenate(held[kind]))
+        held[kind], sizes[kind] = [], 0
+
+    for kind, content in recording.read(Kind.MESSAGES, Kind.EVENTS, *takers):
+        if kind == Kind.MESSAGES:
+            yield from content
+        elif kind == Kind.EVENTS:
+            events.take(content)
+        else:
+            held[kind].append(content)
+            sizes[kind] += len(content)
+            if sizes[kind] >= ROWS_AT_ONCE:
+                pass_on(kind)
+    for kind in takers:
+        pass_on(kind)
 
 
 def advice_on(fault: str) -> str:
@@ -281,61 +416,3 @@ def _passing(recording: Recording, bundle: Bundle | None, decisions: Decisions) 
         "outcomes": decisions.stacked("decisions", {name: name.removeprefix("outcome ") for name in names}),
         "pulses": decisions.stacked("pulses", {"made": "done", "gate_refused": "refused", "gate_expired": "expired"}),
     }
-
-
-def _dark_agrees(dark: Any) -> bool:
-    counted = dark if isinstance(dark, Mapping) and dark.get("exposures") else {}
-    return bool(counted.get("low", 1) <= counted.get("expected", 0) <= counted.get("high", 0))
-
-
-def _what_was_run(recording: Recording, bundle: Bundle | None) -> list[tuple[str, str]]:
-    header, summary = recording.header, recording.summary
-    device, profile = summary.get("device", {}), header.get("profile") or {}
-    firmware = f", firmware {device['firmware']}" if "firmware" in device else ""
-    lasted = f", {float(summary['seconds']):,.1f} s" if "seconds" in summary else ""
-    rows = [
-        ("date", f"{str(header.get('created_utc', 'unknown'))[:19].replace('T', ' ')} UTC{lasted}"),
-        ("device", f"{header.get('device_url', 'unknown')}{firmware}"),
-        ("bundle", "not in the recording" if bundle is None else bundle.name),
-        ("profile", str(profile.get("name", "unknown"))),
-        ("recording", str(recording.path)),
-        ("ended", str(summary.get("ended", ""))),
-    ]
-    return [row for row in rows if row[1]]
-
-
-def accuracy_interval(summary: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Return the 95 % interval of the accuracy by its spread over objects, or as a flow states it; None where it is not known."""
-    accuracy, error = summary.get("accuracy"), summary.get("accuracy_stderr_objects")
-    if summary.get("accuracy_ci"):
-        low, high = summary["accuracy_ci"]
-        return low, high
-    if accuracy is None or error is None:
-        return None
-    return max(0.0, accuracy - Z_95 * error), min(1.0, accuracy + Z_95 * error)
-
-
-def _tiles(summary: Mapping[str, Any], timed: bool) -> Iterator[tuple[str, str, str]]:
-    """Yield name, figure and a line about each of the main figures."""
-    if summary.get("accuracy") is not None:
-        between = accuracy_interval(summary)
-        more = "" if between is None else f"95 % interval {100 * between[0]:.2f} to {100 * between[1]:.2f} %, "
-        objects = f"of {summary['objects']:,} objects" if summary.get("objects") else "of objects that passed alone"
-        yield "accuracy", points(summary["accuracy"]), more + objects
-    yield "decisions", f"{summary.get('decisions', 0):,}", f"{summary.get('abstained', 0):,} of them abstained"
-    photons, clicks = (mean_words(summary.get(name)) for name in ("photons_mean", "clicks_mean"))
-    light = mean_words(summary.get("illumination_mean", summary.get("illumination")))
-    more = f"{photons} photons (expected photoelectrons), illumination {light} (sum of pattern intensities)"
-    yield "clicks per decision", clicks, more
-    if timed and (latency := summary.get("latency_us")):
-        budget = float(summary.get("deadline_us", 0.0)) / 1000
-        yield "latency p99", f"{latency['p99'] / 1000:.3g} ms", f"99 % of decisions were faster; budget {budget:g} ms"
-    more = f"decisions; {summary.get('lost', 0):,} exposures lost{repeat_words(summary.get('stream', {}))}"
-    yield "late", f"{summary.get('late', 0):,}", more
-    if timing := summary.get("exposure_timing"):
-        start = f"{timing['worst_start_us']:+.3g} us" if timing["exposures"] else "unknown"
-        yield "exposures off the plan", start, exposure_words(timing)
-    dark = summary.get("dark")
-    if isinstance(dark, Mapping) and dark.get("exposures"):
-        more = f"95 % interval {dark['low']:.3g} to {dark['high']:.3g}, expected {dark['expected']:.3g}"
-        yield "dark clicks per exposure", f"{dark['clicks'] / dark['exposures']:.3g}", more

@@ -26,7 +26,7 @@ from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.parts import is_of_parts, parts_in
 from pans.runtime.record.replaying import ASKED, ClickLog, replay
-from pans.runtime.report.handshakes import handshakes
+from pans.runtime.report.file_facts import handshakes
 
 HEADS = (("object", "label"), ("recording", "object", "label"))
 ROWS_MAX = 1 << 20

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,22 @@ from pans.runtime.record import Recording
 from pans.runtime.record.parts import open_recording
 from pans.runtime.record.recording import together
 from pans.runtime.registration.file import load_registration
+from pans.runtime.wire.messages import (
+    FrameDecoder,
+    MalformedMessage,
+    MessageType,
+    Opcode,
+    decode_ack,
+    decode_command,
+    decode_welcome,
+    unpack_body,
+)
 
-from .handshakes import handshakes
 from .verify import file_kind
 
 MOST_USED = 5  # patterns of an automaton that are named
+SESSIONS_MAX, REFUSED_MAX = 1000, 100  # that are shown; a device may fill a file with either
+_COUNTED = ("welcomes", "acks", "pongs", "malformed")
 
 
 def file_facts(path: str | Path) -> dict[str, Any]:
@@ -37,20 +49,13 @@ def file_facts(path: str | Path) -> dict[str, Any]:
         return {"kind": kind, "path": str(path), **_recording_facts(open_recording(path, salvage=True))}
     if kind in ("calibration", "registration"):
         calibration = load_calibration(path) if kind == "calibration" else load_registration(path)
-        facts = {key: value for key, value in calibration.values.items() if key != "sha256"}
-        return {
-            "kind": kind,
-            "path": str(path),
-            "sha256": calibration.sha256,
-            "age_h": calibration.age_h(now_utc()),
-            **facts,
-        }
+        found = {"kind": kind, "path": str(path), "sha256": calibration.sha256, "age_h": calibration.age_h(now_utc())}
+        return found | {key: value for key, value in calibration.values.items() if key != "sha256"}
     return {"kind": kind, "path": str(path), **_profile_facts(load_profile(str(path)))}
 
 
 def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
     parts = {"table": bundle.table, "onnx": bundle.head_onnx, "automaton": bundle.automaton}
-    back_ends = [name for name, part in parts.items() if part is not None]
     return {
         "name": bundle.name,
         "task": bundle.task,
@@ -64,7 +69,7 @@ def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
         "photons_per_level": bundle.photons_per_level,
         "illumination": bundle.illumination(),
         "photon_number_max": bundle.largest,
-        "back_ends": back_ends,
+        "back_ends": [name for name, part in parts.items() if part is not None],
         "head_bytes": 0 if bundle.head_onnx is None else len(bundle.head_onnx),
         "table_rows": 0 if bundle.table is None else len(bundle.table),
         "golden_vectors": len(bundle.golden_means),
@@ -117,10 +122,9 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         rows = rows[rows["truth"] >= 0]
         known, right = known + len(rows), right + int((rows["label"] == rows["truth"]).sum())
     header = dict(recording.header)
-    profile = header.pop("profile", None)
-    if isinstance(profile, dict):
+    if isinstance(profile := header.pop("profile", None), dict):
         header["profile"] = {key: value for key, value in profile.items() if key != "toml"}
-    facts: dict[str, Any] = {
+    return {
         "complete": recording.complete,
         "damage": recording.damage,
         "size_bytes": recording.size,
@@ -138,9 +142,8 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "events": dict(Counter(str(event.get("kind", "?")) for event in recording.events())),
         "header": header,
         "summary": dict(recording.summary),
+        "bundle": recording.bundle().name if recording.bundle_place else None,
     }
-    facts["bundle"] = recording.bundle().name if recording.bundle_place else None
-    return facts
 
 
 def _profile_facts(profile: Profile) -> dict[str, Any]:
@@ -150,3 +153,56 @@ def _profile_facts(profile: Profile) -> dict[str, Any]:
     if modulator is not None and math.isinf(modulator["contrast"]):
         modulator["contrast"] = "inf"  # JSON has no infinity
     return {**facts, "sha256": profile.sha256}
+
+
+# ---- what the device answered ----
+
+
+def handshakes(recording: Recording) -> list[dict[str, Any]]:
+    """Return one row for each session with an answer: what the device is, how many answers came, which commands it refused.
+
+    Rows are bounded in number. The texts are the device's: whoever prints them makes them safe (safe_text).
+    """
+    rows: dict[int, dict[str, Any]] = {}
+    for _, body in recording.answers():
+        try:
+            frame = unpack_body(body)
+        except MalformedMessage:
+            continue  # verify.py's
+        if frame.session not in rows and len(rows) == SESSIONS_MAX:
+            continue
+        new = {"session": frame.session, "device": {}, **dict.fromkeys(_COUNTED, 0), "refused": []}
+        row = rows.setdefault(frame.session, new)
+        try:
+            _take_answer(row, frame.type, frame.payload)
+        except MalformedMessage:
+            row["malformed"] += 1
+    _name_refused(rows, recording)
+    return list(rows.values())
+
+
+def _take_answer(row: dict[str, Any], kind: int, payload: bytes) -> None:
+    if kind == MessageType.WELCOME:
+        row["welcomes"] += 1
+        row["device"] = row["device"] or dict(decode_welcome(payload).facts)
+    elif kind == MessageType.ACK:
+        row["acks"] += 1
+        ack, refused = decode_ack(payload), row["refused"]
+        known = {one["command_id"] for one in refused}
+        if ack.refused_id and ack.refused_id not in known and len(refused) < REFUSED_MAX:
+            refused.append({"command_id": ack.refused_id, "command": "", "status": ack.status, "text": ack.text})
+    elif kind == MessageType.PONG:
+        row["pongs"] += 1
+
+
+def _name_refused(rows: dict[int, dict[str, Any]], recording: Recording) -> None:
+    """Say which commands the refused ones were."""
+    wanted = {(session, one["command_id"]): one for session, row in rows.items() for one in row["refused"]}
+    decoder = FrameDecoder()
+    for _, data in recording.commands() if wanted else ():
+        for frame in decoder.feed(data):
+            with suppress(MalformedMessage):
+                command = decode_command(frame.payload) if frame.type == MessageType.COMMAND else None
+                if command is not None and (one := wanted.get((frame.session, command.command_id))) is not None:
+                    known = command.opcode in set(Opcode)
+                    one["command"] = Opcode(command.opcode).name if known else str(command.opcode)

@@ -1,7 +1,7 @@
 """A recording as Photon-HDF5, the open format of photon-counting experiments (photon-hdf5.org, version 0.5).
 
-Needs h5py (extra `export`), imported when a file is written. Each field has the title that the format's definition gives it: readers such
-as phconvert refuse other words.
+Needs h5py (extra `export`), imported when a file is written. What is the same in every file stands in photon_hdf5.toml, with the titles
+that the format's definition gives its fields: readers such as phconvert refuse other words.
 
 A binary click becomes a photon: its timestamp is the **begin of its exposure** in device ticks (when in the exposure it fell is not known),
 its detector the channel that clicked. Which pattern was displayed, which object stood there and what was decided is in `/user/pans`; the
@@ -29,10 +29,6 @@ from pans.runtime.outputs import write_file
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import ClickList
 
-FORMAT_NAME, FORMAT_VERSION = "Photon-HDF5", "0.5"
-FORMAT_URL = "http://photon-hdf5.org/"
-_ROOT_TITLE = "A file format for photon-counting detector based single-molecule spectroscopy experiments."
-
 
 def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: ClickList, *, force: bool = False) -> None:
     """Write `clicks` of `recording` to `path`, whole or not at all.
@@ -50,16 +46,19 @@ def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: Clic
         )
     image = io.BytesIO()  # h5py tells of a full disk by a traceback of its own, or not at all
     with h5py.File(image, "w") as file:
-        file.attrs["format_name"] = np.bytes_(FORMAT_NAME)
-        file.attrs["format_version"] = np.bytes_(FORMAT_VERSION)
-        file.attrs["TITLE"] = np.bytes_(_ROOT_TITLE)
+        for key, said in {**_fixed("root"), "TITLE": _fixed("titles")["/"]}.items():
+            file.attrs[key] = np.bytes_(said)
         _write(file, _tree(path, recording, plan, clicks))
     write_file(path, image.getbuffer(), force=force)
 
 
 @cache
-def _titles() -> dict[str, str]:
-    return tomllib.loads(files(__package__).joinpath("photon_hdf5.toml").read_text(encoding="utf-8"))
+def _fixed(table: str) -> dict[str, Any]:
+    """What is the same in every file: a table of photon_hdf5.toml; flags are bytes, as readers expect."""
+    text = files(__package__).joinpath("photon_hdf5.toml").read_text(encoding="utf-8")
+    dtypes = {int: np.uint8, float: np.float64}
+    rows = tomllib.loads(text)[table].items()
+    return {key: np.array(one, dtypes[type(one[0])]) if isinstance(one, list) else one for key, one in rows}
 
 
 def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
@@ -75,7 +74,7 @@ def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
             if isinstance(value, str):  # so that PyTables, with which readers are written, reads bytes and not an array
                 for key, said in (("CLASS", "ARRAY"), ("VERSION", "2.4"), ("FLAVOR", "python")):
                     node.attrs[key] = np.bytes_(said)
-        node.attrs["TITLE"] = np.bytes_(_titles().get(where, name.replace("_", " ")).encode())
+        node.attrs["TITLE"] = np.bytes_(_fixed("titles").get(where, name.replace("_", " ")).encode())
 
 
 def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
@@ -90,8 +89,7 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
         f"{plan.exposure_us:g} us; timestamps are the begin of the exposure. Profile {profile.get('name')}."
     )
     return {
-        "format_name": FORMAT_NAME,
-        "format_version": FORMAT_VERSION,
+        **_fixed("root"),
         "acquisition_duration": (clicks.last_tick - clicks.first_tick) * unit_s,
         "description": described,
         "photon_data": {
@@ -100,22 +98,14 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
             "detectors": clicks.channel.astype(np.uint8 if channels <= 256 else np.uint16),
             "measurement_specs": {"measurement_type": "generic", "detectors_specs": {}},
         },
-        "setup": {
-            "num_pixels": channels,
-            "num_spots": 1,
-            "num_spectral_ch": 1,
-            "num_polarization_ch": 1,
-            "num_split_ch": 1,
-            "modulated_excitation": 0,
-            "lifetime": 0,
-            "excitation_alternated": np.zeros(1, np.uint8),
-            "excitation_cw": np.ones(1, np.uint8),
-            "excitation_wavelengths": np.full(
-                1, np.nan
-            ),  # a profile does not state them, and readers expect the fields
-            "detection_wavelengths": np.full(1, np.nan),
+        "setup": {"num_pixels": channels, **_fixed("setup")},
+        "identity": {
+            **_fixed("identity"),
+            "filename": path.name,
+            "filename_full": str(path.resolve()),
+            "creation_time": time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()),
+            "software_version": __version__,
         },
-        "identity": _identity(path),
         "provenance": {
             "filename": recording.path.name,
             "filename_full": str(recording.path.resolve()),
@@ -139,21 +129,4 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
                 "profile": str(profile.get("toml", "")),
             }
         },
-    }
-
-
-def _identity(path: Path) -> dict[str, Any]:
-    return {
-        "author": "unknown",
-        "author_affiliation": "unknown",
-        "creator": "unknown",
-        "creator_affiliation": "unknown",
-        "filename": path.name,
-        "filename_full": str(path.resolve()),
-        "creation_time": time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()),
-        "software": "pans-runtime",
-        "software_version": __version__,
-        "format_name": FORMAT_NAME,
-        "format_version": FORMAT_VERSION,
-        "format_url": FORMAT_URL,
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from pans.runtime.live.flow_run import FlowFigures
 
 MAX_VERDICTS = 20  # of a summary; the recording has them all
+FIRST_NAMED = 3  # late decisions
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +37,6 @@ class WalkFigures:
     expected: dict[str, Any] | None  # as the bundle says it: for its profile, task and split
     # measured accuracy less the expected one, in standard errors, on the same profile
     expected_off_stderr: float | None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the figures under the contract's keys."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,27 +81,11 @@ class Summary:
     light: dict[str, Any] | None
     registration: dict[str, Any] | None = None  # of the optical table, and what the correction of the patterns came to
 
-    @property
-    def accuracy(self) -> float | None:
-        """Of all decisions with a known truth, or of the objects that passed alone."""
-        return self.tally.accuracy if self.flow is None else self.flow.passages.accuracy.value
-
-    @property
-    def clicks_mean(self) -> float | None:
-        """Clicks per decision."""
-        return (self.tally if self.flow is None else self.flow.passages).clicks_mean
-
-    @property
-    def photons_mean(self) -> float | None:
-        """Expected photoelectrons per decision; None where the instrument does not know."""
-        return (self.tally if self.flow is None else self.flow.passages).photons_mean
-
     def as_json(self) -> dict[str, Any]:
         """Return the summary under the contract's keys, in their order."""
         facts = asdict(self.tally) | ({} if self.flow is None else self.flow.as_json())
-        facts |= {} if self.walks is None else self.walks.as_json()
-        for field in fields(self)[3:]:
-            facts[field.name] = getattr(self, field.name)
+        facts |= {} if self.walks is None else asdict(self.walks)
+        facts |= {field.name: getattr(self, field.name) for field in fields(self)[3:]}
         return facts | {"dark": asdict(self.dark)}
 
 
@@ -122,45 +104,29 @@ def summarise(
     dark = DarkFigures(None, [], None, []) if dark is None else dark
     faults = find_faults(result, expected_decisions, aborts_are_faults=flow is None)
     faults += ([] if flow is None else gate_faults(flow.gates)) + dark.faults
-    return Summary(
-        tally=result.tally.figures(),
-        flow=flow,
-        walks=walks,
-        illumination=illumination,
-        late=timing.late,
-        late_blame=timing.blame,
-        late_cause=result.late_cause,
-        lost_cause=result.lost_cause,
-        blame=[event for event in result.events if event["kind"] == "blame"][:MAX_VERDICTS],
-        lost=result.stream["lost_exposures"],
-        latency_us=timing.total.summary(),
-        stage_latency_us={name: histogram.summary() for name, histogram in timing.stages.items()},
-        deadline_us=timing.deadline_ns / 1000,
-        clock=result.clock | {"worst_uncertainty_us": timing.worst_uncertainty_ns / 1000},
-        slot_jitter_us=result.slot_jitter_us,
-        exposure_timing=result.exposure_timing,
-        wrong_patterns=result.wrong_patterns,
-        dark=result.dark,
-        stream=result.stream,
-        link=result.decoder,
-        contradictions=contradictions_of(result),
-        realtime=result.realtime,
-        page_faults=result.page_faults,
-        device=_plain_device(result.device),
-        armed_after_s=result.armed_after_s,
-        seconds=result.seconds,
-        ended=result.ended,
-        link_lost=result.link_lost,
-        reconnects=result.reconnects,
-        decisions_sha256=result.decisions_sha256,
-        simulated=bool(result.device.get("simulated")),
-        verdict="FAIL" if faults else "PASS",
-        faults=faults,
-        calibration=dark.calibration,
-        calibration_warnings=dark.warnings,
-        light=dark.light,
-        registration=registration,
-    )
+    made: dict[str, Any] = {
+        "illumination": illumination,
+        "late": timing.late,
+        "late_blame": timing.blame,
+        "blame": [event for event in result.events if event["kind"] == "blame"][:MAX_VERDICTS],
+        "lost": result.stream["lost_exposures"],
+        "latency_us": timing.total.summary(),
+        "stage_latency_us": {name: histogram.summary() for name, histogram in timing.stages.items()},
+        "deadline_us": timing.deadline_ns / 1000,
+        "clock": result.clock | {"worst_uncertainty_us": timing.worst_uncertainty_ns / 1000},
+        "link": result.decoder,
+        "contradictions": contradictions_of(result),
+        "device": {str(key): one for key, one in result.device.items() if isinstance(one, (str, int, float, bool))},
+        "simulated": bool(result.device.get("simulated")),
+        "verdict": "FAIL" if faults else "PASS",
+        "faults": faults,
+        "calibration": dark.calibration,
+        "calibration_warnings": dark.warnings,
+        "light": dark.light,
+        "registration": registration,
+    }
+    same = {field.name: getattr(result, field.name) for field in fields(Summary)[3:] if field.name not in made}
+    return Summary(tally=result.tally.figures(), flow=flow, walks=walks, **made, **same)
 
 
 def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: bool = True) -> list[str]:
@@ -174,8 +140,7 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
     if result.reconnects:
         faults.append(f"the device was lost and found again {result.reconnects} times")
     if timing.late:
-        blame = ", ".join(f"{cause} {count}" for cause, count in sorted(result.late_cause.items()))
-        faults.append(f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms (cause: {blame})")
+        faults.append(f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms ({late_words(result)})")
     if stream["lost_exposures"]:
         faults.append(
             f"{stream['lost_exposures']} exposures lost in {stream['gaps']} gaps, "
@@ -202,6 +167,16 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
         faults.append(result.dark.alarm)
     faults += [event["words"] for event in result.dark.findings if event["level"] == "alarm"]
     return faults
+
+
+def late_words(result: RunResult) -> str:
+    """Return the causes of late decisions, the most frequent first, how far the evidence shows them, and the first late decisions."""
+    found = [event for event in result.events if event["kind"] == "blame" and event["what"] == "late"]
+    sure = {cause: [bool(event["sure"]) for event in found if event["cause"] == cause] for cause in result.late_cause}
+    doubts = {c: ", not surely" if not any(one) else ", not always surely" for c, one in sure.items() if not all(one)}
+    causes = (f"{cause} {n}{doubts.get(cause, '')}" for cause, n in Counter(result.late_cause).most_common())
+    first = ", ".join(str(event["first_decision"]) for event in found[:FIRST_NAMED])
+    return f"cause: {'; '.join(causes)}{f'; first at decision {first}' if found else ''}"
 
 
 def exposure_fault(timing: Mapping[str, Any], received: int = 0) -> str:
@@ -237,10 +212,6 @@ def gate_faults(gates: Mapping[str, int]) -> list[str]:
     return [f"{lost} of {gates['asked']} pulses were not made: {counts}"] if lost else []
 
 
-def _plain_device(device: Mapping[str, Any]) -> dict[str, Any]:
-    return {str(key): value for key, value in device.items() if isinstance(value, (str, int, float, bool))}
-
-
 def walk_figures(result: RunResult, plan: Plan, bundle: Bundle, profile: str, confidence: float) -> WalkFigures | None:
     """Return the figures of a run of `plan` on `profile`; None where the patterns are fixed."""
     if plan.automaton is None:
@@ -249,8 +220,8 @@ def walk_figures(result: RunResult, plan: Plan, bundle: Bundle, profile: str, co
     hosted = plan.drive == "host"
     light = float(result.states_shown @ bundle.light_of(plan.automaton))
     figures, off, stated = tally.figures(), None, bundle.expected_on(profile, plan.automaton)
-    if stated is not None:
-        off = _in_standard_errors(figures.accuracy, figures.accuracy_stderr_objects, stated)
+    if stated is not None and figures.accuracy is not None and figures.accuracy_stderr_objects:
+        off = (figures.accuracy - float(stated["accuracy"])) / figures.accuracy_stderr_objects
     return WalkFigures(
         drive=plan.drive,
         confidence=confidence,
@@ -263,9 +234,3 @@ def walk_figures(result: RunResult, plan: Plan, bundle: Bundle, profile: str, co
         expected=None if expected is None else dict(expected),
         expected_off_stderr=off,
     )
-
-
-def _in_standard_errors(accuracy: float | None, stderr: float | None, expected: Mapping[str, Any]) -> float | None:
-    if accuracy is None or not stderr:
-        return None
-    return (accuracy - float(expected["accuracy"])) / stderr

@@ -1,4 +1,4 @@
-"""A run's figures in words, from the facts of its summary: closing lines for a terminal, rows for pages, and the summary as Markdown.
+"""A run's figures in words, from the facts of its summary: rows for terminal, Markdown and pages, closing lines, and the Markdown page.
 
 The Markdown page is written beside the recording without any extra; `pans report` makes the full page of the recording.
 """
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.intervals import wilson_interval
 from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown, one_line
 from pans.runtime.timing.realtime import fault_words
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host takes
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 Facts = Mapping[str, Any]
-Rows = list[tuple[str, str]]
+Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 
 
 def closing_words(summary: Summary, recording: str, report: str) -> str:
@@ -30,22 +31,23 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
     facts = summary.as_json()
     accuracy = "unknown" if facts["accuracy"] is None else f"{facts['accuracy']:.2%}"
     photons = "unknown" if facts["photons_mean"] is None else f"{facts['photons_mean']:.2f}"
-    light = (
-        f"{facts['clicks_mean'] or 0.0:.2f} clicks, {photons} photons, illumination {facts['illumination']:.1f} each"
-    )
-    lines = [
-        f"{'SIMULATED · ' if facts['simulated'] else ''}{facts['verdict']}: {facts['decisions']} decisions ({objects_words(facts)})",
-        f"  accuracy      {accuracy} at {light}",
-        f"  latency       {latency_words(facts)}; late {facts['late']}, lost {facts['lost']}",
-        f"  exposures     {exposure_words(facts['exposure_timing'])}",
+    light = f"{facts['clicks_mean'] or 0.0:.2f} clicks, {photons} photons, illumination {facts['illumination']:.1f}"
+    rows: Rows = [
+        ("accuracy", f"{accuracy} at {light} each", ""),
+        ("latency", f"{latency_words(facts)}; late {facts['late']}, lost {facts['lost']}", ""),
+        ("exposures", exposure_words(facts["exposure_timing"]), ""),
+        *more_rows(facts),
+        *(("fault", fault, "") for fault in facts["faults"]),
+        *(("recording", recording, ""), ("report", report, "")),
     ]
-    if "passages" in facts:
-        gates = ", ".join(f"{what} {facts['gates'][what]}" for what in ("asked", "done", "refused", "expired"))
-        lines += [*passage_words(facts), f"  gates         pulses asked {gates.removeprefix('asked ')}"]
-    if "drive" in facts:
-        lines += [f"  {name:<13} {one_line(text)}" for name, text in _walk_words(facts)]
-    lines += [f"  fault         {one_line(fault)}" for fault in facts["faults"]]
-    return "\n".join([*lines, f"  recording     {one_line(recording)}", f"  report        {one_line(report)}"])
+    simulated = "SIMULATED · " * facts["simulated"]
+    head = f"{simulated}{facts['verdict']}: {facts['decisions']} decisions ({objects_words(facts)})"
+    return "\n".join([head, *lines_of(rows)])
+
+
+def lines_of(rows: Rows) -> list[str]:
+    """Return rows as lines for a terminal."""
+    return [f"  {name:<13} {one_line('; '.join(filter(None, texts)))}" for name, *texts in rows]
 
 
 def objects_words(facts: Facts) -> str:
@@ -57,20 +59,17 @@ def objects_words(facts: Facts) -> str:
     objects, trials, decisions = facts["objects"], facts["trials"], facts["decisions"]
     if objects * trials == decisions:
         return f"{objects} objects × {trials} trials"
-    return (
-        f"{objects} objects, {decisions / objects:.1f} decisions on each on average"
-        if objects
-        else "true classes unknown"
-    )
+    many = f"{objects} objects, {decisions / max(objects, 1):.1f} decisions on each on average"
+    return many if objects else "true classes unknown"
 
 
 def latency_words(facts: Facts) -> str:
     """Return the quantiles of the time from exposure to decision; what the clock cannot resolve is said, not shown as 0."""
     values = {name: facts["latency_us"][key] for name, key in QUANTILES.items()}
     uncertainty_us = facts["clock"]["worst_uncertainty_us"]
-    if not is_unresolved(values["p50"], uncertainty_us):
-        return ", ".join(f"{name} {value:.0f} us" for name, value in values.items())
     seen = [f"{name} {value:.0f} us" for name, value in values.items() if not is_unresolved(value, uncertainty_us)]
+    if not is_unresolved(values["p50"], uncertainty_us):
+        return ", ".join(seen)
     return f"{', '.join([*seen, 'else'] if seen else [])} not resolved (clock uncertainty {uncertainty_us / 1000:.1f} ms)".strip()
 
 
@@ -91,21 +90,27 @@ def exposure_words(timing: Facts) -> str:
     return f"start {start}, length {length} at most, of {timing['exposures']}; allowed {timing['tolerance_us']:.3g} us"
 
 
-def repeat_words(stream: Facts) -> str:
-    """Return how many messages came twice, behind a semicolon, "" without any; what differs is a contradiction, and a fault."""
-    more = {what: stream.get(f"repeats_{what}", 0) for what in ("differing", "unchecked")}
-    words = ", ".join(f"{count} {what}" for what, count in more.items() if count)
-    repeated = stream.get("repeated", 0)
-    return f"; {repeated} messages repeated or overtaken{f' ({words})' if words else ''}" if repeated else ""
+def accuracy_interval(facts: Facts) -> tuple[float, float] | None:
+    """Return the 95 % interval of the accuracy, None where it is not known: as a flow states it, else Wilson's by independent objects.
 
-
-def mean_words(value: float | None) -> str:
-    """Return a mean with three digits behind the point."""
-    return "unknown" if value is None or value != value else f"{value:.3f}"
+    Several decisions about an object count as many objects as the spread over objects amounts to.
+    """
+    accuracy, objects, error = (facts.get(name) for name in ("accuracy", "objects", "accuracy_stderr_objects"))
+    if facts.get("accuracy_ci"):
+        low, high = facts["accuracy_ci"]
+        return low, high
+    if accuracy is None or not objects:
+        return None
+    n = max(objects, round(accuracy * (1 - accuracy) / error**2)) if error else objects
+    return wilson_interval(accuracy * n, n)
 
 
 def _percent(value: float | None) -> str:
     return "unknown" if value is None else f"{100 * value:.2f} %"
+
+
+def _mean(value: float | None) -> str:
+    return "unknown" if value is None or value != value else f"{value:.3f}"
 
 
 def _share(facts: Facts, name: str) -> str:
@@ -113,84 +118,94 @@ def _share(facts: Facts, name: str) -> str:
     return "unknown" if value is None or ends is None else f"{value:.3%} ({ends[0]:.3%} to {ends[1]:.3%})"
 
 
-def figure_rows(facts: Facts) -> Rows:
-    """Return name and text of a run's figures, of passing objects and of an automaton too."""
-    dark, rows = facts.get("dark") or {}, [("accuracy", _percent(facts.get("accuracy")))]
+def figure_rows(facts: Facts, *, timed: bool = False) -> Rows:
+    """Return the figures that every run has; with `timed` how long decisions took."""
+    rows: Rows = []
     if "passages" not in facts:
-        rows += [
-            ("spread over trials (standard deviation)", _percent(facts.get("accuracy_std_trials"))),
-            ("spread over objects (standard error)", _percent(facts.get("accuracy_stderr_objects"))),
-            ("objects", objects_words(facts)),
-        ]
+        ends, spread = accuracy_interval(facts), facts.get("accuracy_std_trials")
+        more = "" if ends is None else f"95 % interval {100 * ends[0]:.2f} to {100 * ends[1]:.2f} %; "
+        more += "" if spread is None else f"standard deviation over trials {_percent(spread)}; "
+        rows.append(("accuracy", _percent(facts.get("accuracy")), more + objects_words(facts)))
+    clicks, photons = (_mean(facts.get(name)) for name in ("clicks_mean", "photons_mean"))
+    light = _mean(facts.get("illumination_mean", facts.get("illumination")))
+    sent = f"{photons} photons (expected photoelectrons), illumination {light} (sum of pattern intensities)"
     rows += [
-        ("decisions (abstained)", f"{facts['decisions']} ({facts['abstained']})"),
-        ("clicks per decision", mean_words(facts["clicks_mean"])),
-        ("photons per decision (expected photoelectrons)", mean_words(facts["photons_mean"])),
-        ("illumination per decision (sum of pattern intensities)", mean_words(facts["illumination"])),
-        ("late decisions", str(facts["late"])),
-        ("lost exposures", str(facts["lost"])),
+        ("decisions", f"{facts['decisions']:,}", f"{facts['abstained']:,} of them abstained"),
+        ("clicks per decision", clicks, sent),
+        ("late decisions", f"{facts['late']:,}", f"{facts['lost']:,} exposures lost{_repeats(facts['stream'])}"),
     ]
-    if dark.get("exposures"):
-        ends = f"95 % interval {dark['low']:.2g} to {dark['high']:.2g}, profile {dark['expected']:.2g}"
-        rows.append(("dark clicks per dark exposure", f"{dark['clicks']} in {dark['exposures']}, {ends}"))
-    rows += flow_rows(facts) if "passages" in facts else []
-    return [*rows, *_walk_words(facts)] if "drive" in facts else rows
+    if timed:
+        budget = f"99 % of decisions were faster; budget {facts['deadline_us'] / 1000:g} ms"
+        rows.append(("latency p99", f"{facts['latency_us']['p99'] / 1000:.3g} ms", budget))
+    if timing := facts.get("exposure_timing"):
+        start = f"{timing['worst_start_us']:+.3g} us" if timing["exposures"] else "unknown"
+        rows.append(("exposures off the plan", start, exposure_words(timing)))
+    if (dark := facts.get("dark") or {}).get("exposures"):
+        ends = f"95 % interval {dark['low']:.2g} to {dark['high']:.2g}, expected {dark['expected']:.2g}; "
+        counts = f"{dark['clicks']} clicks in {dark['exposures']} dark exposures of the whole run"
+        rows.append(("dark clicks per exposure", f"{dark['clicks'] / dark['exposures']:.3g}", ends + counts))
+    return rows
 
 
-def _walk_words(facts: Facts) -> Rows:
-    """Return name and text of the figures that only an automaton has."""
-    rows = [("walks", f"{mean_words(facts['exposures_mean'])} exposures each, driven by the {facts['drive']}")]
+def more_rows(facts: Facts) -> Rows:
+    """Return the figures that only passing objects, and those that only an automaton has."""
+    return (flow_rows(facts) if "passages" in facts else []) + (walk_rows(facts) if "drive" in facts else [])
+
+
+def _repeats(stream: Facts) -> str:
+    """How many messages came twice; what differs is a contradiction, and a fault."""
+    more = {what: stream.get(f"repeats_{what}", 0) for what in ("differing", "unchecked")}
+    words = ", ".join(f"{count} {what}" for what, count in more.items() if count)
+    repeated = stream.get("repeated", 0)
+    return f"; {repeated} messages repeated or overtaken{f' ({words})' if words else ''}" if repeated else ""
+
+
+def walk_rows(facts: Facts) -> Rows:
+    """Return the figures of an automaton's walks."""
+    rows: Rows = [("walks", f"{_mean(facts['exposures_mean'])} exposures each, driven by the {facts['drive']}", "")]
     if facts["confidence"]:
         below = f"{facts['abstained_below_confidence']} decisions abstained below it"
-        rows.append(("confidence", f"{facts['confidence']:g}: {below}"))
+        rows.append(("confidence", f"{facts['confidence']:g}", below))
     if (turn := facts["turn_us"]) is not None:
         words = ", ".join(f"{name} {turn[key]:.0f} us" for name, key in QUANTILES.items())
-        rows.append(("host's turn", f"{words} of {facts['turn_budget_us']:.0f} us; late slots {facts['late_slots']}"))
+        rows.append(
+            ("host's turn", f"{words} of {facts['turn_budget_us']:.0f} us", f"late slots {facts['late_slots']}")
+        )
     if (one := facts["expected"]) is not None:
         off = facts["expected_off_stderr"]
-        beside = "" if off is None else f"; measured {off:+.2f} standard errors from it"
         light = f"{one['clicks']:.2f} clicks, {one['photons']:.2f} photons"
-        rows.append(("expected", f"{one['accuracy']:.2%} at {light} ({one['profile']}, {one['split']}){beside}"))
+        words = f"{one['accuracy']:.2%} at {light} ({one['profile']}, {one['split']})"
+        rows.append(("expected", words, "" if off is None else f"measured {off:+.2f} standard errors from it"))
     return rows
 
 
 def flow_rows(facts: Facts) -> Rows:
-    """Return name and text of the figures that only a flow has."""
-    counts = facts["passages"]
+    """Return the figures of passing objects; those of the gates are not known in a replay. Intervals are 95 %."""
+    n, gates = facts["passages"], facts.get("gates")
+    means = [_mean(facts[name]) for name in ("clicks_mean", "passage_clicks_mean", "passage_photons_mean")]
+    aborted = ", ".join(f"{name} {count}" for name, count in facts["aborted"].items()) or "none"
+    coincident = (
+        f"{n['coincident']} in coincidence ({n['coincident_aborted']} aborted, {n['coincident_labelled']} labelled)"
+    )
+    passed = f"{n['alone']} alone, {coincident}, {n['in_gaps']} in gaps"
+    made = (
+        "" if gates is None else ", ".join(f"{what} {gates[what]}" for what in ("asked", "done", "refused", "expired"))
+    )
     return [
+        ("passages", f"{n['marks']}: {passed}", f"{n['without_mark']} decisions without a passage"),
         (
-            "passages (alone, in coincidence, in gaps)",
-            f"{counts['alone']}, {counts['coincident']}, {counts['in_gaps']}",
+            "accuracy",
+            f"{_share(facts, 'accuracy')} of those alone",
+            f"{_share(facts, 'accuracy_labelled')} where labelled",
         ),
-        ("accuracy per passage alone, 95 % interval", _share(facts, "accuracy")),
-        ("accuracy where a label was given", _share(facts, "accuracy_labelled")),
-        ("missed, of those alone", _share(facts, "missed")),
-        ("doubled, of those alone", _share(facts, "doubled")),
-        ("decisions without a passage", str(counts["without_mark"])),
-        ("coincidences aborted / labelled", f"{counts['coincident_aborted']} / {counts['coincident_labelled']}"),
-        ("aborted", _counts(facts["aborted"])),
-        ("yield (targets pulsed)", _share(facts, "yield")),
-        ("purity (pulses on a target alone)", _share(facts, "purity")),
-        ("pulses asked, done, refused, expired", ", ".join(str(n) for n in facts["gates"].values())),
-        ("clicks of the whole passage", mean_words(facts["passage_clicks_mean"])),
-        ("photons of the whole passage, at least (scaled by clicks)", mean_words(facts["passage_photons_mean"])),
-    ]
-
-
-def _counts(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{name} {n}" for name, n in counts.items()) or "none"
-
-
-def passage_words(facts: Facts) -> list[str]:
-    """Return what the decisions about passing objects were worth, in lines; all of it is known in a replay, too."""
-    counts, means = facts["passages"], (mean_words(facts[f"{name}_mean"]) for name in ("clicks", "passage_clicks"))
-    return [
-        f"  passages      {counts['marks']}: {counts['alone']} alone, {counts['coincident']} in coincidence, {counts['in_gaps']} in gaps; "
-        f"missed {_share(facts, 'missed')}, doubled {_share(facts, 'doubled')}",
-        f"  accuracy      {_share(facts, 'accuracy')} of those alone",
-        f"  aborted       {_counts(facts['aborted'])}",
-        "  light         {} clicks of the window, {} of the passage".format(*means),
-        f"  pulses        {counts['pulses']} made; yield {_share(facts, 'yield')}, purity {_share(facts, 'purity')}",
+        ("missed", f"{_share(facts, 'missed')} of those alone", f"doubled {_share(facts, 'doubled')}"),
+        ("aborted", aborted, ""),
+        ("light", "{} clicks of the window, {} of the passage".format(*means), f"{means[2]} photons of it, at least"),
+        (
+            "pulses",
+            f"{n['pulses']} made{f' ({made})' if made else ''}",
+            f"yield {_share(facts, 'yield')}, purity {_share(facts, 'purity')}",
+        ),
     ]
 
 
@@ -209,16 +224,28 @@ def write_markdown(
     """Write the summary as Markdown; UsageError if it exists, unless `force`. `run`: name -> text about what was run."""
     facts = summary.as_json()
     simulated = "\n> **SIMULATED**: the clicks come from a simulated instrument, not from light.\n" * facts["simulated"]
-    causes = [(*_what(one), "yes" if one["sure"] else "no", one["why"]) for one in facts["blame"]]
+    clock, granted = facts["clock"], ", ".join(f"{what}: {answer}" for what, answer in facts["realtime"].items())
+    timing = [
+        f"deadline {facts['deadline_us']:.0f} us",
+        f"clock: uncertainty at most {clock['worst_uncertainty_us']:.0f} us, drift {clock.get('drift_ppm', 0.0):.1f} ppm; "
+        f"slot jitter at most {facts['slot_jitter_us']:.1f} us",
+        f"armed {facts['armed_after_s']:.2f} s after the start; measured for {facts['seconds']:.1f} s; ended: {facts['ended']}",
+        f"real-time set-up: {granted or 'virtual time: nothing asked for'}",
+        f"page faults of the loop while armed: {fault_words(facts['page_faults'])}",
+    ]
     lines = [
         f"# Run of {markdown(run.get('bundle', 'a bundle'))}{' (SIMULATED)' if simulated else ''}",
         simulated,
         f"**{facts['verdict']}**",
         *(f"- {markdown(fault)}" for fault in facts["faults"]),
-        *_table("Results", ("figure", "value"), figure_rows(facts)),
-        *_table("Timing", ("microseconds", *QUANTILES), _stage_rows(facts)),
-        *(f"- {markdown(line)}" for line in _timing(facts)),
-        *(_table("Late and missing work", ("what", "cause", "sure", "why"), causes) if causes else ()),
+        *_table("Results", ("figure", "value", ""), [*figure_rows(facts), *more_rows(facts)]),
+        *_table("Timing", ("microseconds", *QUANTILES), stage_rows(facts)),
+        *(f"- {markdown(line)}" for line in timing),
+        *(
+            _table("Late and missing work", ("what", "cause", "sure", "why"), causes)
+            if (causes := _causes(facts))
+            else ()
+        ),
     ]
     if confusion.any():
         cells = [(name, *(str(n) if n else "·" for n in row)) for name, row in zip(classes, confusion.tolist())]
@@ -228,34 +255,25 @@ def write_markdown(
 
 
 def _table(heading: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    cells = [head, *rows]
-    lines = [f"| {' | '.join(map(markdown, row))} |" for row in cells]
+    lines = [f"| {' | '.join(map(markdown, row))} |" for row in (head, *rows)]
     return ["", f"## {heading}", "", lines[0], "|" + " --- |" * len(head), *lines[1:], ""]
 
 
-def _what(blame: Facts) -> tuple[str, str]:
-    late = blame["what"] == "late"
-    return f"{blame['decisions']} late" if late else f"{blame['exposures']} exposures missing", blame["cause"]
+def _causes(facts: Facts) -> list[tuple[str, ...]]:
+    """What was late or missing, from which decision or exposure on, its cause, whether the evidence is conclusive, and why."""
+    late, missing = (
+        "{decisions} late from decision {first_decision} on",
+        "{exposures} exposures missing from {first_exposure} on",
+    )
+    rows = ((late if one["what"] == "late" else missing, one) for one in facts["blame"])
+    return [(words.format(**one), one["cause"], "yes" if one["sure"] else "no", one["why"]) for words, one in rows]
 
 
-def _stage_rows(facts: Facts) -> list[tuple[str, ...]]:
-    """The quantiles of the whole and by stage; the host's own stages are of its clock alone."""
+def stage_rows(facts: Facts) -> list[tuple[str, ...]]:
+    """Return the quantiles of the whole latency and by stage, microseconds; the host's own stages are of its clock alone."""
     uncertainty_us, rows = facts["clock"]["worst_uncertainty_us"], []
     for name, row in {"exposure end to decision": facts["latency_us"], **facts["stage_latency_us"]}.items():
         doubt_us = uncertainty_us if name in ("exposure end to decision", "link") else 0.0
         cells = (row[key] for key in QUANTILES.values())
         rows.append((name, *("not resolved" if is_unresolved(us, doubt_us) else f"{us:.0f}" for us in cells)))
     return rows
-
-
-def _timing(facts: Facts) -> list[str]:
-    clock, granted = facts["clock"], ", ".join(f"{what}: {answer}" for what, answer in facts["realtime"].items())
-    return [
-        f"deadline {facts['deadline_us']:.0f} us: {facts['late']} late; {facts['lost']} exposures lost{repeat_words(facts['stream'])}",
-        f"clock: uncertainty at most {clock['worst_uncertainty_us']:.0f} us, drift {clock.get('drift_ppm', 0.0):.1f} ppm; "
-        f"slot jitter at most {facts['slot_jitter_us']:.1f} us",
-        f"exposures: {exposure_words(facts['exposure_timing'])}",
-        f"armed {facts['armed_after_s']:.2f} s after the start; measured for {facts['seconds']:.1f} s; ended: {facts['ended']}",
-        f"real-time set-up: {granted or 'virtual time: nothing asked for'}",
-        f"page faults of the loop while armed: {fault_words(facts['page_faults'])}",
-    ]

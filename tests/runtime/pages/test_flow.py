@@ -24,7 +24,7 @@ def test_the_page_says_what_the_run_said(run: Path, tmp_path: Path) -> None:
     page = page_of(run, tmp_path)
     words, summary = words_of(page), read_recording(run).summary
     shares = [f"{summary[name]:.3%}" for name in ("accuracy", "missed", "yield", "purity")]
-    gates = ", ".join(str(n) for n in summary["gates"].values())
+    gates = "asked {asked}, done {done}, refused {refused}, expired {expired}".format_map(summary["gates"])
     sections = ("Objects that passed by", "Decisions by what became of them", "true class in rows")
     for text in (*sections, *shares, gates):
         assert text in words
@@ -50,13 +50,23 @@ def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> Non
                 {"kind": "gate_refused", "command_id": 3},  # of no decision
                 {"kind": "gate_expired", "decision": int(mine[2])},
                 {"kind": "blame", "what": "late", "cause": "link", "decisions": 2, "first_decision": first, "why": "w"},
-                {"kind": "blame", "what": "late", "cause": "host", "decisions": 3, "first_decision": first + 9},
+                {
+                    "kind": "blame",
+                    "what": "late",
+                    "cause": "host",
+                    "decisions": 3,
+                    "first_decision": first + 9,
+                    "sure": False,
+                },
                 {"kind": "blame", "what": "missing", "cause": "link", "exposures": 7},
                 {"kind": "gate_expired", "decision": 1 << 62},  # that there is not
             ]
         )
         assert decisions.pulses() == {"asked": len(mine), "done": len(mine) - 2, "refused": 1, "expired": 1}
-        assert events.causes() == [("link", 2, 7, "w"), ("host", 3, 0, "")]
+        assert events.causes() == [
+            ("link", 2, 7, f"from decision {first} on: w"),
+            ("host", 3, 0, f"from decision {first + 9} on, not surely: "),
+        ]
         over, place = decisions.over, first - int(part["index"][0])
         assert over.sums["late link"].tolist() == np.bincount([place // over.width], [2], BINS).tolist()
         assert over.sums["late host"].tolist() == np.bincount([(place + 9) // over.width], [3], BINS).tolist()

@@ -14,17 +14,15 @@ from pans.runtime.bundle.model import load_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.intervals import wilson_interval
-from pans.runtime.pages.charts import POINTS_MAX, Axis, Curve, chart
+from pans.runtime.pages.charts import Axis, Curve, chart
 from pans.runtime.pages.index import accuracy_over
 from pans.runtime.pages.page import sentence_of
 from pans.runtime.pages.rates import BINS, SET_MAX, Rates, Stretches
-from pans.runtime.pages.run import Decisions
-from pans.runtime.pages.timing import CLOCK_MAX, Clock, Durations, survival
+from pans.runtime.pages.run import Decisions, Durations, survival
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list, iter_exposures
 from pans.runtime.record.format import TIMING_DTYPE
 from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.timing.clock import CLOCK_DTYPE
 
 pytest.importorskip("matplotlib", reason="needs the plot extra")
 
@@ -43,9 +41,12 @@ def test_a_recording_s_page(demo: Path, tmp_path: Path) -> None:
     assert "SIMULATED" in words
     for text in (f"{100 * summary['accuracy']:.2f} %", *(f"{summary[k]:.3f}" for k in ("clicks_mean", "photons_mean"))):
         assert text in words
-    error = 1.959964 * summary["accuracy_stderr_objects"]
-    ends = [100 * (summary["accuracy"] + sign * error) for sign in (-1, 1)]
-    assert f"95 % interval {ends[0]:.2f} to {ends[1]:.2f} %" in words
+    low, high = (float(end) for end in re.findall(r"95 % interval ([\d.]+) to ([\d.]+) %", words)[0])
+    error = (
+        100 * 1.959964 * summary["accuracy_stderr_objects"]
+    )  # of 200 objects, where Wilson's interval is nearly the usual one
+    assert (high - low) / 2 == pytest.approx(error, rel=0.02)
+    assert low < 100 * summary["accuracy"] < high
     assert summary["decisions_sha256"] in words
     assert "All 200 decisions were made within 16.667 ms, no exposure was lost" in words
     for section in (
@@ -136,7 +137,9 @@ def test_latencies_of_very_many_are_those_of_all() -> None:
     us = np.sort(rows["decided_ns"]) / 1000
     times, share = survival(found.stages["end of exposure to decision"])
     assert times[-1] == us[-1]
-    assert found.quantiles("end of exposure to decision")[0] == pytest.approx(np.quantile(us, 0.5), rel=0.033)
+    name, median, *_ = found.rows({})[0]
+    assert name == "exposure end to decision"
+    assert float(median) == pytest.approx(np.quantile(us, 0.5), rel=0.033)
     wanted = [(us >= time / 1.033).mean() for time in times]
     assert (share <= np.array(wanted) + 1e-12).all()
     assert not found.is_virtual()
@@ -151,34 +154,15 @@ def test_events_become_sentences_and_foreign_ones_stay_whole() -> None:
     assert all(word in sentence_of(blame) for word in ("40", "device", "a drop"))
 
 
-def test_a_curve_of_many_points_keeps_its_outliers() -> None:
-    y = np.zeros(20_000)
-    y[[7, 12_345]] = 50.0, -30.0
-    y[:5] = np.nan
-    x, found, low, _ = Curve(np.arange(20_000), y, low=y - 1).thinned()
-    assert x is not None
-    assert found is not None
-    assert low is not None
-    assert len(found) <= POINTS_MAX
-    assert (np.nanmax(found), np.nanmin(found)) == (50.0, -30.0)
-    assert x[[found.argmax(), found.argmin()]].tolist() == [7, 12_345]
-    assert (low == found - 1).all()
-
-
-def test_probes_of_a_long_run_are_bounded_and_keep_the_worst() -> None:
-    n = 20 * CLOCK_MAX
-    samples = np.zeros(n, CLOCK_DTYPE)
-    samples["tick"], samples["host_ns"] = 1000 * np.arange(n), 1_000_000 * np.arange(n)
-    samples["host_ns"][n // 3] += 700_000
-    clock = Clock(1_000_000)
-    for part in np.split(samples, 40):
-        clock.take(part)
-    assert clock.n == n
-    assert len(clock.samples) <= 2 * CLOCK_MAX
-    assert samples[n // 3] in clock.samples
-    assert (clock.samples[[0, -1]] == samples[[0, -1]]).all()
-    halves = np.bincount(2 * clock.samples["tick"].astype(int) // (1000 * n))
-    assert halves[0] > 0.2 * halves[1]  # the last stretches may still be whole
+def test_a_curve_of_many_points_is_small_and_keeps_its_outliers() -> None:
+    y = np.zeros(100_000)
+    y[[700, 61_725]] = 50.0, -30.0
+    drawn = str(chart("many", Axis("x", 0.0, 100_000.0), Axis("y", -50.0, 50.0), curves=[Curve(np.arange(100_000), y)]))
+    assert len(drawn) < 20_000
+    (path,) = re.findall(r'<path d="([^"]+)"[^>]*stroke: var\(--a\)', drawn)
+    heights = np.array(re.findall(r"[ML] [\d.]+ ([\d.]+)", path), float)
+    above, below = np.median(heights) - heights.min(), heights.max() - np.median(heights)
+    assert above / below == pytest.approx(50 / 30, rel=0.01)
 
 
 def test_a_chart_follows_the_page_s_colours_and_says_what_it_shows() -> None:

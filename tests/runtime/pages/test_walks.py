@@ -1,6 +1,7 @@
-"""The page and the exports of a run with an automaton: its tree, walks and states are those of the recorded messages."""
+"""The page and the exports of a run with an automaton: its walks and states are those of the recorded messages."""
 
 import csv
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from commands import Pans
 
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
+from pans.runtime.pages.bundle import first_states
 from pans.runtime.pages.rates import Rates
-from pans.runtime.pages.walks import Walks, first_states, tree_of
+from pans.runtime.pages.run import Walks
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import iter_exposures
 from pans.runtime.record.sent_plan import recorded_plan
@@ -44,21 +46,23 @@ def shown_states(recording: Recording) -> list[tuple[int, int]]:
     return [(stamp, bit) for stamp, bit in found if stamp != DARK_PATTERN]
 
 
-def test_the_tree_tells_what_was_shown_and_what_clicked(recording: Recording) -> None:
-    plan = recorded_plan(recording)
+def test_the_first_states_tell_what_was_shown_and_what_clicked(recording: Recording) -> None:
+    plan, bundle = recorded_plan(recording), recording.bundle()
     states = shown_states(recording)
     times, clicks = Counter(state for state, _ in states), Counter(state for state, bit in states if bit)
-    nodes, rates = first_states(plan.automaton), Rates(plan)
+    rates = Rates(plan)
     for item in iter_exposures(recording, plan):
         rates.take(item)
-    tree = tree_of(plan.automaton, nodes, recording.bundle(), rates)
-    assert len(tree) == len(nodes)
-    for state, node in zip(nodes.tolist(), tree):
-        rate = f"{100 * clicks[state] / times[state]:.0f} %" if times[state] else "never"
-        assert node.lines == (f"{100 * times[state] / times[0]:.0f} %", rate)
-        for outcome, lead in enumerate(node.leads):
-            successor = int(plan.automaton.successors[state, outcome])
-            assert lead == (nodes.tolist().index(successor) if successor in nodes else -1)
+    pictures = first_states(bundle, plan.automaton, rates)
+    assert len(pictures) == min(24, plan.automaton.n_states)
+    for state, (name, _, lines) in enumerate(pictures):
+        assert name.startswith(f"state {state}, ")
+        seen = f"{100 * times[state] / times[0]:.0f} % of the walks, clicked in {100 * clicks[state] / max(times[state], 1):.0f} %"
+        assert lines[0] == (seen if times[state] else "never shown")
+        for line, successor in zip(lines[1:], plan.automaton.successors[state][::-1].tolist(), strict=True):
+            best = bundle.classes[int(plan.automaton.posteriors[successor].argmax())]
+            where = f"state {successor}" if successor < plan.automaton.n_states else "the end"
+            assert re.fullmatch(rf"(no )?click: {where}, {best} \d+ %", line)
 
 
 def test_reliability_is_that_of_the_decisions() -> None:
