@@ -20,7 +20,7 @@ OBJECTS_KEPT = 1 << 14  # whose true class is remembered: the exposures of an ob
 CLASSES_NAMED = 2
 LEAST_EXPOSURES = 20  # of a class, before anything is said about it
 BINS = 128
-SET_MAX = 4096  # different objects of a stretch that are told apart: an interval counts no more of them
+TOLD_APART = 4096  # objects of a stretch that follow one another in number: an interval counts no more of them
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
@@ -31,19 +31,15 @@ class Stretches:
     def __init__(self, **shapes: tuple[int, ...]) -> None:
         self.width, self.used = 1, 0
         self.sums: dict[str, F64] = {name: np.zeros((BINS, *shape)) for name, shape in shapes.items()}
-        self.sets: dict[int, NDArray[Any]] = {}
 
     def at(self, numbers: I64) -> I64:
         """Return the stretch of each number, after making them wide enough."""
         if not len(numbers):
             return numbers
         while (top := int(numbers.max()) // self.width) >= BINS:
-            self.width *= 2
-            rest = [(name, one[::2] + one[1::2]) for name, one in self.sums.items()]
-            self.sums = {name: np.concatenate([one, np.zeros_like(one)]) for name, one in rest}
-            self.used, sets, self.sets = -(-self.used // 2), self.sets, {}
-            for place, one in sets.items():
-                self._join(place // 2, one)
+            self.width, self.used = 2 * self.width, -(-self.used // 2)
+            for name, one in self.sums.items():
+                self.sums[name] = np.concatenate([one[::2] + one[1::2], np.zeros_like(one[::2])])
         self.used = max(self.used, top + 1)
         return np.maximum(numbers, 0) // self.width
 
@@ -53,15 +49,10 @@ class Stretches:
         places = self.at(numbers)
         self.sums[name] += np.bincount(places, weights, BINS)
 
-    def tell_apart(self, numbers: I64, things: NDArray[Any]) -> None:
-        """Remember which different `things` each stretch has."""
+    def tell_apart(self, name: str, numbers: I64, things: I64) -> None:
+        """Count each of the `things` in the sum `name`, of shape (TOLD_APART,): what is not 0 there are the different ones."""
         places = self.at(numbers)
-        for place in np.unique(places).tolist():
-            self._join(place, things[places == place])
-
-    def _join(self, place: int, things: NDArray[Any]) -> None:
-        known = self.sets.get(place, things[:0])
-        self.sets[place] = known if len(known) >= SET_MAX else np.union1d(known, things)[:SET_MAX]
+        np.add.at(self.sums[name], (places, things % TOLD_APART), 1.0)
 
     def merged(self, most: int) -> Stretches:
         """Return the same in at most `most` stretches."""
@@ -69,8 +60,6 @@ class Stretches:
         firsts = np.arange(0, max(self.used, 1), times)
         found.width, found.used = self.width * times, len(firsts)
         found.sums = {name: np.add.reduceat(one[: max(self.used, 1)], firsts) for name, one in self.sums.items()}
-        for place, one in self.sets.items():
-            found._join(place // times, one)
         return found
 
 
@@ -116,8 +105,8 @@ class Rates:
             shown = item.pattern[~dark].astype(np.int64)
             if plan.automaton is not None:
                 states = np.minimum(item.state[~dark], plan.automaton.n_states - 1)
-                self.state_clicks += np.bincount(states, lit[:, 0], plan.automaton.n_states)
-                self.state_exposures += np.bincount(states, minlength=plan.automaton.n_states)
+                np.add.at(self.state_clicks, states, lit[:, 0])
+                np.add.at(self.state_exposures, states, 1)
                 shown = plan.automaton.depth[states].astype(np.int64)
             self._add(at, np.minimum(shown, self.n - 1), lit[:, 0], truth)
         while len(self._truths) > OBJECTS_KEPT:
@@ -131,14 +120,11 @@ class Rates:
 
     def _add(self, at: I64, shown: I64, clicked: NDArray[np.bool_], truth: I64) -> None:
         """Add exposures in the stretches `at`, one pattern, channel or step each."""
-        places, size = at * self.n + shown, BINS * self.n
-        self.over.sums["clicks"] += np.bincount(places, clicked, size).reshape(BINS, self.n)
-        self.over.sums["exposures"] += np.bincount(places, minlength=size).reshape(BINS, self.n)
-        if n := self.class_clicks.shape[1]:
-            known = truth >= 0
-            places = shown[known] * n + truth[known]
-            self.class_clicks += np.bincount(places, clicked[known], self.n * n).reshape(self.n, n)
-            self.class_exposures += np.bincount(places, minlength=self.n * n).reshape(self.n, n)
+        np.add.at(self.over.sums["clicks"], (at, shown), clicked)
+        np.add.at(self.over.sums["exposures"], (at, shown), 1)
+        known = truth >= 0
+        np.add.at(self.class_clicks, (shown[known], truth[known]), clicked[known])
+        np.add.at(self.class_exposures, (shown[known], truth[known]), 1)
 
     def _edges(self, over: Stretches) -> F64:
         return np.arange(over.used + 1, dtype=np.float64) * (over.width * self._plan.cycle_us * 1e-6)

@@ -32,7 +32,7 @@ from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 from .bundle import first_states, optics
 from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, span, whole
 from .page import render, sentence_of, words
-from .rates import BINS, Rates, Stretches
+from .rates import BINS, TOLD_APART, Rates, Stretches
 
 CONFUSION_MAX = 40  # classes
 ACCURACY_BINS, OBJECTS_PER_BIN = 60, 20
@@ -63,7 +63,7 @@ class Decisions:
         self.known = self.right = 0
         shown = len(classes) if len(classes) <= CONFUSION_MAX else 0
         self.confusion = np.zeros((shown, shown), np.int64)  # truth in rows, of those that have a label
-        self.over = Stretches()
+        self.over = Stretches(objects=(TOLD_APART,))
         gated = config["flow"]["settings"].get("gate_classes", ()) if "flow" in config else ()
         self._passing = "flow" in config
         self._gated = [list(classes).index(name) for name in gated if name in classes]
@@ -86,7 +86,7 @@ class Decisions:
         self.add("seconds", numbers, ticks / self._tick_hz)
         for name, which in (("known", told), ("right", right)):
             self.add(name, numbers[which])
-        self.over.tell_apart(numbers[told].astype(np.int64) - self._first, rows["object"][told])
+        self.over.tell_apart("objects", numbers[told].astype(np.int64) - self._first, rows["object"][told])
         n = len(self.confusion)
         fits = told & ~abstained & (rows["truth"] < n) & (rows["label"] < n)
         np.add.at(self.confusion, (rows["truth"][fits], rows["label"][fits]), 1)
@@ -97,13 +97,13 @@ class Decisions:
 
     def accuracy(self, n_classes: int, label: str = "Accuracy over the run") -> tuple[Any, list[int]]:
         """Return accuracy over time with its interval, and the least and largest number of objects of a stretch; None of a short run."""
-        objects = sum(map(len, self.over.sets.values()))
+        objects = np.count_nonzero(self.over.sums["objects"])
         over = self.over.merged(int(np.clip(objects // OBJECTS_PER_BIN, 1, ACCURACY_BINS)))
         some = over.sums.get("known", np.zeros(1)) > 0
         if some.sum() < 2:
             return None, []
         share = over.sums["right"][some] / over.sums["known"][some]
-        counts = [len(over.sets[place]) for place in np.flatnonzero(some).tolist()]
+        counts = np.count_nonzero(over.sums["objects"][some], axis=1).tolist()
         ends = np.array([wilson_interval(round(p * n), n) for p, n in zip(share.tolist(), counts)]).T
         when, mean = self._seconds(over)[some], self.right / self.known
         marks = [Mark(mean, f"whole run {100 * mean:.1f} %")]

@@ -17,7 +17,7 @@ from pans.runtime.intervals import wilson_interval
 from pans.runtime.pages.charts import Axis, Curve, chart
 from pans.runtime.pages.index import accuracy_over
 from pans.runtime.pages.page import sentence_of
-from pans.runtime.pages.rates import BINS, SET_MAX, Rates, Stretches
+from pans.runtime.pages.rates import BINS, TOLD_APART, Rates, Stretches
 from pans.runtime.pages.run import Decisions, Durations, survival
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list, iter_exposures
@@ -75,22 +75,21 @@ def test_the_confusion_on_the_page_is_that_of_the_decisions(demo: Path, tmp_path
 def test_sums_over_a_run_of_any_length_hold_everything_once() -> None:
     rng = np.random.default_rng(1)
     numbers = np.sort(rng.integers(0, 70_000, 9000))
-    found = Stretches(wide=(3,))
+    found = Stretches(wide=(3,), things=(TOLD_APART,))
     for part in np.array_split(numbers, 50):
         found.add("n", part)
         np.add.at(found.sums["wide"], found.at(part), [1.0, 0.0, 2.0])
-        found.tell_apart(part, part // 10)
+        found.tell_apart("things", part, part // 10)
     wanted = np.bincount(numbers // found.width, minlength=BINS)
     assert found.width == 1024  # the first power of two that holds them
     assert found.sums["n"].tolist() == wanted.tolist() == found.sums["wide"][:, 0].tolist()
-    assert [len(one) for _, one in sorted(found.sets.items())] == [
-        len({*(numbers[numbers // 1024 == bin_] // 10).tolist()}) for bin_ in range(found.used)
-    ]
+    for sums in (found, found.merged(20)):
+        different = [len({*(numbers[numbers // sums.width == one] // 10).tolist()}) for one in range(sums.used)]
+        assert np.count_nonzero(sums.sums["things"][: sums.used], axis=1).tolist() == different
     few = found.merged(20)
     assert (few.width, few.used) == (4096, 18)
     assert few.sums["n"].sum() == 9000
     assert few.sums["n"][2] == ((numbers // 4096) == 2).sum()
-    assert max(map(len, few.sets.values())) <= SET_MAX
 
 
 def test_accuracy_over_time_counts_objects_once() -> None:
