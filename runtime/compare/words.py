@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 from pans.runtime.pages.page import render, words
-from pans.runtime.pages.run import Decisions, Durations, latency_chart
+from pans.runtime.pages.run import Decisions, Durations
 from pans.runtime.safe_text import one_line
 
 from .comparison import ALPHA, Change, Comparison, Finding, Side
@@ -105,26 +104,24 @@ def comparison_page(comparison: Comparison) -> bytes:
         conclusion=conclusion(comparison),
         rows=[_row(one) for one in comparison.findings],
         methods=[f"{_title(one)}: {one.method}." for one in comparison.findings],
-        charts=[drawn for name, side in sides.items() for drawn in _charts(name, side)],
+        curves={name: _curves(side) for name, side in sides.items()},
         changes=[(one.name, one.first or "-", one.second or "-") for one in sorted(comparison.changes, key=_is_hash)],
         same=SAME,
         cut=CUT,
     )
 
 
-def _charts(name: str, side: Side) -> Iterator[tuple[Any, str]]:
-    """Yield the charts of one side with their captions: accuracy over time, latency unless time was virtual."""
+def _curves(side: Side) -> dict[str, Any]:
+    """What is drawn of one side: accuracy over time, latency unless time was virtual."""
     if side.decisions is None or side.timings is None or not len(side.decisions):
-        return
-    numbers = Decisions(side.header["config"], len(side.decisions), first=int(side.decisions["index"][0]))
+        return {}
+    numbers, durations = (
+        Decisions(side.header["config"], len(side.decisions), first=int(side.decisions["index"][0])),
+        Durations(),
+    )
     numbers.take(side.decisions)
-    drawn, _ = numbers.accuracy(max(int(side.decisions["truth"].max()) + 1, 2), f"{name}: accuracy over the run")
-    if drawn is not None:
-        yield drawn, f"{name}: share of right decisions over the run, with 95 % intervals."
-    durations = Durations()
     durations.take(side.timings)
-    if durations.is_virtual():
-        return
-    deadline = side.summary.get("deadline_us")
-    drawn = latency_chart(durations, float(deadline) if deadline else None, f"{name}: latency")
-    yield drawn, f"{name}: share of decisions that took longer, whole and by stage."
+    deadline_us = side.summary.get("deadline_us")
+    latency = None if durations.is_virtual() else durations.chart(float(deadline_us) if deadline_us else None)
+    classes = max(int(side.decisions["truth"].max()) + 1, 2)
+    return {"accuracy": numbers.accuracy(), "classes": classes, "latency": latency}

@@ -17,7 +17,6 @@ from pans.runtime.registration.measure import Registration
 from pans.runtime.registration.parameters import DARK, N_GEOMETRY, PARAMETERS, flat_basis
 from pans.runtime.report.file_facts import file_facts
 
-from .charts import Axis, Curve, Mark, chart, percent, whole
 from .page import picture, render
 from .rates import Rates
 
@@ -34,7 +33,9 @@ def bundle_page(path: Path) -> bytes:
     if (automaton := bundle.automaton) is None:
         shown: dict[str, Any] = {"optics": optics(bundle)}
     else:
-        shown = {"states": first_states(bundle, automaton), "sure": _sure_chart(automaton)}
+        sure = automaton.posteriors[: automaton.n_states].max(axis=1)
+        steps = [np.quantile(sure[automaton.depth == slot], (0.25, 0.5, 0.75)) for slot in range(automaton.n_slots)]
+        shown = {"states": first_states(bundle, automaton), "sure": np.array(steps).T}
     return render("bundle.html", bundle=bundle, facts=facts, provenance=provenance, **shown)
 
 
@@ -65,19 +66,6 @@ def first_states(bundle: Bundle, automaton: Automaton, rates: Rates | None = Non
         name = f"state {state}, step {int(automaton.depth[state]) + 1}"
         pictures.append((name, picture(state_picture(bundle, automaton, state)), lines))
     return pictures
-
-
-def _sure_chart(automaton: Automaton) -> Any:
-    """How sure the states of each step are: median and quartiles of their largest probability."""
-    sure = automaton.posteriors[: automaton.n_states].max(axis=1)
-    steps = [sure[automaton.depth == slot] for slot in range(automaton.n_slots)]
-    low, middle, high = np.array([np.quantile(values, (0.25, 0.5, 0.75)) for values in steps]).T
-    curve = Curve(np.arange(1, len(steps) + 1), middle, low=low, high=high)
-    x, y = (
-        Axis("step of the walk", 0.5, len(steps) + 0.5, text=whole),
-        Axis("largest probability", 0.0, 1.0, text=percent),
-    )
-    return chart("Largest probability of a class in the states of each step", x, y, curves=[curve], height=190)
 
 
 def state_picture(bundle: Bundle, automaton: Automaton, state: int) -> F64:
@@ -119,13 +107,13 @@ def clicked_words(word: int, channels: int) -> str:
 
 def measured_page(path: Path) -> bytes:
     """Return the page of a calibration or a registration."""
-    return _measured(file_facts(path), [], [])
+    return _measured(file_facts(path), [], None)
 
 
-def _measured(facts: dict[str, Any], pictures: list[Any], charts: list[Any]) -> bytes:
+def _measured(facts: dict[str, Any], pictures: list[Any], left: dict[str, Any] | None) -> bytes:
     units = {one.name: one.unit for one in PARAMETERS}
     rows = [(name, row, units.get(name, "")) for name, row in facts.pop("parameters", {}).items()]
-    more = {"channels": facts.pop("channels", None) or [], "pictures": pictures, "charts": charts}
+    more = {"channels": facts.pop("channels", None) or [], "pictures": pictures, "left": left}
     return render("measured.html", facts=facts, parameters=rows, **more)
 
 
@@ -146,17 +134,5 @@ def write_registration_page(
         ("flat field", picture(field, *ends), ["{:.3f} to {:.3f}".format(*ends)]),
     ]
     expected, share, deviation = pattern_residuals(bench, measurement.observed, found.values)
-    top = float(max(expected.max(), share.max(), 1e-3))
-    curves = [Curve(expected, share, "patterns", dots=True), Curve([0.0, top], [0.0, top], "equal", "b")]
-    x, y = Axis("expected share of clicks", 0.0, top), Axis("measured share of clicks", 0.0, top)
-    words = "share of exposures that clicked against the share that the model expects, a dot for each pattern"
-    agreement = chart(words, x, y, curves=curves)
-    dots, last = Curve(np.arange(len(deviation)), np.clip(deviation, -FAR, FAR), dots=True), max(len(deviation) - 1, 1)
-    x, y = Axis("pattern", 0.0, float(last), text=whole), Axis("residual (standard errors)", -FAR, FAR)
-    marks = [Mark(2.0, "2 standard errors"), Mark(-2.0, "")]
-    left = chart("residual of every pattern in standard errors", x, y, curves=[dots], marks=marks)
-    charts = [
-        (agreement, "Every pattern's share of clicks."),
-        (left, "Measured less expected clicks over their standard error."),
-    ]
-    write_file(path, _measured(facts, pictures, charts), force=force)
+    left = {"expected": expected, "share": share, "deviation": np.clip(deviation, -FAR, FAR), "far": FAR}
+    write_file(path, _measured(facts, pictures, left), force=force)

@@ -20,7 +20,7 @@ from pans.runtime.record.format import LIMITS, Kind
 from pans.runtime.record.log import LogReader
 from pans.runtime.report.words import accuracy_interval
 
-from .charts import Axis, Curve, chart, number, percent, spark
+from .charts import spark
 from .page import render
 
 SPARKS, LOG_MAX_BYTES = 24, 1 << 24  # stretches of a small picture; of a larger recording there is none
@@ -31,7 +31,8 @@ Run = Any  # of operate/runs.py, a package that comes later
 def index_page(root: Path, runs: Sequence[Run], beside: Path) -> bytes:
     """Return the page of the runs in `root`, the newest first, with links from the folder `beside`."""
     rows = [(run, run.summary, accuracy_interval(run.summary), _link(run, beside), _spark(run)) for run in runs]
-    trends = [drawn for drawn in (_trend(runs, *one) for one in _TRENDS) if drawn is not None]
+    figures = {"accuracy": _accuracy, "dark": _dark, "clicks": _clicks, "late": _late}
+    trends = {name: _trend(runs, figure) for name, figure in figures.items()}
     return render("index.html", root=root, rows=rows, trends=trends, simulated=any(run.simulated for run in runs))
 
 
@@ -93,30 +94,12 @@ def _late(one: Mapping[str, Any]) -> Ends:
     return (one["late"] / one["decisions"],) * 3 if one.get("decisions") else None
 
 
-_TRENDS: tuple[tuple[str, str, Callable[[Mapping[str, Any]], Ends], Callable[[float], str]], ...] = (
-    ("accuracy", "Accuracy of each run with its 95 % interval.", _accuracy, percent),
-    ("dark clicks per dark exposure", "Dark rate of each run with its 95 % interval.", _dark, number),
-    ("clicks per decision", "Light level: clicks of a decision, on average.", _clicks, number),
-    ("late decisions, share", "Share of decisions that were late.", _late, percent),
-)
-
-
-def _trend(
-    runs: Sequence[Run],
-    title: str,
-    words: str,
-    figure: Callable[[Mapping[str, Any]], Ends],
-    text: Callable[[float], str],
-) -> tuple[Any, str] | None:
+def _trend(runs: Sequence[Run], figure: Callable[[Mapping[str, Any]], Ends]) -> dict[str, Any] | None:
     """One figure of all runs over time; None where fewer than two know it."""
     found = [(run.started.timestamp(), *values) for run in runs if (values := figure(run.summary)) is not None]
     if len(found) < 2:
         return None
     when, value, low, high = np.array(sorted(found)).T
     unit, unit_s = next(one for one in UNITS if when[-1] - when[0] >= 2 * one[1] or one is UNITS[-1])
-    since = (when - when[0]) / unit_s
-    first, top = datetime.fromtimestamp(when[0]).astimezone(), float(high.max())
-    x = Axis(f"{unit} since {first:%Y-%m-%d %H:%M}", -0.02 * since[-1], 1.02 * since[-1] or 1.0)
-    y = Axis(title, 0.0, 1.0 if title == "accuracy" else 1.1 * top or 1.0, text=text)
-    curve = Curve(since, value, low=low, high=high, dots=True)
-    return chart(f"{title} of {len(value)} runs", x, y, curves=[curve]), words
+    first = datetime.fromtimestamp(when[0]).astimezone()
+    return {"unit": unit, "since": (when - when[0]) / unit_s, "first": first, "value": value, "low": low, "high": high}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pans.runtime import safe_text
 from pans.runtime.images import grey_png
 
-from .charts import needed, number, percent
+from .charts import Axis, Bars, Curve, Mark, chart, needed, number, percent, seconds, span, whole
 
 SIDE_MAX = 96  # pixels of a small picture
 
@@ -40,7 +40,9 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters |= {"number": number, "percent": percent, "flat": flat, "points": points, "picture": picture}
+    found.filters |= {"number": number, "percent": percent, "seconds": seconds, "flat": flat, "points": points}
+    drawing = (chart, Axis, Bars, Curve, Mark, number, percent, seconds, span, whole)
+    found.globals |= {one.__name__: one for one in drawing}
     # our own text, with what stands between backticks as code
     found.filters["coded"] = lambda text: markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", safe_text.html(text)))
     return found

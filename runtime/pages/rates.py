@@ -12,8 +12,6 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.record.exposures import Exposures, is_dark
 
-from .charts import Axis, Curve, Mark, chart, seconds, whole
-
 HEAT_BINS, EXPOSURES_PER_BIN = 120, 25  # of each pattern: a rate from fewer is noise
 DARK_BINS, DARK_PER_BIN = 40, 200
 OBJECTS_KEPT = 1 << 14  # whose true class is remembered: the exposures of an object come soon after its mark
@@ -129,38 +127,29 @@ class Rates:
     def _edges(self, over: Stretches) -> F64:
         return np.arange(over.used + 1, dtype=np.float64) * (over.width * self._plan.cycle_us * 1e-6)
 
-    def heat(self) -> tuple[Any, float, int]:
-        """Return clicks per exposure over time as shades, the largest rate, and how many stretches of the run are shown."""
+    def heat(self) -> dict[str, Any]:
+        """Return clicks per exposure over time (`rate`, stretches last), the largest, when the run ended, and how many stretches it has."""
         exposures = float(self.over.sums["exposures"].sum()) / self.n
         over = self.over.merged(int(np.clip(exposures / EXPOSURES_PER_BIN, 1, HEAT_BINS)))
         with np.errstate(invalid="ignore", divide="ignore"):
             rate = over.sums["clicks"] / over.sums["exposures"]
         high = float(np.nanmax(rate)) if np.isfinite(rate).any() else 0.0
-        x = Axis("time since the first exposure", 0.0, float(self._edges(over)[-1]), text=seconds)
-        y = Axis(self.what, -0.5, self.n - 0.5, text=whole)
-        return chart(f"Clicks per exposure of each {self.what} over the run", x, y, heat=rate.T), high, over.used
+        return {"rate": rate.T, "high": high, "end_s": float(self._edges(over)[-1]), "stretches": over.used}
 
     def dark(self) -> tuple[int, int, float, float] | None:
         """Return clicks and dark exposures, and the 95 % interval of their ratio; None without dark exposures."""
         clicks, exposures = (int(self.over.sums[f"dark {what}"].sum()) for what in ("clicks", "exposures"))
         return (clicks, exposures, *wilson_interval(clicks, exposures)) if exposures else None
 
-    def dark_chart(self, expected: float | None) -> Any:
-        """Return the dark rate over time with its interval and what is expected."""
+    def dark_over(self) -> dict[str, Any]:
+        """Return the dark rate over time with its interval, and when the run ended."""
         total = float(self.over.sums["dark exposures"].sum())
         over = self.over.merged(int(np.clip(total / DARK_PER_BIN, 1, DARK_BINS)))
         some, edges = over.sums["dark exposures"] > 0, self._edges(over)
         clicks, exposures = over.sums["dark clicks"][some], over.sums["dark exposures"][some]
-        ends = np.array([wilson_interval(int(c), int(n)) for c, n in zip(clicks, exposures)]).T
-        top = min(max(float(ends[1].max()), 1.2 * (expected or 0.0), 1e-12), 1.0)
-        return chart(
-            f"Dark clicks per exposure over the run, {clicks.sum() / total:.3g} on average",
-            Axis("time since the first exposure", 0.0, float(edges[-1]), text=seconds),
-            Axis("dark clicks per dark exposure", 0.0, top),
-            curves=[Curve(((edges[1:] + edges[:-1]) / 2)[some], clicks / exposures, low=ends[0], high=ends[1])],
-            marks=[] if expected is None else [Mark(expected, f"expected {expected:.3g}")],
-            height=190,
-        )
+        low, high = np.array([wilson_interval(int(c), int(n)) for c, n in zip(clicks, exposures)]).T
+        middle, rate = ((edges[1:] + edges[:-1]) / 2)[some], clicks / exposures
+        return {"seconds": middle, "rate": rate, "low": low, "high": high, "end_s": float(edges[-1])}
 
     def begin_of(self, event: Mapping[str, Any]) -> dict[str, Any]:
         """Return a state of the detector in dark exposures with `begun_s` and `noticed_s`, seconds since the first exposure, about.

@@ -30,7 +30,7 @@ from pans.runtime.report.words import figure_rows, flow_rows, stage_rows, walk_r
 from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 
 from .bundle import first_states, optics
-from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, span, whole
+from .charts import Bars, Curve
 from .page import render, sentence_of, words
 from .rates import BINS, TOLD_APART, Rates, Stretches
 
@@ -95,44 +95,31 @@ class Decisions:
                 self.add(f"outcome {abort_reason(flag) or 'with a label'}", numbers[rows["flags"] == flag])
             self.add("asked", numbers[np.isin(rows["label"], self._gated)])
 
-    def accuracy(self, n_classes: int, label: str = "Accuracy over the run") -> tuple[Any, list[int]]:
-        """Return accuracy over time with its interval, and the least and largest number of objects of a stretch; None of a short run."""
+    def accuracy(self) -> dict[str, Any] | None:
+        """Return accuracy over time with its interval, and how many objects a stretch has; None where it is not known, or too short."""
         objects = np.count_nonzero(self.over.sums["objects"])
         over = self.over.merged(int(np.clip(objects // OBJECTS_PER_BIN, 1, ACCURACY_BINS)))
         some = over.sums.get("known", np.zeros(1)) > 0
         if some.sum() < 2:
-            return None, []
+            return None
         share = over.sums["right"][some] / over.sums["known"][some]
         counts = np.count_nonzero(over.sums["objects"][some], axis=1).tolist()
-        ends = np.array([wilson_interval(round(p * n), n) for p, n in zip(share.tolist(), counts)]).T
-        when, mean = self._seconds(over)[some], self.right / self.known
-        marks = [Mark(mean, f"whole run {100 * mean:.1f} %")]
-        if abs(mean - 1 / n_classes) > 0.12:
-            marks.append(Mark(1 / n_classes, "a guess"))
-        curve = Curve(when, share, low=np.minimum(ends[0], share), high=np.maximum(ends[1], share))
-        x = Axis("time since the first decision", 0.0, max(float(when[-1]), 1e-9), text=seconds)
-        y = Axis("share of right decisions", 0.0, 1.0, text=percent)
-        return chart(f"{label}, {100 * mean:.1f} % on average", x, y, curves=[curve], marks=marks), [
-            min(counts),
-            max(counts),
-        ]
+        low, high = np.array([wilson_interval(round(p * n), n) for p, n in zip(share.tolist(), counts)]).T
+        band = {"low": np.minimum(low, share), "high": np.maximum(high, share)}
+        sums = {"mean": self.right / self.known, "objects": (min(counts), max(counts))}
+        return {"seconds": self._seconds(over)[some], "share": share, **band, **sums}
 
-    def stacked(self, what: str, names: Mapping[str, str]) -> Any:
+    def stacked(self, names: Mapping[str, str]) -> dict[str, Any] | None:
         """Return sums over time, one upon the other, the largest first; `names`: sum -> its name. None where there is nothing."""
         over = self.over.merged(ACCURACY_BINS)
         rows = {name: over.sums[key] for key, name in names.items() if over.sums.get(key, np.zeros(1)).any()}
-        if not rows:
-            return None
         edges = np.append(np.minimum.accumulate(self._seconds(over)[::-1])[::-1], 0.0)
         edges[-1] = 2 * edges[-2] - edges[-3] if len(edges) > 2 else edges[-2] + 1.0
         base, bars = np.zeros(over.used), []
         for (name, counts), kind in zip(sorted(rows.items(), key=lambda row: -float(row[1].sum())), "abcd"):
             bars.append(Bars(edges, counts, base.copy(), f"{name} ({int(counts.sum())})", kind))
             base += counts
-        label = f"{what} over the run: " + ", ".join(f"{name} {int(counts.sum())}" for name, counts in rows.items())
-        x = Axis("time since the first decision", float(edges[0]), float(edges[-1]), text=seconds)
-        y = Axis(f"{what} per {over.width} decisions", 0.0, 1.05 * max(float(base.max()), 1.0), text=whole)
-        return chart(label, x, y, bars=bars)
+        return {"bars": bars, "edges": edges, "top": float(base.max()), "width": over.width} if bars else None
 
     def _seconds(self, over: Stretches) -> F64:
         """The mean time of each stretch."""
@@ -197,11 +184,6 @@ class Durations:
     def __init__(self) -> None:
         self.stages = {name: LatencyHistogram() for name in _STAGES}
 
-    @property
-    def n(self) -> int:
-        """Decisions."""
-        return self.stages[IN_HOST].total
-
     def take(self, rows: Rows) -> None:
         """Take the next rows, TIMING_DTYPE (n,)."""
         for name, (start, end) in _STAGES.items():
@@ -219,6 +201,13 @@ class Durations:
         told = {"latency_us": found.pop(WHOLE), "stage_latency_us": found}
         return stage_rows({**told, "clock": {"worst_uncertainty_us": 0.0}})
 
+    def chart(self, deadline_us: float | None) -> dict[str, Any]:
+        """Return the shares of decisions above each time, in microseconds, with the deadline, and where the axes end."""
+        curves = [Curve(*survival(one), name, kind) for (name, one), kind in zip(self.stages.items(), "abcd")]
+        top = max([one.max_ns / 1000 for one in self.stages.values()] + [deadline_us or 0.0, 10.0]) * 1.3
+        least = 0.7 / self.stages[IN_HOST].total
+        return {"curves": curves, "deadline_us": deadline_us, "left": LEAST_US, "right": top, "least": least}
+
 
 def survival(histogram: LatencyHistogram) -> tuple[F64, F64]:
     """Return times in microseconds and the share of durations that are at least about as long."""
@@ -229,26 +218,12 @@ def survival(histogram: LatencyHistogram) -> tuple[F64, F64]:
     return np.maximum(edges / 1000, LEAST_US), np.asarray(beyond, np.float64)
 
 
-def latency_chart(durations: Durations, deadline_us: float | None, label: str = "Latency") -> Any:
-    """Return the shares of decisions above each time, with the deadline."""
-    curves = [Curve(*survival(one), name, kind) for (name, one), kind in zip(durations.stages.items(), "abcd")]
-    top = max([one.max_ns / 1000 for one in durations.stages.values()] + [deadline_us or 0.0, 10.0]) * 1.3
-    return chart(
-        f"{label}: share of decisions that took longer than a time",
-        Axis("longer than", LEAST_US, top, log=True, text=span),
-        Axis("share of decisions", 0.7 / durations.n, 1.0, log=True, text=percent),
-        curves=curves,
-        marks=[Mark(deadline_us, f"budget {span(deadline_us)}", upright=True)] if deadline_us else [],
-        height=320,
-    )
-
-
 class Walks:
-    """How many whole walks had each number of exposures and of clicks, int64 (numbers,), and what they said of themselves."""
+    """How many whole walks had each number of exposures and of clicks, and what they said of themselves."""
 
     def __init__(self, automaton: Automaton) -> None:
         self._automaton = automaton
-        self.exposures, self.clicks = np.zeros(automaton.n_slots + 1, np.int64), np.zeros(1, np.int64)
+        self.exposures, self.clicks = Counter[int](), Counter[int]()
         self.probability = 0.0  # their sum
         self.bins = np.zeros((3, CONFIDENCE_BINS))  # of those with label and truth: how many, probabilities, right ones
 
@@ -259,7 +234,8 @@ class Walks:
         place = np.minimum((known["probability"] * CONFIDENCE_BINS).astype(np.int64), CONFIDENCE_BINS - 1)
         for row, weights in enumerate((None, known["probability"], known["label"] == known["truth"])):
             self.bins[row] += np.bincount(place, weights, CONFIDENCE_BINS)
-        self.exposures, self.clicks = _added(self.exposures, some["exposures"]), _added(self.clicks, some["clicks"])
+        self.exposures.update(some["exposures"].tolist())
+        self.clicks.update(some["clicks"].tolist())
         self.probability += float(some["probability"].sum(dtype=np.float64))
 
     def reliability(self) -> list[tuple[float, float, float]]:
@@ -269,45 +245,21 @@ class Walks:
 
     def facts(self, bundle: Bundle, rates: Rates) -> dict[str, Any]:
         """Return what the page says of the walks; {} without any."""
-        n, automaton = int(self.exposures.sum()), self._automaton
+        n, bins, known = self.exposures.total(), self.reliability(), float(self.bins[0].sum())
         if not n:
             return {}
-        bins, told = self.reliability(), float(self.bins[0].sum())
         return {
             "n": n,
-            "automaton": automaton,
-            "pictures": first_states(bundle, automaton, rates),
-            "means": [float(np.average(np.arange(len(one)), weights=one)) for one in (self.exposures, self.clicks)],
-            "lengths": _counted("exposures of a walk", self.exposures[1:], 1),
-            "clicks": _counted("clicks of a walk", self.clicks, 0),
+            "automaton": self._automaton,
+            "pictures": first_states(bundle, self._automaton, rates),
+            "lengths": self.exposures,
+            "clicks": self.clicks,
             "probability": self.probability / n,
-            "reliability": _reliability_chart(bins) if bins else None,
+            "bins": np.array(bins).T,
             "error": sum(share * abs(right - said) for said, right, share in bins),
             # if every stated probability were right: of a share of m decisions sqrt(2 p (1 - p) / (pi m))
-            "chance": sum(share * float(np.sqrt(2 * p * (1 - p) / (np.pi * share * told))) for p, _, share in bins),
+            "chance": sum(share * float(np.sqrt(2 * p * (1 - p) / (np.pi * share * known))) for p, _, share in bins),
         }
-
-
-def _added(counts: I64, values: NDArray[np.integer[Any]]) -> I64:
-    """Return `counts` with how often each of `values` is there; longer where they are larger."""
-    more = np.bincount(values, minlength=len(counts))
-    more[: len(counts)] += counts
-    return more
-
-
-def _counted(what: str, counts: I64, first: int) -> Any:
-    edges = first + np.arange(len(counts) + 1) - 0.5
-    x = Axis(what, float(edges[0]), float(edges[-1]), text=whole)
-    y = Axis("walks", 0.0, 1.05 * max(int(counts.max(initial=0)), 1))
-    return chart(f"How many walks had each number of {what}", x, y, bars=[Bars(edges, counts)], height=190)
-
-
-def _reliability_chart(bins: list[tuple[float, float, float]]) -> Any:
-    said, right, _ = np.array(bins).T
-    x = Axis("probability that the decision stated", 0.0, 1.0, text=percent)
-    y = Axis("share of right decisions", 0.0, 1.0, text=percent)
-    curves = [Curve([0.0, 1.0], [0.0, 1.0], "as sure as right", "b"), Curve(said, right, "decisions", "a")]
-    return chart("Share of right decisions against the probability that they stated", x, y, curves=curves, height=270)
 
 
 # ---- the page ----
@@ -327,7 +279,6 @@ def run_page(recording: Recording) -> bytes:
     for item in iter_exposures(cast(Recording, messages), plan):
         rates.take(item)
     budget_us, timed = summary.get("deadline_us") or config.get("deadline_us"), not durations.is_virtual()
-    accuracy, sizes = decisions.accuracy(len(classes)) if len(classes) > 1 and decisions.known else (None, [])
     passing = _passing(recording, bundle, decisions)
     confusion = passing["confusion"] if passing else decisions.confusion
     return render(
@@ -339,8 +290,7 @@ def run_page(recording: Recording) -> bytes:
         reasons=[(fault, advice_on(str(fault))) for fault in summary.get("faults", ())],
         tiles=figure_rows(summary, timed=timed) if "verdict" in summary else [],
         decisions=decisions,
-        accuracy=accuracy,
-        sizes=sizes,
+        accuracy=decisions.accuracy() if len(classes) > 1 else None,
         confusion=confusion if confusion.any() else None,
         mistakes=mistakes(confusion, bundle),
         passing=passing,
@@ -350,12 +300,11 @@ def run_page(recording: Recording) -> bytes:
         rates=rates,
         states=[rates.begin_of(event) for event in events.dark],
         latency=durations.rows(summary) if timed else [],
-        curve=latency_chart(durations, float(budget_us) if budget_us else None) if timed else None,
+        curve=durations.chart(float(budget_us) if budget_us else None) if timed else None,
         causes=events.causes(),
-        late=decisions.stacked("late decisions", {f"late {cause}": cause for cause in events.late}),
+        late=decisions.stacked({f"late {cause}": cause for cause in events.late}),
         noted=events.kinds,
         sentences=[sentence_of(event) for event in events.shown],
-        records=[(e["kind"], ", ".join(f"{k} {v}" for k, v in e.items() if k != "kind")) for e in events.shown],
     )
 
 
@@ -413,6 +362,6 @@ def _passing(recording: Recording, bundle: Bundle | None, decisions: Decisions) 
     return {
         "rows": flow_rows(figures.as_json() | {"gates": pulses}),
         "confusion": confusion,
-        "outcomes": decisions.stacked("decisions", {name: name.removeprefix("outcome ") for name in names}),
-        "pulses": decisions.stacked("pulses", {"made": "done", "gate_refused": "refused", "gate_expired": "expired"}),
+        "outcomes": decisions.stacked({name: name.removeprefix("outcome ") for name in names}),
+        "pulses": decisions.stacked({"made": "done", "gate_refused": "refused", "gate_expired": "expired"}),
     }

@@ -102,9 +102,10 @@ def test_accuracy_over_time_counts_objects_once() -> None:
         found.take(part)
     assert (found.known, found.right) == (270, 134)
     assert found.confusion.tolist() == [[0, 0], [136, 134]]
-    drawn, sizes = found.accuracy(2)
-    assert "49.6 % on average" in drawn
-    assert 0 < sizes[0] <= sizes[1] <= 43  # of 128 decisions in a stretch at most
+    over = found.accuracy()
+    assert over is not None
+    assert over["mean"] == pytest.approx(134 / 270)
+    assert 0 < over["objects"][0] <= over["objects"][1] <= 43  # of 128 decisions in a stretch at most
     assert accuracy_over([]) == []
 
 
