@@ -253,14 +253,15 @@ def _findings(first: Side, second: Side, paired: bool) -> Iterator[Finding]:
         counts, totals = ([int(one or 0) for one in _told(sides, *keys)] for keys in (count, total))
         if all(totals) and (any(counts) or name == "dark_rate"):
             four = counts[0], totals[0], counts[1], totals[1]
-            rates, how = (counts[0] / totals[0], counts[1] / totals[1]), "{} of {} and {} of {} ".format(*four) + method
+            rates, how = (four[0] / four[1], four[2] / four[3]), "{} of {} and {} of {} ".format(*four) + method
             yield Finding(name, unit, *rates, *rate_ratio(*four), True, poisson_rates(*four), how)
     yield from _latencies(sides)
 
 
 def _told(sides: Sides, *keys: str) -> list[Any]:
     """What the summaries say below nested keys; None where one says nothing."""
-    return [reduce(lambda one, key: (one or {}).get(key), keys, side.summary) for side in sides]
+    start: list[Any] = [side.summary for side in sides]
+    return [reduce(lambda one, key: (one or {}).get(key), keys, one) for one in start]
 
 
 def _untested(name: str, unit: str, values: list[Any], why: str = "not tested", *, is_ratio: bool = False) -> Finding:
@@ -302,7 +303,9 @@ def _two_shares(name: str, shares: list[float], sizes: list[int], method: str) -
     right = [share * n for share, n in zip(shares, sizes)]
     between = newcombe_difference(right[0], sizes[0], right[1], sizes[1])  # of the shares that are shown
     p = fisher_exact(round(right[0]), sizes[0], round(right[1]), sizes[1])
-    return Finding(name, "share", *shares, *between, False, p, f"{method}, Fisher exact; interval by Newcombe")
+    return Finding(
+        name, "share", shares[0], shares[1], *between, False, p, f"{method}, Fisher exact; interval by Newcombe"
+    )
 
 
 def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Finding:

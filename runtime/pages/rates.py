@@ -91,7 +91,7 @@ class Rates:
         cycles = np.maximum(item.message_tick - self._first, 0) * (plan.tick_us / plan.cycle_us)
         where, dark = self.over.at(cycles.astype(np.int64)), is_dark(item.pattern)
         # in any of the channels, where one pattern after the other is shown
-        clicks = item.clicks[:, : self.n] if self.parallel else item.clicks.any(axis=1, keepdims=True)
+        clicks = item.clicks[:, : self.n] if self.parallel else np.asarray(item.clicks.any(axis=1))[:, None]
         sums = self.over.sums
         sums["dark clicks"] += np.bincount(where[dark], clicks[dark].sum(axis=1), BINS)
         sums["dark exposures"] += np.bincount(where[dark], minlength=BINS) * (self.n if self.parallel else 1)

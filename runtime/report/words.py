@@ -141,9 +141,9 @@ def figure_rows(facts: Facts, *, timed: bool = False) -> Rows:
         start = f"{timing['worst_start_us']:+.3g} us" if timing["exposures"] else "unknown"
         rows.append(("exposures off the plan", start, exposure_words(timing)))
     if (dark := facts.get("dark") or {}).get("exposures"):
-        ends = f"95 % interval {dark['low']:.2g} to {dark['high']:.2g}, expected {dark['expected']:.2g}; "
-        counts = f"{dark['clicks']} clicks in {dark['exposures']} dark exposures of the whole run"
-        rows.append(("dark clicks per exposure", f"{dark['clicks'] / dark['exposures']:.3g}", ends + counts))
+        between = f"95 % interval {dark['low']:.2g} to {dark['high']:.2g}, expected {dark['expected']:.2g}"
+        counts = f"{dark['clicks']} clicks in {dark['exposures']} dark exposures of the whole run, {between}"
+        rows.append(("dark clicks per exposure", f"{dark['clicks'] / dark['exposures']:.3g}", counts))
     return rows
 
 
