@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import cycle
 from types import ModuleType
 from typing import Any
 
@@ -174,9 +175,9 @@ def chart(
             drawn_bars = axes.bar(edges[:-1], bar.heights, np.diff(edges), bar.base, align="edge", color=ink)
             named.append((drawn_bars, bar.name))
         named += [(_curve(axes, curve), curve.name) for curve in curves]
-        for mark in marks:
+        for mark, dashes in zip(marks, cycle(((4, 3), (1.5, 2)))):
             line = axes.axvline if mark.upright else axes.axhline
-            named.append((line(mark.at, color=_INKS["bad"], ls=(0, (4, 3)), lw=1), mark.name))
+            named.append((line(mark.at, color=_INKS["bad"], ls=(0, dashes), lw=1), mark.name))
         if (told := [(artist, one_line(name)) for artist, name in named if name]) and (marks or len(told) > 1):
             columns = 2 if max(len(name) for _, name in told) < 20 else 1
             where = {"loc": "outside upper left", "ncols": columns, "frameon": False, "borderpad": 0}

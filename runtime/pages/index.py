@@ -101,5 +101,9 @@ def _trend(runs: Sequence[Run], figure: Callable[[Mapping[str, Any]], Ends]) -> 
         return None
     when, value, low, high = np.array(sorted(found)).T
     unit, unit_s = next(one for one in UNITS if when[-1] - when[0] >= 2 * one[1] or one is UNITS[-1])
-    first = datetime.fromtimestamp(when[0]).astimezone()
-    return {"unit": unit, "since": (when - when[0]) / unit_s, "first": first, "value": value, "low": low, "high": high}
+    first, top = (
+        datetime.fromtimestamp(when[0]).astimezone(),
+        max(value.max(), np.median(high)),
+    )  # one short run hides no other
+    since = (when - when[0]) / unit_s
+    return {"unit": unit, "since": since, "first": first, "value": value, "low": low, "high": high, "top": float(top)}
