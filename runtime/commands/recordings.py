@@ -27,7 +27,7 @@ from pans.runtime.record.parts import is_of_parts, open_recording, parts_in
 from pans.runtime.record.pictures import PictureLog
 from pans.runtime.record.replaying import Replayed, replay
 from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.report.csv_files import FILES, write_csv
+from pans.runtime.report.exports import FILES, write_csv, write_photon_hdf5
 from pans.runtime.report.summary import exposure_fault
 from pans.runtime.report.verify import file_kind
 from pans.runtime.report.words import flow_rows, lines_of
@@ -144,8 +144,6 @@ def _export(args: argparse.Namespace) -> int:
     elif args.format == "parquet":
         write_decisions(args.out, recording, plan, force=args.force)
     else:
-        from pans.runtime.report.photon_hdf5 import write_photon_hdf5
-
         write_photon_hdf5(args.out, recording, plan, clicks, force=args.force)
     payload = {
         "format": args.format,
@@ -260,8 +258,7 @@ def _compare(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_outputs([args.out], inputs=[args.first, args.second], force=args.force)
         need_extra()
-    from pans.runtime.compare import compare, read_side
-    from pans.runtime.compare.words import comparison_page, comparison_words
+    from pans.runtime.compare import compare, comparison_page, comparison_words, read_side
 
     found = compare(read_side(args.first), read_side(args.second), args.objects)
     if args.out is not None:

@@ -8,7 +8,7 @@ with comparison.py; statistics.py has the tests.
 0.021484
 """
 
-from .comparison import Comparison, Side, compare, read_side
+from .comparison import Comparison, Side, compare, comparison_page, comparison_words, read_side
 from .statistics import mcnemar_exact
 
-__all__ = ["Comparison", "Side", "compare", "mcnemar_exact", "read_side"]
+__all__ = ["Comparison", "Side", "compare", "comparison_page", "comparison_words", "mcnemar_exact", "read_side"]

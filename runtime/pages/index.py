@@ -6,7 +6,7 @@ Runs come as `pans runs` lists them, with their summaries; of a recording its de
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,7 @@ Run = Any  # of operate/runs.py, a package that comes later
 def index_page(root: Path, runs: Sequence[Run], beside: Path) -> bytes:
     """Return the page of the runs in `root`, the newest first, with links from the folder `beside`."""
     rows = [(run, run.summary, accuracy_interval(run.summary), _link(run, beside), _spark(run)) for run in runs]
-    figures = {"accuracy": _accuracy, "dark": _dark, "clicks": _clicks, "late": _late}
-    trends = {name: _trend(runs, figure) for name, figure in figures.items()}
+    trends = {name: _trend(runs, name) for name in ("accuracy", "dark", "clicks", "late")}
     return render("index.html", root=root, rows=rows, trends=trends, simulated=any(run.simulated for run in runs))
 
 
@@ -73,30 +72,24 @@ def accuracy_over(recordings: Sequence[Path]) -> list[float]:
 
 # ---- trends ----
 
-Ends = tuple[float, float, float] | None  # a figure with its interval
+
+def _figures(one: Mapping[str, Any]) -> dict[str, tuple[float, float, float]]:
+    """The figures that a summary has, with the ends of their intervals."""
+    found, dark, ends = {}, one.get("dark") or {}, accuracy_interval(one)
+    if ends is not None and one.get("accuracy") is not None:
+        found["accuracy"] = (one["accuracy"], *ends)
+    if dark.get("exposures"):
+        found["dark"] = (dark["clicks"] / dark["exposures"], dark["low"], dark["high"])
+    if one.get("clicks_mean") is not None:
+        found["clicks"] = (one["clicks_mean"],) * 3
+    if one.get("decisions"):
+        found["late"] = (one["late"] / one["decisions"],) * 3
+    return found
 
 
-def _accuracy(one: Mapping[str, Any]) -> Ends:
-    ends = accuracy_interval(one)
-    return None if ends is None or one.get("accuracy") is None else (one["accuracy"], *ends)
-
-
-def _dark(one: Mapping[str, Any]) -> Ends:
-    dark = one.get("dark") or {}
-    return (dark["clicks"] / dark["exposures"], dark["low"], dark["high"]) if dark.get("exposures") else None
-
-
-def _clicks(one: Mapping[str, Any]) -> Ends:
-    return None if one.get("clicks_mean") is None else (float(one["clicks_mean"]),) * 3
-
-
-def _late(one: Mapping[str, Any]) -> Ends:
-    return (one["late"] / one["decisions"],) * 3 if one.get("decisions") else None
-
-
-def _trend(runs: Sequence[Run], figure: Callable[[Mapping[str, Any]], Ends]) -> dict[str, Any] | None:
+def _trend(runs: Sequence[Run], name: str) -> dict[str, Any] | None:
     """One figure of all runs over time; None where fewer than two know it."""
-    found = [(run.started.timestamp(), *values) for run in runs if (values := figure(run.summary)) is not None]
+    found = [(run.started.timestamp(), *some[name]) for run in runs if name in (some := _figures(run.summary))]
     if len(found) < 2:
         return None
     when, value, low, high = np.array(sorted(found)).T

@@ -1,21 +1,24 @@
-"""A recording as Photon-HDF5, the open format of photon-counting experiments (photon-hdf5.org, version 0.5).
+"""A recording for other tools: CSV files with a data dictionary, and Photon-HDF5 (photon-hdf5.org, version 0.5).
 
-Needs h5py (extra `export`), imported when a file is written. What is the same in every file stands in photon_hdf5.toml, with the titles
-that the format's definition gives its fields: readers such as phconvert refuse other words.
-
-A binary click becomes a photon: its timestamp is the **begin of its exposure** in device ticks (when in the exposure it fell is not known),
-its detector the channel that clicked. Which pattern was displayed, which object stood there and what was decided is in `/user/pans`; the
-format leaves `/user` to its users.
+Photon-HDF5 needs h5py (extra `export`), imported when a file is written. What is the same in every file stands in photon_hdf5.toml, with
+the titles that the format's definition gives its fields: readers such as phconvert refuse other words. A binary click becomes a photon: its
+timestamp is the **begin of its exposure** in device ticks (when in the exposure it fell is not known), its detector the channel that
+clicked. Which pattern was displayed, which object stood there and what was decided is in `/user/pans`; the format leaves `/user` to its
+users.
 """
 
 from __future__ import annotations
 
+import csv
 import importlib
 import io
+import json
 import time
 import tomllib
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +28,69 @@ from pans.runtime import __version__
 from pans.runtime.cli.finding import missing_extra
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import write_file
+from pans.runtime.outputs import make_folder, write_file
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import ClickList
+from pans.runtime.record.tables import (
+    CLICKS,
+    DECISIONS,
+    TIMINGS,
+    Table,
+    click_table,
+    facts_of,
+    iter_decisions,
+    timing_table,
+)
+from pans.runtime.safe_text import csv_cell
+
+TABLES = {"decisions.csv": DECISIONS, "clicks.csv": CLICKS, "timings.csv": TIMINGS}
+FILES = (*TABLES, "columns.csv", "about.json")
+
+
+def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList, *, force: bool = False) -> list[Path]:
+    """Write the tables, their dictionary columns.csv and about.json into `folder`; return their paths. UsageError where it is a file."""
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder} is a file", remedy="name a folder: csv is several files")
+    make_folder(folder)
+    tables = {
+        "decisions.csv": _csv(DECISIONS, iter_decisions(recording, plan)),
+        "clicks.csv": _csv(CLICKS, [click_table(recording, plan, clicks)]),
+        "timings.csv": _csv(TIMINGS, map(timing_table, recording.iter_timings())),
+        "columns.csv": dictionary(),
+    }
+    about = facts_of(recording) | {
+        "exposure_us": plan.exposure_us,
+        "exposures": clicks.exposures,
+        "time_zero": "the begin of the first recorded exposure",
+        "header": {key: value for key, value in recording.header.items() if key != "profile"},
+        "events": list(recording.events()),
+    }
+    texts = tables | {"about.json": json.dumps(about, indent=1, sort_keys=True) + "\n"}
+    for name, text in texts.items():
+        write_file(folder / name, text.encode(), force=force)
+    return [folder / name for name in texts]
+
+
+def dictionary() -> str:
+    """Return columns.csv: every column of every table with its unit, its type, what it means, and what an empty cell means."""
+    rows = (
+        (file, name, column.unit, column.dtype, column.meaning, column.missing)
+        for file, columns in TABLES.items()
+        for name, column in columns.items()
+    )
+    return _text(("file", "column", "unit", "dtype", "meaning", "empty_means"), rows)
+
+
+def _csv(columns: Mapping[str, object], blocks: Iterable[Table]) -> str:
+    """A table with a head; masked values are None, which the writer leaves empty."""
+    rows = (zip(*([csv_cell(value) for value in one.tolist()] for one in table.values())) for table in blocks)
+    return _text(tuple(columns), chain.from_iterable(rows))
+
+
+def _text(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(chain([head], rows))
+    return text.getvalue()
 
 
 def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: ClickList, *, force: bool = False) -> None:
@@ -80,12 +143,10 @@ def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
 def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
     unit_s = plan.exposure_us * 1e-6 / plan.exposure_ticks
     channels = plan.n_channels
-    simulated = recording.simulated
     profile = recording.header.get("profile", {})
-    device = recording.summary.get("device", {})
     classes = recording.bundle().classes if recording.bundle_place else ()
     described = (
-        f"{'SIMULATED. ' if simulated else ''}Binary clicks of {plan.n_patterns} patterns, {plan.mode}, exposures of "
+        f"{'SIMULATED. ' if recording.simulated else ''}Binary clicks of {plan.n_patterns} patterns, {plan.mode}, exposures of "
         f"{plan.exposure_us:g} us; timestamps are the begin of the exposure. Profile {profile.get('name')}."
     )
     return {
@@ -115,7 +176,7 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
         },
         "user": {
             "pans": {
-                "simulated": int(simulated),
+                "simulated": int(recording.simulated),
                 "exposure_us": plan.exposure_us,
                 "exposures": clicks.exposures,
                 "exposure": clicks.exposure,
@@ -125,7 +186,7 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
                 "decisions": recording.decisions(),
                 "classes": np.array([name.encode() for name in classes], dtype=np.bytes_),
                 "decisions_sha256": recording.decisions_sha256,
-                "device": str(device.get("firmware", "unknown")),
+                "device": str(recording.summary.get("device", {}).get("firmware", "unknown")),
                 "profile": str(profile.get("toml", "")),
             }
         },
