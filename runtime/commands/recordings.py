@@ -30,7 +30,7 @@ from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.exports import FILES, write_csv, write_photon_hdf5
 from pans.runtime.report.summary import exposure_fault
 from pans.runtime.report.verify import file_kind
-from pans.runtime.report.words import flow_rows, lines_of
+from pans.runtime.report.words import lines_of, rows_of
 
 OF_RECORDINGS = ("csv", "photon-hdf5", "parquet")
 OF_BUNDLES = ("onnx", "npy", "png")
@@ -63,7 +63,7 @@ def _replay(args: argparse.Namespace) -> int:
         head = f"{path.name}: {found.decisions} decisions" if of_parts else of_one
         lines += [
             f"{head}: {_agreement_words(recording, found)}",
-            *([] if found.passages is None else lines_of(flow_rows(found.passages.as_json()))),
+            *([] if found.passages is None else lines_of(rows_of(found.passages.as_json(), "flow"))),
             *([f"  fault         {fault}"] if (fault := exposure_fault(found.exposure_timing)) else []),
         ]
         if of_parts:

@@ -35,11 +35,7 @@ class Interval(NamedTuple):
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
     """Return the p-value for pairs of which one alone is right: `only_first` by the first, `only_second` by the second; 1 without any."""
-    n, least = only_first + only_second, min(only_first, only_second)
-    if not n:
-        return 1.0
-    tail = math.fsum(math.exp(_log_choose(n, k) - n * math.log(2)) for k in range(least + 1))
-    return min(1.0, 2 * tail)
+    return min(1.0, 2 * binomial_tail(max(only_first, only_second), only_first + only_second, 0.5))
 
 
 def paired_difference(first: F64, second: F64) -> Interval:

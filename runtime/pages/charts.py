@@ -26,15 +26,7 @@ from pans.runtime.safe_text import html, one_line
 WIDTH, HEIGHT = 440, 240  # pixels
 BLUES = ("#eef3fa", "#5e94cd", "#08265c")  # light to dark, so that more is darker on paper too
 # A colour that stands for a variable of page.css, and is replaced by it.
-_INKS = {
-    "a": "#fe01a0",
-    "b": "#fe01b0",
-    "c": "#fe01c0",
-    "d": "#fe01d0",
-    "bad": "#fe01e0",
-    "soft": "#fe01f0",
-    "line": "#fe0110",
-}
+_INKS = {name: f"#fe01{place}0" for place, name in enumerate(("a", "b", "c", "d", "bad", "soft", "line"))}
 _DASHES = {"a": "-", "b": (0, (5, 2)), "c": (0, (1.5, 2)), "d": (0, (7, 2, 2, 2))}
 _STYLE = {
     **{"font.size": 13, "svg.fonttype": "none", "text.parse_math": False, "axes.spines.top": False, "axes.spines.right": False},

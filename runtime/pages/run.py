@@ -1,16 +1,14 @@
-"""The page of a run: its recording is read once, block by block, while sums of bounded size add up; the rest is that of its summary.
+"""The page of a run: decisions, times, events and messages are read block by block, while sums of bounded size add up.
 
-Before that it was checked, and its commands were read for the plan. The messages are read for the rates; the blocks that come in between
-go to who sums them up: decisions, events, durations, and an automaton's walks. Only objects in flow need one reading more: their passages
-come from a replay. Verdict, faults and figures are those that the run recorded; a cut recording has none, and says so.
+Messages are read for the rates; passages of objects in flow come from a replay. Verdict, faults and figures are those that the run
+recorded; a cut recording has none, and says so.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from types import SimpleNamespace
-from typing import Any, cast
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +20,10 @@ from pans.runtime.flow.matching import abort_reason
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import iter_exposures
-from pans.runtime.record.format import Kind
 from pans.runtime.record.parts import first_decision
-from pans.runtime.record.recording import ROWS_AT_ONCE
+from pans.runtime.record.recording import together
 from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.report.words import figure_rows, flow_rows, stage_rows, walk_rows
+from pans.runtime.report.words import rows_of, stage_rows
 from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 
 from .bundle import first_states, optics
@@ -273,10 +270,14 @@ def run_page(recording: Recording) -> bytes:
     decisions = Decisions(config, recording.n_decisions, classes, first_decision(recording))
     events, durations, rates = Events(decisions), Durations(), Rates(plan, len(classes))
     walks = Walks(plan.automaton) if plan.automaton is not None else None
-    takers = {Kind.DECISIONS: [decisions.take], Kind.TIMINGS: [durations.take]}
-    takers[Kind.DECISIONS] += [] if walks is None else [walks.take]
-    messages = SimpleNamespace(messages=lambda: _messages(recording, takers, events))
-    for item in iter_exposures(cast(Recording, messages), plan):
+    for rows in together(recording.iter_decisions()):
+        decisions.take(rows)
+        if walks is not None:
+            walks.take(rows)
+    for rows in together(recording.iter_timings()):
+        durations.take(rows)
+    events.take(recording.events())
+    for item in iter_exposures(recording, plan):
         rates.take(item)
     budget_us, timed = summary.get("deadline_us") or config.get("deadline_us"), not durations.is_virtual()
     passing = _passing(recording, bundle, decisions)
@@ -288,7 +289,7 @@ def run_page(recording: Recording) -> bytes:
         bundle=bundle,
         header={key: value for key, value in recording.header.items() if key not in ("profile", "command")},
         reasons=[(fault, advice_on(str(fault))) for fault in summary.get("faults", ())],
-        tiles=figure_rows(summary, timed=timed) if "verdict" in summary else [],
+        tiles=rows_of(summary, "figures", *["timed"] * timed) if "verdict" in summary else [],
         decisions=decisions,
         accuracy=decisions.accuracy() if len(classes) > 1 else None,
         confusion=confusion if confusion.any() else None,
@@ -296,7 +297,7 @@ def run_page(recording: Recording) -> bytes:
         passing=passing,
         optics=optics(bundle, rates) if bundle is not None and plan.automaton is None else None,
         walks=walks.facts(bundle, rates) if walks is not None and bundle is not None else None,
-        walked=walk_rows(summary) if "drive" in summary else [],
+        walked=rows_of(summary, "walks"),
         rates=rates,
         states=[rates.begin_of(event) for event in events.dark],
         latency=durations.rows(summary) if timed else [],
@@ -306,32 +307,6 @@ def run_page(recording: Recording) -> bytes:
         noted=events.kinds,
         sentences=[sentence_of(event) for event in events.shown],
     )
-
-
-def _messages(
-    recording: Recording, takers: Mapping[Kind, Sequence[Callable[[Rows], None]]], events: Events
-) -> Iterator[tuple[int, bytes]]:
-    """Yield the device's messages; rows of other kinds go to their `takers`, those of many blocks at once, and events to `events`."""
-    held: dict[Kind, list[Rows]] = {kind: [] for kind in takers}
-    sizes = Counter[Kind]()
-
-    def pass_on(kind: Kind) -> None:
-        for take in takers[kind] if held[kind] else ():
-            take(np.concatenate(held[kind]))
-        held[kind], sizes[kind] = [], 0
-
-    for kind, content in recording.read(Kind.MESSAGES, Kind.EVENTS, *takers):
-        if kind == Kind.MESSAGES:
-            yield from content
-        elif kind == Kind.EVENTS:
-            events.take(content)
-        else:
-            held[kind].append(content)
-            sizes[kind] += len(content)
-            if sizes[kind] >= ROWS_AT_ONCE:
-                pass_on(kind)
-    for kind in takers:
-        pass_on(kind)
 
 
 def advice_on(fault: str) -> str:
@@ -360,7 +335,7 @@ def _passing(recording: Recording, bundle: Bundle | None, decisions: Decisions) 
     figures, confusion = replayed_flow(recording, bundle)
     pulses, names = decisions.pulses(), [name for name in decisions.over.sums if name.startswith("outcome ")]
     return {
-        "rows": flow_rows(figures.as_json() | {"gates": pulses}),
+        "rows": rows_of(figures.as_json() | {"gates": pulses}, "flow"),
         "confusion": confusion,
         "outcomes": decisions.stacked({name: name.removeprefix("outcome ") for name in names}),
         "pulses": decisions.stacked({"made": "done", "gate_refused": "refused", "gate_expired": "expired"}),

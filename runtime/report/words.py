@@ -1,12 +1,15 @@
-"""A run's figures in words, from the facts of its summary: rows for terminal, Markdown and pages, closing lines, and the Markdown page.
+"""A run's figures in words.toml's words, from the facts of its summary: rows for terminal, Markdown and pages, and the Markdown page.
 
 The Markdown page is written beside the recording without any extra; `pans report` makes the full page of the recording.
 """
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
+from string import Formatter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
 
 UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host takes
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
+_SHARES = ("accuracy", "accuracy_labelled", "missed", "doubled", "yield", "purity")
 Facts = Mapping[str, Any]
 Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 
@@ -29,25 +33,70 @@ Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 def closing_words(summary: Summary, recording: str, report: str) -> str:
     """The lines that the command ends with."""
     facts = summary.as_json()
-    accuracy = "unknown" if facts["accuracy"] is None else f"{facts['accuracy']:.2%}"
-    photons = "unknown" if facts["photons_mean"] is None else f"{facts['photons_mean']:.2f}"
-    light = f"{facts['clicks_mean'] or 0.0:.2f} clicks, {photons} photons, illumination {facts['illumination']:.1f}"
-    rows: Rows = [
-        ("accuracy", f"{accuracy} at {light} each", ""),
-        ("latency", f"{latency_words(facts)}; late {facts['late']}, lost {facts['lost']}", ""),
-        ("exposures", exposure_words(facts["exposure_timing"]), ""),
-        *more_rows(facts),
-        *(("fault", fault, "") for fault in facts["faults"]),
-        *(("recording", recording, ""), ("report", report, "")),
-    ]
+    last = [*(("fault", fault, "") for fault in facts["faults"]), ("recording", recording, ""), ("report", report, "")]
     simulated = "SIMULATED · " * facts["simulated"]
     head = f"{simulated}{facts['verdict']}: {facts['decisions']} decisions ({objects_words(facts)})"
-    return "\n".join([head, *lines_of(rows)])
+    return "\n".join([head, *lines_of(rows_of(facts, "closing", "flow", "walks") + last)])
 
 
 def lines_of(rows: Rows) -> list[str]:
     """Return rows as lines for a terminal."""
     return [f"  {name:<13} {one_line('; '.join(filter(None, texts)))}" for name, *texts in rows]
+
+
+def rows_of(facts: Facts, *tables: str) -> Rows:
+    """Return those rows of words.toml's `tables` of which a summary has the facts: `flow` of passing objects, `walks` of an automaton."""
+    told, rows = {**facts, **_further(facts)}, []
+    words = tomllib.loads(files(__package__).joinpath("words.toml").read_text(encoding="utf-8"))
+    for name, texts in (row for table in tables for row in words[table].items()):
+        figure, *more = (_said(text, told) for text in texts)
+        if figure:
+            rows.append((name, figure, "; ".join(filter(None, more))))
+    return rows
+
+
+class _Words(Formatter):
+    """What is None is unknown."""
+
+    def format_field(self, value: Any, spec: str) -> str:
+        return "unknown" if value is None or value != value else str(super().format_field(value, spec))
+
+
+def _said(text: str, facts: Facts) -> str:
+    """A text with its facts, "" where one of them is not there."""
+    try:
+        return _Words().vformat(text, (), facts)
+    except (KeyError, TypeError):
+        return ""
+
+
+def _further(facts: Facts) -> dict[str, Any]:
+    """What the words need besides the facts of a summary; a list of one is None where its fact is."""
+    dark, stream = (facts.get(name) or {} for name in ("dark", "stream"))
+    known = {"spread": "accuracy_std_trials", "off": "expected_off_stderr", "asked": "confidence"}
+    found: dict[str, Any] = {name: [facts[key]] if facts.get(key) else None for name, key in known.items()}
+    found |= {"ends": accuracy_interval(facts), "light": facts.get("illumination_mean", facts.get("illumination"))}
+    found["share"] = {name: _share(facts, name) for name in _SHARES if f"{name}_ci" in facts}
+    found["text"] = {"aborted": ", ".join(f"{name} {n}" for name, n in facts.get("aborted", {}).items()) or "none"}
+    if "verdict" in facts:
+        granted = ", ".join(f"{what}: {answer}" for what, answer in facts.get("realtime", {}).items())
+        found["text"] |= {
+            "objects": objects_words(facts),
+            "latency": latency_words(facts),
+            "exposures": exposure_words(facts.get("exposure_timing", {})),
+            "realtime": granted or "virtual time: nothing asked for",
+            "page_faults": fault_words(facts.get("page_faults", {})),
+        }
+    if dark.get("exposures"):
+        found["dark_rate"] = dark["clicks"] / dark["exposures"]
+    if stream.get("repeated"):
+        unlike = [
+            f"{stream[f'repeats_{what}']} {what}"
+            for what in ("differing", "unchecked")
+            if stream.get(f"repeats_{what}")
+        ]
+        found |= {"repeats": stream["repeated"], "differing": f" ({', '.join(unlike)})" if unlike else ""}
+    return found
 
 
 def objects_words(facts: Facts) -> str:
@@ -105,108 +154,9 @@ def accuracy_interval(facts: Facts) -> tuple[float, float] | None:
     return wilson_interval(accuracy * n, n)
 
 
-def _percent(value: float | None) -> str:
-    return "unknown" if value is None else f"{100 * value:.2f} %"
-
-
-def _mean(value: float | None) -> str:
-    return "unknown" if value is None or value != value else f"{value:.3f}"
-
-
 def _share(facts: Facts, name: str) -> str:
     value, ends = facts[name], facts[f"{name}_ci"]
     return "unknown" if value is None or ends is None else f"{value:.3%} ({ends[0]:.3%} to {ends[1]:.3%})"
-
-
-def figure_rows(facts: Facts, *, timed: bool = False) -> Rows:
-    """Return the figures that every run has; with `timed` how long decisions took."""
-    rows: Rows = []
-    if "passages" not in facts:
-        ends, spread = accuracy_interval(facts), facts.get("accuracy_std_trials")
-        more = "" if ends is None else f"95 % interval {100 * ends[0]:.2f} to {100 * ends[1]:.2f} %; "
-        more += "" if spread is None else f"standard deviation over trials {_percent(spread)}; "
-        rows.append(("accuracy", _percent(facts.get("accuracy")), more + objects_words(facts)))
-    clicks, photons = (_mean(facts.get(name)) for name in ("clicks_mean", "photons_mean"))
-    light = _mean(facts.get("illumination_mean", facts.get("illumination")))
-    sent = f"{photons} photons (expected photoelectrons), illumination {light} (sum of pattern intensities)"
-    rows += [
-        ("decisions", f"{facts['decisions']:,}", f"{facts['abstained']:,} of them abstained"),
-        ("clicks per decision", clicks, sent),
-        ("late decisions", f"{facts['late']:,}", f"{facts['lost']:,} exposures lost{_repeats(facts['stream'])}"),
-    ]
-    if timed:
-        budget = f"99 % of decisions were faster; budget {facts['deadline_us'] / 1000:g} ms"
-        rows.append(("latency p99", f"{facts['latency_us']['p99'] / 1000:.3g} ms", budget))
-    if timing := facts.get("exposure_timing"):
-        start = f"{timing['worst_start_us']:+.3g} us" if timing["exposures"] else "unknown"
-        rows.append(("exposures off the plan", start, exposure_words(timing)))
-    if (dark := facts.get("dark") or {}).get("exposures"):
-        between = f"95 % interval {dark['low']:.2g} to {dark['high']:.2g}, expected {dark['expected']:.2g}"
-        counts = f"{dark['clicks']} clicks in {dark['exposures']} dark exposures of the whole run, {between}"
-        rows.append(("dark clicks per exposure", f"{dark['clicks'] / dark['exposures']:.3g}", counts))
-    return rows
-
-
-def more_rows(facts: Facts) -> Rows:
-    """Return the figures that only passing objects, and those that only an automaton has."""
-    return (flow_rows(facts) if "passages" in facts else []) + (walk_rows(facts) if "drive" in facts else [])
-
-
-def _repeats(stream: Facts) -> str:
-    """How many messages came twice; what differs is a contradiction, and a fault."""
-    more = {what: stream.get(f"repeats_{what}", 0) for what in ("differing", "unchecked")}
-    words = ", ".join(f"{count} {what}" for what, count in more.items() if count)
-    repeated = stream.get("repeated", 0)
-    return f"; {repeated} messages repeated or overtaken{f' ({words})' if words else ''}" if repeated else ""
-
-
-def walk_rows(facts: Facts) -> Rows:
-    """Return the figures of an automaton's walks."""
-    rows: Rows = [("walks", f"{_mean(facts['exposures_mean'])} exposures each, driven by the {facts['drive']}", "")]
-    if facts["confidence"]:
-        below = f"{facts['abstained_below_confidence']} decisions abstained below it"
-        rows.append(("confidence", f"{facts['confidence']:g}", below))
-    if (turn := facts["turn_us"]) is not None:
-        words = ", ".join(f"{name} {turn[key]:.0f} us" for name, key in QUANTILES.items())
-        rows.append(
-            ("host's turn", f"{words} of {facts['turn_budget_us']:.0f} us", f"late slots {facts['late_slots']}")
-        )
-    if (one := facts["expected"]) is not None:
-        off = facts["expected_off_stderr"]
-        light = f"{one['clicks']:.2f} clicks, {one['photons']:.2f} photons"
-        words = f"{one['accuracy']:.2%} at {light} ({one['profile']}, {one['split']})"
-        rows.append(("expected", words, "" if off is None else f"measured {off:+.2f} standard errors from it"))
-    return rows
-
-
-def flow_rows(facts: Facts) -> Rows:
-    """Return the figures of passing objects; those of the gates are not known in a replay. Intervals are 95 %."""
-    n, gates = facts["passages"], facts.get("gates")
-    means = [_mean(facts[name]) for name in ("clicks_mean", "passage_clicks_mean", "passage_photons_mean")]
-    aborted = ", ".join(f"{name} {count}" for name, count in facts["aborted"].items()) or "none"
-    coincident = (
-        f"{n['coincident']} in coincidence ({n['coincident_aborted']} aborted, {n['coincident_labelled']} labelled)"
-    )
-    passed = f"{n['alone']} alone, {coincident}, {n['in_gaps']} in gaps"
-    made = (
-        "" if gates is None else ", ".join(f"{what} {gates[what]}" for what in ("asked", "done", "refused", "expired"))
-    )
-    return [
-        ("passages", f"{n['marks']}: {passed}", f"{n['without_mark']} decisions without a passage"),
-        (
-            "accuracy",
-            f"{_share(facts, 'accuracy')} of those alone",
-            f"{_share(facts, 'accuracy_labelled')} where labelled",
-        ),
-        ("missed", f"{_share(facts, 'missed')} of those alone", f"doubled {_share(facts, 'doubled')}"),
-        ("aborted", aborted, ""),
-        ("light", "{} clicks of the window, {} of the passage".format(*means), f"{means[2]} photons of it, at least"),
-        (
-            "pulses",
-            f"{n['pulses']} made{f' ({made})' if made else ''}",
-            f"yield {_share(facts, 'yield')}, purity {_share(facts, 'purity')}",
-        ),
-    ]
 
 
 # ---- Markdown ----
@@ -224,28 +174,28 @@ def write_markdown(
     """Write the summary as Markdown; UsageError if it exists, unless `force`. `run`: name -> text about what was run."""
     facts = summary.as_json()
     simulated = "\n> **SIMULATED**: the clicks come from a simulated instrument, not from light.\n" * facts["simulated"]
-    clock, granted = facts["clock"], ", ".join(f"{what}: {answer}" for what, answer in facts["realtime"].items())
-    timing = [
-        f"deadline {facts['deadline_us']:.0f} us",
-        f"clock: uncertainty at most {clock['worst_uncertainty_us']:.0f} us, drift {clock.get('drift_ppm', 0.0):.1f} ppm; "
-        f"slot jitter at most {facts['slot_jitter_us']:.1f} us",
-        f"armed {facts['armed_after_s']:.2f} s after the start; measured for {facts['seconds']:.1f} s; ended: {facts['ended']}",
-        f"real-time set-up: {granted or 'virtual time: nothing asked for'}",
-        f"page faults of the loop while armed: {fault_words(facts['page_faults'])}",
+    late, missing = (
+        "{decisions} late from decision {first_decision} on",
+        "{exposures} missing from exposure {first_exposure} on",
+    )
+    causes = [
+        (
+            (late if one["what"] == "late" else missing).format_map(one),
+            one["cause"],
+            "yes" if one["sure"] else "no",
+            one["why"],
+        )
+        for one in facts["blame"]
     ]
     lines = [
         f"# Run of {markdown(run.get('bundle', 'a bundle'))}{' (SIMULATED)' if simulated else ''}",
         simulated,
         f"**{facts['verdict']}**",
         *(f"- {markdown(fault)}" for fault in facts["faults"]),
-        *_table("Results", ("figure", "value", ""), [*figure_rows(facts), *more_rows(facts)]),
+        *_table("Results", ("figure", "value", ""), rows_of(facts, "figures", "flow", "walks")),
         *_table("Timing", ("microseconds", *QUANTILES), stage_rows(facts)),
-        *(f"- {markdown(line)}" for line in timing),
-        *(
-            _table("Late and missing work", ("what", "cause", "sure", "why"), causes)
-            if (causes := _causes(facts))
-            else ()
-        ),
+        *(f"- {name}: {markdown('; '.join(filter(None, texts)))}" for name, *texts in rows_of(facts, "timing")),
+        *(_table("Late and missing work", ("what", "cause", "sure", "why"), causes) if causes else ()),
     ]
     if confusion.any():
         cells = [(name, *(str(n) if n else "·" for n in row)) for name, row in zip(classes, confusion.tolist())]
@@ -257,16 +207,6 @@ def write_markdown(
 def _table(heading: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     lines = [f"| {' | '.join(map(markdown, row))} |" for row in (head, *rows)]
     return ["", f"## {heading}", "", lines[0], "|" + " --- |" * len(head), *lines[1:], ""]
-
-
-def _causes(facts: Facts) -> list[tuple[str, ...]]:
-    """What was late or missing, from which decision or exposure on, its cause, whether the evidence is conclusive, and why."""
-    late, missing = (
-        "{decisions} late from decision {first_decision} on",
-        "{exposures} exposures missing from {first_exposure} on",
-    )
-    rows = ((late if one["what"] == "late" else missing, one) for one in facts["blame"])
-    return [(words.format(**one), one["cause"], "yes" if one["sure"] else "no", one["why"]) for words, one in rows]
 
 
 def stage_rows(facts: Facts) -> list[tuple[str, ...]]:

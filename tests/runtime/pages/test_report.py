@@ -39,9 +39,9 @@ def test_a_recording_s_page(demo: Path, tmp_path: Path) -> None:
     words = words_of(page)
     summary = read_recording(demo).summary
     assert "SIMULATED" in words
-    for text in (f"{100 * summary['accuracy']:.2f} %", *(f"{summary[k]:.3f}" for k in ("clicks_mean", "photons_mean"))):
+    for text in (f"{summary['accuracy']:.2%}", *(f"{summary[k]:.3f}" for k in ("clicks_mean", "photons_mean"))):
         assert text in words
-    low, high = (float(end) for end in re.findall(r"95 % interval ([\d.]+) to ([\d.]+) %", words)[0])
+    low, high = (float(end) for end in re.findall(r"95 % interval ([\d.]+)% to ([\d.]+)%", words)[0])
     error = (
         100 * 1.959964 * summary["accuracy_stderr_objects"]
     )  # of 200 objects, where Wilson's interval is nearly the usual one
