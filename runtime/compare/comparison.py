@@ -26,17 +26,7 @@ from pans.runtime.record.parts import open_recording
 from pans.runtime.safe_text import one_line
 from pans.runtime.wire.messages import NO_OBJECT
 
-from .statistics import (
-    LEAST_US,
-    fisher_exact,
-    holm,
-    mcnemar_exact,
-    newcombe_difference,
-    paired_difference,
-    poisson_rates,
-    quantile_ratio,
-    rate_ratio,
-)
+from . import statistics
 
 ALPHA = 0.05
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
@@ -44,11 +34,8 @@ LEAST_BEYOND = 10  # decisions slower than a quantile, or nothing is said about 
 SUMMARY_MAX_BYTES = 1 << 24
 # Facts that differ between any two runs, or that follow from others.
 _ALWAYS_DIFFERENT = ("created_utc", "command", "format_version", "toml", "decisions_sha256", "tick", "part")
-_DERIVED = (
-    "config.dark.guard.",
-    "config.backend_choice.",
-    *(f"options.{n}" for n in ("device", "out", "record", "force")),
-)
+_OUTPUTS = ("options.device", "options.out", "options.record", "options.force")
+_DERIVED = ("config.dark.guard.", "config.backend_choice.", *_OUTPUTS)
 _FIRST = ("bundle_sha256", "profile.", "device_url")  # what a reader asks for first
 F64 = NDArray[np.float64]
 
@@ -150,7 +137,7 @@ class Finding:
     def as_json(self) -> dict[str, Any]:
         """Return it JSON-able; what is not finite becomes None."""
         facts = {
-            name: None if isinstance(one, float) and not np.isfinite(one) else one for name, one in asdict(self).items()
+            key: one if not isinstance(one, float) or math.isfinite(one) else None for key, one in asdict(self).items()
         }
         return facts | {"difference_is": "a / b" if self.is_ratio else "a - b", "significant": self.significant}
 
@@ -185,7 +172,7 @@ def compare(first: Side, second: Side, pairing: str = "auto") -> Comparison:
     paired, why = _pairing(first, second, pairing)
     found = list(_findings(first, second, paired))
     tested = [at for at, finding in enumerate(found) if finding.p is not None]
-    for at, p in zip(tested, holm([found[at].p or 0.0 for at in tested])):
+    for at, p in zip(tested, statistics.holm([found[at].p or 0.0 for at in tested])):
         found[at] = replace(found[at], p_corrected=p)
     return Comparison(first, second, paired, why, tuple(changes_of(first, second)), tuple(found))
 
@@ -227,21 +214,6 @@ def _pairing(first: Side, second: Side, pairing: str) -> tuple[bool, str]:
 
 # ---- figures ----
 
-_BURSTS = "decisions as two Poisson counts; bursts look surer than they are"
-_COUNTS = (  # name, unit, keys of the count and of its total in the summary, how it was tested
-    ("late", "per decision", ("late",), ("decisions",), _BURSTS),
-    ("lost", "per exposure", ("lost",), ("stream", "exposures"), _BURSTS.replace("decisions", "exposures")),
-    *[
-        (
-            "dark_rate",
-            "clicks per dark exposure",
-            ("dark", "clicks"),
-            ("dark", "exposures"),
-            "dark exposures as two Poisson counts, exact",
-        )
-    ],
-)
-
 
 def _findings(first: Side, second: Side, paired: bool) -> Iterator[Finding]:
     sides = (first, second)
@@ -252,12 +224,13 @@ def _findings(first: Side, second: Side, paired: bool) -> Iterator[Finding]:
     yield _untested("photons_mean", "photons per decision", _told(sides, "photons_mean"))
     shown, light = _told(sides, "illumination_mean"), _told(sides, "illumination")  # of an automaton the states shown
     yield _untested("illumination", "illumination per decision", [a if b is None else b for a, b in zip(light, shown)])
-    for name, unit, count, total, method in _COUNTS:
-        counts, totals = ([int(one or 0) for one in _told(sides, *keys)] for keys in (count, total))
-        if all(totals) and (any(counts) or name == "dark_rate"):
+    for row in words()["counts"]:
+        counts, totals = ([int(one or 0) for one in _told(sides, *row[keys])] for keys in ("count", "total"))
+        if all(totals) and (any(counts) or row["always"]):
             four = counts[0], totals[0], counts[1], totals[1]
-            rates, how = (four[0] / four[1], four[2] / four[3]), "{} of {} and {} of {} ".format(*four) + method
-            yield Finding(name, unit, *rates, *rate_ratio(*four), True, poisson_rates(*four), how)
+            rates, how = (four[0] / four[1], four[2] / four[3]), "{} of {} and {} of {} ".format(*four) + row["method"]
+            ratio, p = statistics.rate_ratio(*four), statistics.poisson_rates(*four)
+            yield Finding(row["name"], row["unit"], *rates, *ratio, True, p, how)
     yield from _latencies(sides)
 
 
@@ -304,11 +277,10 @@ def _accuracy(sides: Sides, paired: bool) -> Finding | None:
 
 def _two_shares(name: str, shares: list[float], sizes: list[int], method: str) -> Finding:
     right = [share * n for share, n in zip(shares, sizes)]
-    between = newcombe_difference(right[0], sizes[0], right[1], sizes[1])  # of the shares that are shown
-    p = fisher_exact(round(right[0]), sizes[0], round(right[1]), sizes[1])
-    return Finding(
-        name, "share", shares[0], shares[1], *between, False, p, f"{method}, Fisher exact; interval by Newcombe"
-    )
+    between = statistics.newcombe_difference(right[0], sizes[0], right[1], sizes[1])  # of the shares that are shown
+    p = statistics.fisher_exact(round(right[0]), sizes[0], round(right[1]), sizes[1])
+    how = f"{method}, Fisher exact; interval by Newcombe"
+    return Finding(name, "share", shares[0], shares[1], *between, False, p, how)
 
 
 def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Finding:
@@ -316,14 +288,13 @@ def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Findi
     one, two = (np.array([shares[number] for number in common]) for shares in (first, second))
     better, worse = int((one > two).sum()), int((one < two).sum())
     method = f"pairs of {len(common)} objects: {better} better in A, {worse} better in B, McNemar exact"
-    between, p = paired_difference(one, two), mcnemar_exact(better, worse)
+    between, p = statistics.paired_difference(one, two), statistics.mcnemar_exact(better, worse)
     return Finding("accuracy", "share", float(one.mean()), float(two.mean()), *between, False, p, method)
 
 
 def _abstained(sides: Sides) -> Iterator[Finding]:
-    abstained, decisions, trials = (
-        [int(n or 0) for n in _told(sides, key)] for key in ("abstained", "decisions", "trials")
-    )
+    names = "abstained", "decisions", "trials"
+    abstained, decisions, trials = ([int(n or 0) for n in _told(sides, name)] for name in names)
     if all(decisions) and any(abstained):
         sizes = [max(1, n // max(1, times)) for n, times in zip(decisions, trials)]
         shares = [some / n for some, n in zip(abstained, decisions)]
@@ -331,10 +302,8 @@ def _abstained(sides: Sides) -> Iterator[Finding]:
 
 
 def _clicks(sides: Sides) -> Finding:
-    unit, means = (
-        "clicks per decision",
-        [np.array([*one.values()]) for one in _of_objects(sides, lambda rows: rows["clicks"])],
-    )
+    unit, shares = "clicks per decision", _of_objects(sides, lambda rows: rows["clicks"])
+    means = [np.array([*one.values()]) for one in shares]
     if min(map(len, means), default=0) < 2:
         return _untested("clicks_mean", unit, _told(sides, "clicks_mean"))
     (one, two), apart = means, float(means[0].mean() - means[1].mean())
@@ -349,15 +318,13 @@ def _latencies(sides: Sides) -> Iterator[Finding]:
     for name, q in QUANTILES.items():
         if one is None or two is None:
             values = _told(sides, "latency_us", name.replace(".", ""))
-            if None not in values and min(map(float, values)) >= LEAST_US:
+            if None not in values and min(map(float, values)) >= statistics.LEAST_US:
                 yield _untested(f"latency_{name}", "us", values, "not tested: no single latencies", is_ratio=True)
-        elif (
-            min(len(one), len(two)) * (1 - q) >= LEAST_BEYOND
-            and min(np.quantile(one, q), np.quantile(two, q)) >= LEAST_US
-        ):
-            found = quantile_ratio(one, two, q)  # but in virtual time
+        elif min(len(one), len(two)) * (1 - q) >= LEAST_BEYOND:
+            found = statistics.quantile_ratio(one, two, q)
             method = "interval by a bootstrap of stretches of consecutive decisions"
-            yield Finding(f"latency_{name}", "us", found.first, found.second, *found.ratio, True, None, method)
+            if min(found.first, found.second) >= statistics.LEAST_US:  # not in virtual time
+                yield Finding(f"latency_{name}", "us", found.first, found.second, *found.ratio, True, None, method)
 
 
 # ---- in words ----
@@ -466,13 +433,10 @@ def _curves(side: Side) -> dict[str, Any]:
     """What is drawn of one side: accuracy over time, latency unless time was virtual."""
     if side.decisions is None or side.timings is None or not len(side.decisions):
         return {}
-    numbers, durations = (
-        Decisions(side.header["config"], len(side.decisions), first=int(side.decisions["index"][0])),
-        Durations(),
-    )
-    numbers.take(side.decisions)
+    rows, durations = side.decisions, Durations()
+    numbers = Decisions(side.header["config"], len(rows), first=int(rows["index"][0]))
+    numbers.take(rows)
     durations.take(side.timings)
     deadline_us = side.summary.get("deadline_us")
     latency = None if durations.is_virtual() else durations.chart(float(deadline_us) if deadline_us else None)
-    classes = max(int(side.decisions["truth"].max()) + 1, 2)
-    return {"accuracy": numbers.accuracy(), "classes": classes, "latency": latency}
+    return {"accuracy": numbers.accuracy(), "classes": max(int(rows["truth"].max()) + 1, 2), "latency": latency}

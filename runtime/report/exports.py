@@ -29,21 +29,11 @@ from pans.runtime.cli.finding import missing_extra
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import make_folder, write_file
-from pans.runtime.record import Recording
+from pans.runtime.record import Recording, tables
 from pans.runtime.record.exposures import ClickList
-from pans.runtime.record.tables import (
-    CLICKS,
-    DECISIONS,
-    TIMINGS,
-    Table,
-    click_table,
-    facts_of,
-    iter_decisions,
-    timing_table,
-)
 from pans.runtime.safe_text import csv_cell
 
-TABLES = {"decisions.csv": DECISIONS, "clicks.csv": CLICKS, "timings.csv": TIMINGS}
+TABLES = {"decisions.csv": tables.DECISIONS, "clicks.csv": tables.CLICKS, "timings.csv": tables.TIMINGS}
 FILES = (*TABLES, "columns.csv", "about.json")
 
 
@@ -52,20 +42,20 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList,
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file", remedy="name a folder: csv is several files")
     make_folder(folder)
-    tables = {
-        "decisions.csv": _csv(DECISIONS, iter_decisions(recording, plan)),
-        "clicks.csv": _csv(CLICKS, [click_table(recording, plan, clicks)]),
-        "timings.csv": _csv(TIMINGS, map(timing_table, recording.iter_timings())),
+    written = {
+        "decisions.csv": _csv(tables.DECISIONS, tables.iter_decisions(recording, plan)),
+        "clicks.csv": _csv(tables.CLICKS, [tables.click_table(recording, plan, clicks)]),
+        "timings.csv": _csv(tables.TIMINGS, map(tables.timing_table, recording.iter_timings())),
         "columns.csv": dictionary(),
     }
-    about = facts_of(recording) | {
+    about = tables.facts_of(recording) | {
         "exposure_us": plan.exposure_us,
         "exposures": clicks.exposures,
         "time_zero": "the begin of the first recorded exposure",
         "header": {key: value for key, value in recording.header.items() if key != "profile"},
         "events": list(recording.events()),
     }
-    texts = tables | {"about.json": json.dumps(about, indent=1, sort_keys=True) + "\n"}
+    texts = written | {"about.json": json.dumps(about, indent=1, sort_keys=True) + "\n"}
     for name, text in texts.items():
         write_file(folder / name, text.encode(), force=force)
     return [folder / name for name in texts]
@@ -81,7 +71,7 @@ def dictionary() -> str:
     return _text(("file", "column", "unit", "dtype", "meaning", "empty_means"), rows)
 
 
-def _csv(columns: Mapping[str, object], blocks: Iterable[Table]) -> str:
+def _csv(columns: Mapping[str, object], blocks: Iterable[tables.Table]) -> str:
     """A table with a head; masked values are None, which the writer leaves empty."""
     rows = (zip(*([csv_cell(value) for value in one.tolist()] for one in table.values())) for table in blocks)
     return _text(tuple(columns), chain.from_iterable(rows))

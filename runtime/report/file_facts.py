@@ -21,16 +21,7 @@ from pans.runtime.record import Recording
 from pans.runtime.record.parts import open_recording
 from pans.runtime.record.recording import together
 from pans.runtime.registration.file import load_registration
-from pans.runtime.wire.messages import (
-    FrameDecoder,
-    MalformedMessage,
-    MessageType,
-    Opcode,
-    decode_ack,
-    decode_command,
-    decode_welcome,
-    unpack_body,
-)
+from pans.runtime.wire import messages as wire
 
 from .verify import file_kind
 
@@ -166,8 +157,8 @@ def handshakes(recording: Recording) -> list[dict[str, Any]]:
     rows: dict[int, dict[str, Any]] = {}
     for _, body in recording.answers():
         try:
-            frame = unpack_body(body)
-        except MalformedMessage:
+            frame = wire.unpack_body(body)
+        except wire.MalformedMessage:
             continue  # verify.py's
         if frame.session not in rows and len(rows) == SESSIONS_MAX:
             continue
@@ -175,34 +166,34 @@ def handshakes(recording: Recording) -> list[dict[str, Any]]:
         row = rows.setdefault(frame.session, new)
         try:
             _take_answer(row, frame.type, frame.payload)
-        except MalformedMessage:
+        except wire.MalformedMessage:
             row["malformed"] += 1
     _name_refused(rows, recording)
     return list(rows.values())
 
 
 def _take_answer(row: dict[str, Any], kind: int, payload: bytes) -> None:
-    if kind == MessageType.WELCOME:
+    if kind == wire.MessageType.WELCOME:
         row["welcomes"] += 1
-        row["device"] = row["device"] or dict(decode_welcome(payload).facts)
-    elif kind == MessageType.ACK:
+        row["device"] = row["device"] or dict(wire.decode_welcome(payload).facts)
+    elif kind == wire.MessageType.ACK:
         row["acks"] += 1
-        ack, refused = decode_ack(payload), row["refused"]
+        ack, refused = wire.decode_ack(payload), row["refused"]
         known = {one["command_id"] for one in refused}
         if ack.refused_id and ack.refused_id not in known and len(refused) < REFUSED_MAX:
             refused.append({"command_id": ack.refused_id, "command": "", "status": ack.status, "text": ack.text})
-    elif kind == MessageType.PONG:
+    elif kind == wire.MessageType.PONG:
         row["pongs"] += 1
 
 
 def _name_refused(rows: dict[int, dict[str, Any]], recording: Recording) -> None:
     """Say which commands the refused ones were."""
     wanted = {(session, one["command_id"]): one for session, row in rows.items() for one in row["refused"]}
-    decoder = FrameDecoder()
+    decoder = wire.FrameDecoder()
     for _, data in recording.commands() if wanted else ():
         for frame in decoder.feed(data):
-            with suppress(MalformedMessage):
-                command = decode_command(frame.payload) if frame.type == MessageType.COMMAND else None
+            with suppress(wire.MalformedMessage):
+                command = wire.decode_command(frame.payload) if frame.type == wire.MessageType.COMMAND else None
                 if command is not None and (one := wanted.get((frame.session, command.command_id))) is not None:
-                    known = command.opcode in set(Opcode)
-                    one["command"] = Opcode(command.opcode).name if known else str(command.opcode)
+                    known = command.opcode in set(wire.Opcode)
+                    one["command"] = wire.Opcode(command.opcode).name if known else str(command.opcode)
