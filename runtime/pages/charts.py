@@ -114,11 +114,10 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Bars:
-    """Counts between `edges` (n + 1), from `base` up."""
+    """Counts between `edges` (n + 1); several stand one upon the other."""
 
     edges: ArrayLike
     heights: ArrayLike
-    base: ArrayLike | float = 0.0
     name: str = ""
     kind: str = "a"
 
@@ -162,10 +161,11 @@ def chart(
             axes.grid(axis="y")
             axes.set_axisbelow(True)
         named: list[tuple[Any, str]] = []
+        base: Any = 0.0
         for bar in bars:
             edges, ink = np.asarray(bar.edges, np.float64), _INKS[bar.kind]
-            drawn_bars = axes.bar(edges[:-1], bar.heights, np.diff(edges), bar.base, align="edge", color=ink)
-            named.append((drawn_bars, bar.name))
+            shape = axes.bar(edges[:-1], bar.heights, np.diff(edges), base, align="edge", color=ink)
+            named, base = [*named, (shape, bar.name)], base + np.asarray(bar.heights)
         named += [(_curve(axes, curve), curve.name) for curve in curves]
         for mark, dashes in zip(marks, cycle(((4, 3), (1.5, 2)))):
             line = axes.axvline if mark.upright else axes.axhline

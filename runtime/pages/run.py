@@ -112,11 +112,10 @@ class Decisions:
         rows = {name: over.sums[key] for key, name in names.items() if over.sums.get(key, np.zeros(1)).any()}
         edges = np.append(np.minimum.accumulate(self._seconds(over)[::-1])[::-1], 0.0)
         edges[-1] = 2 * edges[-2] - edges[-3] if len(edges) > 2 else edges[-2] + 1.0
-        base, bars = np.zeros(over.used), []
-        for (name, counts), kind in zip(sorted(rows.items(), key=lambda row: -float(row[1].sum())), "abcd"):
-            bars.append(Bars(edges, counts, base.copy(), f"{name} ({int(counts.sum())})", kind))
-            base += counts
-        return {"bars": bars, "edges": edges, "top": float(base.max()), "width": over.width} if bars else None
+        largest = sorted(rows.items(), key=lambda row: -float(row[1].sum()))
+        bars = [Bars(edges, n, f"{name} ({int(n.sum())})", kind) for (name, n), kind in zip(largest, "abcd")]
+        top = np.sum([bar.heights for bar in bars], axis=0).max() if bars else 0.0
+        return {"bars": bars, "edges": edges, "top": float(top), "width": over.width} if bars else None
 
     def _seconds(self, over: Stretches) -> F64:
         """The mean time of each stretch."""
@@ -150,7 +149,7 @@ class Events:
             self.kinds[kind] += 1
             if len(self.shown) < SHOWN and self.kinds[kind] <= OF_A_KIND and kind != "session":
                 self.shown.append(event)
-                if kind == "dark_state" and event.get("state") != "over":
+                if kind == "dark_state" and event.get("state") != "over" and "since_dark_exposure" in event:
                     self.dark.append(event)
             if kind == "blame":
                 self._take_blame(event)

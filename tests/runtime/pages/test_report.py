@@ -18,11 +18,12 @@ from pans.runtime.pages.charts import Axis, Curve, chart
 from pans.runtime.pages.index import accuracy_over
 from pans.runtime.pages.page import sentence_of
 from pans.runtime.pages.rates import BINS, TOLD_APART, Rates, Stretches
-from pans.runtime.pages.run import Decisions, Durations, survival
+from pans.runtime.pages.run import Decisions, Durations, advice_on, survival
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list, iter_exposures
 from pans.runtime.record.format import TIMING_DTYPE
 from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.wire.messages import DARK_PATTERN
 
 pytest.importorskip("matplotlib", reason="needs the plot extra")
 
@@ -128,6 +129,32 @@ def test_what_a_click_means_is_counted_by_true_class(demo: Path) -> None:
     assert dark[2:] == wilson_interval(*dark[:2])
 
 
+def test_a_rise_of_the_dark_counts_is_told_with_its_begin_and_its_own_rate(tmp_path: Path, pans: Pans) -> None:
+    words = [*fixed_run(150), "--dark-slots", "4", "--out", str(tmp_path / "run")]
+    words = [word.replace("seed=1", "seed=1&changes=dark:at_s=20:factor=3000") for word in words]
+    told = pans(*words, code=None)
+    recording = read_recording(tmp_path / "run" / "run.pansrec")
+    (event,) = (one for one in recording.events() if one["kind"] == "dark_state")
+    plan, config = recorded_plan(recording), recording.header["config"]
+    dark = np.concatenate([one.start_tick[one.pattern == DARK_PATTERN] for one in iter_exposures(recording, plan)])
+    begun, noticed = (
+        (dark[event[key]] - dark[0]) / config["tick_hz"] for key in ("since_dark_exposure", "dark_exposure")
+    )
+    assert 18 < begun < 22
+    shown = words_of(page_of(recording.path, tmp_path))
+    (found,) = re.findall(
+        r"began about ([\d.]+) s .*? noticed at ([\d.]+) s, with ([\d.]+) clicks per dark exposure", shown
+    )
+    assert [float(one) for one in found] == pytest.approx([begun, noticed, event["rate"]], rel=0.02)
+    assert event["rate"] > 2 * told["dark"]["clicks"] / told["dark"]["exposures"]  # of the whole run
+    assert f"{told['dark']['exposures']} dark exposures of the whole run" in shown
+
+
+def test_advice_fits_the_most_frequent_cause_of_late_decisions() -> None:
+    for cause, words in {"host": "--core", "disk": "another disk", "link": "cable"}.items():
+        assert words in advice_on(f"7 decisions later than 16 ms (cause: {cause} 6, not surely; decode 1)")
+
+
 def test_latencies_of_very_many_are_those_of_all() -> None:
     rows = np.zeros(30_000, TIMING_DTYPE)
     rows["decided_ns"] = np.random.default_rng(1).lognormal(11, 1, len(rows)).astype(np.int64)
@@ -202,6 +229,8 @@ def test_a_folder_of_runs_has_a_line_and_a_picture_each(demo: Path, tmp_path: Pa
     assert ("cut" in words, page.count('<td class="spark"><svg')) == (True, 3)
     assert 'href="run%20%3C2%3E/run.pansrec"' in page
     assert "accuracy of 2 runs" in page
+    low, high = wilson_interval(summary["accuracy"] * 200, 200)
+    assert f"{100 * low:.1f} to {100 * high:.1f} %" in words
     rows = read_recording(demo).decisions()
     right = accuracy_over([demo])
     assert np.average(right, weights=[len(p) for p in np.array_split(rows, len(right))]) == pytest.approx(

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,8 @@ import pytest
 from commands import fixed_run, json_of
 from mutated_sessions import Stage
 
-from pans.runtime.report.summary import Summary
-from pans.runtime.report.words import closing_words, write_markdown
+from pans.runtime.report.summary import Summary, late_words
+from pans.runtime.report.words import accuracy_interval, closing_words, write_markdown
 
 MEASURED = ("armed_after_s", "realtime", "page_faults", "recording", "report")  # of this machine and this run
 
@@ -92,3 +93,29 @@ def test_objects_that_come_again_are_no_trials(summary: Summary, tmp_path: Path)
     assert "200 objects, 441.7 decisions on each on average |" in (tmp_path / "s.md").read_text()
     unknown = replace(summary, tally=replace(tally, objects=0, trials=0))
     assert "1000 decisions (true classes unknown)" in closing_words(unknown, "r", "s")
+
+
+def test_late_decisions_say_how_sure_the_cause_is_and_where_they_began(summary: Summary, tmp_path: Path) -> None:
+    def late(cause: str, sure: bool, first: int) -> dict[str, Any]:
+        one = {"kind": "blame", "what": "late", "cause": cause, "sure": sure, "why": "it waited"}
+        return one | {"first_decision": first, "decisions": 2}
+
+    events = [late("host", False, 7), late("link", True, 40), late("host", False, 90), late("host", False, 900)]
+    result: Any = SimpleNamespace(events=events, late_cause={"link": 2, "host": 6})
+    assert late_words(result) == "cause: host 6, not surely; link 2; first at decision 7, 40, 90"
+    result.events[2]["sure"] = True
+    assert "host 6, not always surely; link 2" in late_words(result)
+    write_markdown(tmp_path / "s.md", replace(summary, blame=events), {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
+    assert "| 2 late from decision 7 on | host | no | it waited |" in (tmp_path / "s.md").read_text()
+
+
+def test_an_accuracy_has_an_interval_also_where_all_were_right() -> None:
+    facts = {"accuracy": 1.0, "objects": 3, "accuracy_stderr_objects": 0.0}
+    low, high = accuracy_interval(facts) or (0.0, 0.0)
+    assert (round(low, 4), high) == (0.4385, 1.0)  # Wilson 1927: n / (n + z^2)
+    # objects that are right every time or never tell no more however often they are shown, others do
+    sure = accuracy_interval({"accuracy": 0.8, "objects": 200, "accuracy_stderr_objects": 0.4 / 199**0.5})
+    broken = accuracy_interval({"accuracy": 0.8, "objects": 200, "accuracy_stderr_objects": 0.4 / 1000**0.5})
+    errors = [(high - low) / 2 / 1.96 for low, high in filter(None, (sure, broken))]
+    assert errors == pytest.approx([0.4 / 200**0.5, 0.4 / 1000**0.5], rel=0.01)
+    assert accuracy_interval({"accuracy": None, "objects": 0}) is None
