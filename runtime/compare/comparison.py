@@ -36,8 +36,7 @@ SUMMARY_MAX_BYTES = 1 << 24
 _ALWAYS_DIFFERENT = ("created_utc", "command", "format_version", "toml", "decisions_sha256", "tick", "part")
 _OUTPUTS = ("options.device", "options.out", "options.record", "options.force")
 _DERIVED = ("config.dark.guard.", "config.backend_choice.", *_OUTPUTS)
-_FIRST = ("bundle_sha256", "profile.", "device_url")  # what a reader asks for first
-F64 = NDArray[np.float64]
+_FIRST = ("profile.", "device_url")  # what a reader asks for first
 
 
 # ---- the sides ----
@@ -64,11 +63,6 @@ class Side:
         """The scene that a simulated instrument was given, or says that it shows; "" where none is named."""
         query = str(self.header.get("device_url", "")).partition("?")[2]
         return (parse_qs(query).get("scene") or [str(self.summary.get("device", {}).get("scene", ""))])[0]
-
-    @property
-    def latency_us(self) -> F64 | None:
-        """From the end of the exposure to the decision, in the order of time."""
-        return None if self.timings is None else (self.timings["decided_ns"] - self.timings["device_end_ns"]) / 1000.0
 
 
 Sides = tuple[Side, Side]
@@ -178,9 +172,9 @@ def compare(first: Side, second: Side, pairing: str = "auto") -> Comparison:
 
 
 def changes_of(first: Side, second: Side) -> list[Change]:
-    """Return the facts of headers and devices that differ: bundle, profile and device first, the others in the order of their names."""
+    """Return the facts of headers and devices that differ: profile and device first, hashes last, in the order of their names."""
     one, two = (_facts(side) for side in (first, second))
-    names = sorted({*one, *two}, key=lambda name: (not name.startswith(_FIRST), name))
+    names = sorted({*one, *two}, key=lambda name: ("sha256" in name, not name.startswith(_FIRST), name))
     return [Change(name, one.get(name, ""), two.get(name, "")) for name in names if one.get(name) != two.get(name)]
 
 
@@ -314,7 +308,8 @@ def _clicks(sides: Sides) -> Finding:
 
 
 def _latencies(sides: Sides) -> Iterator[Finding]:
-    one, two = (side.latency_us for side in sides)
+    rows = [side.timings for side in sides]
+    one, two = (None if t is None else (t["decided_ns"] - t["device_end_ns"]) / 1000.0 for t in rows)
     for name, q in QUANTILES.items():
         if one is None or two is None:
             values = _told(sides, "latency_us", name.replace(".", ""))
@@ -401,14 +396,10 @@ def comparison_words(comparison: Comparison) -> str:
         *("  {:<26}A {}, B {}; {}; {}".format(*_row(one)) for one in comparison.findings),
         *("", "What changed:" if comparison.changes else SAME),
     ]
-    for change in sorted(comparison.changes, key=_is_hash):
+    for change in comparison.changes:
         texts = (one_line(text or "-", 60) for text in (change.first, change.second))
         lines.append(f"  {one_line(change.name)}: {' -> '.join(texts)}")
     return "\n".join(lines)
-
-
-def _is_hash(change: Change) -> bool:
-    return "sha256" in change.name
 
 
 def comparison_page(comparison: Comparison) -> bytes:
@@ -423,7 +414,7 @@ def comparison_page(comparison: Comparison) -> bytes:
         rows=[_row(one) for one in comparison.findings],
         methods=[f"{_title(one)}: {one.method}." for one in comparison.findings],
         curves={name: _curves(side) for name, side in sides.items()},
-        changes=[(one.name, one.first or "-", one.second or "-") for one in sorted(comparison.changes, key=_is_hash)],
+        changes=[(one.name, one.first or "-", one.second or "-") for one in comparison.changes],
         same=SAME,
         cut=CUT,
     )

@@ -40,7 +40,7 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters |= {"number": number, "percent": percent, "seconds": seconds, "flat": flat, "points": points}
+    found.filters |= {"number": number, "percent": percent, "seconds": seconds, "flat": flat}
     drawing = (chart, Axis, Bars, Curve, Mark, number, percent, seconds, span, whole)
     found.globals |= {one.__name__: one for one in drawing}
     # our own text, with what stands between backticks as code
@@ -58,11 +58,6 @@ def flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]
                 yield f"{prefix}{name}", ", ".join(str(item) for item in value)
         elif value is not None and value != "":
             yield f"{prefix}{name}", f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def points(share: float | None) -> str:
-    """Return a share in percent with two digits behind the point."""
-    return "unknown" if share is None else f"{100 * share:.2f} %"
 
 
 def picture(values: NDArray[np.float64], low: float = 0.0, high: float | None = None) -> str:

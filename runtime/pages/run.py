@@ -114,8 +114,8 @@ class Decisions:
         edges[-1] = 2 * edges[-2] - edges[-3] if len(edges) > 2 else edges[-2] + 1.0
         largest = sorted(rows.items(), key=lambda row: -float(row[1].sum()))
         bars = [Bars(edges, n, f"{name} ({int(n.sum())})", kind) for (name, n), kind in zip(largest, "abcd")]
-        top = np.sum([bar.heights for bar in bars], axis=0).max() if bars else 0.0
-        return {"bars": bars, "edges": edges, "top": float(top), "width": over.width} if bars else None
+        top = float(np.sum([n for _, n in largest], axis=0).max()) if bars else 0.0
+        return {"bars": bars, "edges": edges, "top": top, "width": over.width} if bars else None
 
     def _seconds(self, over: Stretches) -> F64:
         """The mean time of each stretch."""
