@@ -21,7 +21,7 @@ from pans.runtime.container import parse_json_object, read_file
 from pans.runtime.errors import UsageError
 from pans.runtime.intervals import Z_95
 from pans.runtime.pages.page import flat, render, words
-from pans.runtime.pages.run import Decisions, Durations
+from pans.runtime.pages.run import Decisions, is_virtual, latency_facts, ledger_of
 from pans.runtime.record.parts import open_recording
 from pans.runtime.safe_text import one_line
 from pans.runtime.wire.messages import NO_OBJECT
@@ -424,10 +424,9 @@ def _curves(side: Side) -> dict[str, Any]:
     """What is drawn of one side: accuracy over time, latency unless time was virtual."""
     if side.decisions is None or side.timings is None or not len(side.decisions):
         return {}
-    rows, durations = side.decisions, Durations()
+    rows, ledger = side.decisions, ledger_of([side.timings])
     numbers = Decisions(side.header["config"], len(rows), first=int(rows["index"][0]))
     numbers.take(rows)
-    durations.take(side.timings)
     deadline_us = side.summary.get("deadline_us")
-    latency = None if durations.is_virtual() else durations.chart(float(deadline_us) if deadline_us else None)
+    latency = None if is_virtual(ledger) else latency_facts(ledger, float(deadline_us) if deadline_us else None)
     return {"accuracy": numbers.accuracy(), "classes": max(int(rows["truth"].max()) + 1, 2), "latency": latency}

@@ -24,7 +24,7 @@ from pans.runtime.record.parts import first_decision
 from pans.runtime.record.recording import together
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.words import rows_of, stage_rows
-from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
+from pans.runtime.timing.ledger import LatencyHistogram, TimingLedger, upper_edge
 
 from .bundle import first_states, optics
 from .charts import Bars, Curve
@@ -38,13 +38,9 @@ LEAST_US = 1.0  # of the axis of latencies
 NO_TIME_US = 0.05  # p99 of the host's own time
 CONFIDENCE_BINS = 10
 _NOT_WALKED = int(DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE)
-WHOLE, IN_HOST = "end of exposure to decision", "in the host, to the decision"
-_STAGES = {  # name of a stage -> where it begins and ends
-    WHOLE: ("device_end_ns", "decided_ns"),
-    "on the link": ("device_end_ns", "arrival_ns"),
-    IN_HOST: ("arrival_ns", "decided_ns"),
-    "to the recorder": ("decided_ns", "recorded_ns"),
-}
+NEVER_NS = 1 << 62
+_MARKS = ("device_end_ns", "arrival_ns", "arrival_ns", "decided_ns", "recorded_ns")  # of the ledger's stages
+_CURVES = {"link": "on the link", "decide": "in the host, to the decision", "record": "to the recorder"}
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Rows = NDArray[np.void]
@@ -174,35 +170,30 @@ class Events:
         return [(cause, self.late[cause], self.lost[cause], self.first_case[cause]) for cause, _ in both]
 
 
-class Durations:
-    """Histograms of the latencies of all decisions, whole and by stage; at most 3.2 % too long, their maximum exact."""
+# ---- latencies ----
 
-    def __init__(self) -> None:
-        self.stages = {name: LatencyHistogram() for name in _STAGES}
 
-    def take(self, rows: Rows) -> None:
-        """Take the next rows, TIMING_DTYPE (n,)."""
-        for name, (start, end) in _STAGES.items():
-            self.stages[name].add_many(rows[end].astype(np.int64) - rows[start].astype(np.int64))
+def ledger_of(blocks: Iterable[Rows]) -> TimingLedger:
+    """Return the latencies of recorded decisions, TIMING_DTYPE (n,) in each block; decoding is not recorded, and within `decide`."""
+    ledger = TimingLedger(NEVER_NS)
+    for rows in together(blocks):
+        marks = np.stack([rows[name].astype(np.int64) for name in _MARKS], axis=1)
+        ledger.judge(marks, np.zeros(len(rows), np.int64), np.ones(len(rows), np.int64))
+    return ledger
 
-    def is_virtual(self) -> bool:
-        """Whether the host took no time at all, as in virtual time: then latencies say nothing."""
-        return self.stages[IN_HOST].summary()["p99"] < NO_TIME_US
 
-    def rows(self, summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
-        """Return name and quantiles of the whole and of each stage, as the run summed them up where it did."""
-        if "stage_latency_us" in summary:
-            return stage_rows(summary)
-        found = {name: one.summary() for name, one in self.stages.items()}
-        told = {"latency_us": found.pop(WHOLE), "stage_latency_us": found}
-        return stage_rows({**told, "clock": {"worst_uncertainty_us": 0.0}})
+def is_virtual(ledger: TimingLedger) -> bool:
+    """Return whether the host took no time at all, as in virtual time: then latencies say nothing."""
+    return ledger.stages["decide"].summary()["p99"] < NO_TIME_US
 
-    def chart(self, deadline_us: float | None) -> dict[str, Any]:
-        """Return the shares of decisions above each time, in microseconds, with the deadline, and where the axes end."""
-        curves = [Curve(*survival(one), name, kind) for (name, one), kind in zip(self.stages.items(), "abcd")]
-        top = max([one.max_ns / 1000 for one in self.stages.values()] + [deadline_us or 0.0, 10.0]) * 1.3
-        least = 0.7 / self.stages[IN_HOST].total
-        return {"curves": curves, "deadline_us": deadline_us, "left": LEAST_US, "right": top, "least": least}
+
+def latency_facts(ledger: TimingLedger, deadline_us: float | None) -> dict[str, Any]:
+    """Return the shares of decisions above each time, in microseconds, with the deadline, and where the axes end."""
+    shown = {"end of exposure to decision": ledger.total, **{name: ledger.stages[name] for name in _CURVES}}
+    curves = [Curve(*survival(one), _CURVES.get(name, name), kind) for (name, one), kind in zip(shown.items(), "abcd")]
+    top = max([one.max_ns / 1000 for one in shown.values()] + [deadline_us or 0.0, 10.0]) * 1.3
+    least = 0.7 / max(ledger.total.total, 1)
+    return {"curves": curves, "deadline_us": deadline_us, "left": LEAST_US, "right": top, "least": least}
 
 
 def survival(histogram: LatencyHistogram) -> tuple[F64, F64]:
@@ -267,18 +258,18 @@ def run_page(recording: Recording) -> bytes:
     plan, summary, config = recorded_plan(recording), recording.summary, recording.header["config"]
     classes = () if bundle is None else bundle.classes
     decisions = Decisions(config, recording.n_decisions, classes, first_decision(recording))
-    events, durations, rates = Events(decisions), Durations(), Rates(plan, len(classes))
+    events, rates, ledger = Events(decisions), Rates(plan, len(classes)), ledger_of(recording.iter_timings())
     walks = Walks(plan.automaton) if plan.automaton is not None else None
     for rows in together(recording.iter_decisions()):
         decisions.take(rows)
         if walks is not None:
             walks.take(rows)
-    for rows in together(recording.iter_timings()):
-        durations.take(rows)
     events.take(recording.events())
     for item in iter_exposures(recording, plan):
         rates.take(item)
-    budget_us, timed = summary.get("deadline_us") or config.get("deadline_us"), not durations.is_virtual()
+    stages = {name: ledger.stages[name].summary() for name in _CURVES}
+    told = {"latency_us": ledger.total.summary(), "stage_latency_us": stages, "clock": {"worst_uncertainty_us": 0.0}}
+    budget_us, timed = summary.get("deadline_us") or config.get("deadline_us"), not is_virtual(ledger)
     passing = _passing(recording, bundle, decisions)
     confusion = passing["confusion"] if passing else decisions.confusion
     return render(
@@ -299,8 +290,8 @@ def run_page(recording: Recording) -> bytes:
         walked=rows_of(summary, "walks"),
         rates=rates,
         states=[rates.begin_of(event) for event in events.dark],
-        latency=durations.rows(summary) if timed else [],
-        curve=durations.chart(float(budget_us) if budget_us else None) if timed else None,
+        latency=stage_rows({**told, **summary}) if timed else [],
+        curve=latency_facts(ledger, float(budget_us) if budget_us else None) if timed else None,
         causes=events.causes(),
         late=decisions.stacked({f"late {cause}": cause for cause in events.late}),
         noted=events.kinds,

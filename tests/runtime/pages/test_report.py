@@ -18,7 +18,7 @@ from pans.runtime.pages.charts import Axis, Curve, chart
 from pans.runtime.pages.index import accuracy_over
 from pans.runtime.pages.page import sentence_of
 from pans.runtime.pages.rates import BINS, TOLD_APART, Rates, Stretches
-from pans.runtime.pages.run import Decisions, Durations, advice_on, survival
+from pans.runtime.pages.run import Decisions, advice_on, is_virtual, ledger_of, survival
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list, iter_exposures
 from pans.runtime.record.format import TIMING_DTYPE
@@ -158,18 +158,14 @@ def test_advice_fits_the_most_frequent_cause_of_late_decisions() -> None:
 def test_latencies_of_very_many_are_those_of_all() -> None:
     rows = np.zeros(30_000, TIMING_DTYPE)
     rows["decided_ns"] = np.random.default_rng(1).lognormal(11, 1, len(rows)).astype(np.int64)
-    found = Durations()
-    for part in np.split(rows, 30):
-        found.take(part)
+    found = ledger_of(np.split(rows, 30))
     us = np.sort(rows["decided_ns"]) / 1000
-    times, share = survival(found.stages["end of exposure to decision"])
+    times, share = survival(found.total)
     assert times[-1] == us[-1]
-    name, median, *_ = found.rows({})[0]
-    assert name == "exposure end to decision"
-    assert float(median) == pytest.approx(np.quantile(us, 0.5), rel=0.033)
+    assert found.total.summary()["p50"] == pytest.approx(np.quantile(us, 0.5), rel=0.033)
     wanted = [(us >= time / 1.033).mean() for time in times]
     assert (share <= np.array(wanted) + 1e-12).all()
-    assert not found.is_virtual()
+    assert not is_virtual(found)
 
 
 def test_events_become_sentences_and_foreign_ones_stay_whole() -> None:
