@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime import SHIPPED
+from pans.runtime.cli.finding import needed
 from pans.runtime.outputs import whole_file
-from pans.runtime.pages.charts import needed
 
 Row = dict[str, Any]
 REPEATS = 7

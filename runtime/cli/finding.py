@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from pans.runtime import __version__
 from pans.runtime.errors import UsageError
@@ -50,6 +52,14 @@ def missing_extra(what: str, package: str, extra: str) -> UsageError:
     """Return the error for a package that `what` needs and that is not installed."""
     remedy = f"pip install 'pans-runtime[{extra}]'"
     return UsageError(f"{what} needs the package {package}, which is not installed", remedy=remedy)
+
+
+def needed(module: str, what: str = "a page", extra: str = "plot") -> Any:
+    """Return the `module` of an extra; UsageError that says `what` needs it where it is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise missing_extra(what, module.partition(".")[0], extra) from error
 
 
 def overview(commands: Mapping[str, EntryPoint]) -> str:

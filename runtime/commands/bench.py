@@ -36,7 +36,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from pans.runtime.bench.rows import BenchOptions, machine_facts, table_text, write_plot
-    from pans.runtime.pages.charts import needed
+    from pans.runtime.cli.finding import needed
 
     for option, name in USES.items():
         if getattr(args, option) and args.what not in (name, "all"):

@@ -6,7 +6,6 @@ style, so that they follow light, dark and print.
 
 from __future__ import annotations
 
-import importlib
 import io
 import re
 import warnings
@@ -14,13 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import cycle
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.cli.finding import missing_extra
+from pans.runtime.cli.finding import needed
 from pans.runtime.safe_text import html, one_line
 
 WIDTH, HEIGHT = 440, 240  # pixels
@@ -34,14 +32,6 @@ _STYLE = {
     **{"xtick.color": _INKS["soft"], "ytick.color": _INKS["soft"], "axes.titlesize": 13, "axes.titlecolor": _INKS["soft"]},
     **{"xtick.labelsize": 12, "ytick.labelsize": 12, "grid.color": _INKS["line"], "grid.linewidth": 0.8, "legend.fontsize": 12},
 }  # fmt: skip
-
-
-def needed(name: str, what: str = "a page") -> ModuleType:
-    """Return the module `name` of the extra `plot`; UsageError that says what needs it where it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise missing_extra(what, name.partition(".")[0], "plot") from error
 
 
 def need_extra() -> None:

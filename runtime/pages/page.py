@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime import safe_text
+from pans.runtime.cli.finding import needed
 from pans.runtime.images import grey_png
 
-from .charts import Axis, Bars, Curve, Mark, chart, needed, number, percent, seconds, span, whole
+from .charts import Axis, Bars, Curve, Mark, chart, number, percent, seconds, span, whole
 
 SIDE_MAX = 96  # pixels of a small picture
 

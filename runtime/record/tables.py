@@ -6,7 +6,6 @@ beginning is known to about two seconds.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.cli.finding import missing_extra
+from pans.runtime.cli.finding import needed
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import DamagedFileError, UsageError
@@ -155,7 +154,7 @@ def click_table(recording: Recording, plan: Plan, clicks: ClickList) -> Table:
 
 def frame_of(recording: Recording, table: str) -> Any:
     """Return a table as a pandas.DataFrame (`Recording.to_frame`)."""
-    pandas = _needed("pandas", "to_frame")
+    pandas = needed("pandas", "to_frame", "frames")
     columns, data, times = _timed(recording, table)
     found = {}
     for name, values in data.items():
@@ -173,7 +172,7 @@ def frame_of(recording: Recording, table: str) -> Any:
 
 def dataset_of(recording: Recording, table: str) -> Any:
     """Return a table as an xarray.Dataset (`Recording.to_xarray`)."""
-    xarray = _needed("xarray", "to_xarray")
+    xarray = needed("xarray", "to_xarray", "frames")
     columns, data, times = _timed(recording, table)
     found = {}
     for name, values in data.items():
@@ -185,13 +184,6 @@ def dataset_of(recording: Recording, table: str) -> Any:
         found[name] = ("time", filled, {key: value for key, value in said.items() if value})
     about = {key: int(value) if isinstance(value, bool) else value or "" for key, value in facts_of(recording).items()}
     return xarray.Dataset(found, {"time": ("time", times, {"long_name": "UTC"})}, about)
-
-
-def _needed(package: str, what: str) -> Any:
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise missing_extra(what, package, "frames") from error
 
 
 def _timed(recording: Recording, table: str) -> tuple[Mapping[str, Column], Table, NDArray[np.datetime64]]:

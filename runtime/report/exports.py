@@ -10,7 +10,6 @@ users.
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 import json
 import time
@@ -25,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from pans.runtime import __version__
-from pans.runtime.cli.finding import missing_extra
+from pans.runtime.cli.finding import needed
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import make_folder, write_file
@@ -88,10 +87,7 @@ def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: Clic
 
     UsageError without h5py, when the device's clock went back, and if `path` exists, unless `force`.
     """
-    try:
-        h5py: Any = importlib.import_module("h5py")
-    except ModuleNotFoundError as error:
-        raise missing_extra("Photon-HDF5", "h5py", "export") from error
+    h5py = needed("h5py", "Photon-HDF5", "export")
     if (np.diff(clicks.start_tick) < 0).any():
         raise UsageError(
             f"{recording.path}: the device's clock went back (it was switched off in between): the format has one clock",
