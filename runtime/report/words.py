@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown, one_line
+from pans.runtime.timing.ledger import STAGES
 from pans.runtime.timing.realtime import fault_words
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def _further(facts: Facts) -> dict[str, Any]:
     if "verdict" in facts:
         granted = ", ".join(f"{what}: {answer}" for what, answer in facts.get("realtime", {}).items())
         found["text"] |= {
-            "objects": objects_words(facts),
+            "objects": "of objects that passed alone" if "passages" in facts else objects_words(facts),
             "latency": latency_words(facts),
             "exposures": exposure_words(facts.get("exposure_timing", {})),
             "realtime": granted or "virtual time: nothing asked for",
@@ -212,7 +213,8 @@ def _table(heading: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> 
 def stage_rows(facts: Facts) -> list[tuple[str, ...]]:
     """Return the quantiles of the whole latency and by stage, microseconds; the host's own stages are of its clock alone."""
     uncertainty_us, rows = facts["clock"]["worst_uncertainty_us"], []
-    for name, row in {"exposure end to decision": facts["latency_us"], **facts["stage_latency_us"]}.items():
+    stages = {name: facts["stage_latency_us"][name] for name in STAGES if name in facts["stage_latency_us"]}
+    for name, row in {"exposure end to decision": facts["latency_us"], **stages}.items():
         doubt_us = uncertainty_us if name in ("exposure end to decision", "link") else 0.0
         cells = (row[key] for key in QUANTILES.values())
         rows.append((name, *("not resolved" if is_unresolved(us, doubt_us) else f"{us:.0f}" for us in cells)))
