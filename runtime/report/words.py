@@ -74,8 +74,9 @@ def _said(text: str, facts: Facts) -> str:
 def _further(facts: Facts) -> dict[str, Any]:
     """What the words need besides the facts of a summary; a list of one is None where its fact is."""
     dark, stream = (facts.get(name) or {} for name in ("dark", "stream"))
-    known = {"spread": "accuracy_std_trials", "off": "expected_off_stderr", "asked": "confidence"}
-    found: dict[str, Any] = {name: [facts[key]] if facts.get(key) else None for name, key in known.items()}
+    known = {"spread": facts.get("accuracy_std_trials"), "off": facts.get("expected_off_stderr")}
+    known["asked"] = facts.get("confidence") or None
+    found: dict[str, Any] = {name: None if one is None else [one] for name, one in known.items()}
     found |= {"ends": accuracy_interval(facts), "light": facts.get("illumination_mean", facts.get("illumination"))}
     found["share"] = {name: _share(facts, name) for name in _SHARES if f"{name}_ci" in facts}
     found["text"] = {"aborted": ", ".join(f"{name} {n}" for name, n in facts.get("aborted", {}).items()) or "none"}

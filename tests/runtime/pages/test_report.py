@@ -197,16 +197,16 @@ def test_a_chart_follows_the_page_s_colours_and_says_what_it_shows() -> None:
     assert "var(--soft)" in drawn
 
 
-@pytest.mark.parametrize("dark", [False, True])
-def test_pages_in_a_browser(demo: Path, tmp_path: Path, dark: bool) -> None:
+def test_pages_in_a_browser(demo: Path, tmp_path: Path) -> None:
     page_of(demo, tmp_path)
-    assert main(["report", str(demo.parents[1]), "-o", str(tmp_path / "runs.html")]) == 0
+    for what, name in ((demo.parents[1], "runs"), ("fashion-adaptive", "bundle")):
+        assert main(["report", str(what), "-o", str(tmp_path / f"{name}.html")]) == 0
     with browser(tmp_path) as driver:
-        for name in ("page.html", "runs.html"):
-            driver.get((tmp_path / name).as_uri())
-            for width in (1400, 390):
+        for name in ("page", "runs", "bundle"):
+            driver.get((tmp_path / f"{name}.html").as_uri())
+            for width, dark in ((1400, False), (390, True)):
                 look(driver, width, dark=dark)
-                picture(driver, tmp_path / f"page-{width}.png")
+                picture(driver, tmp_path / f"{name}-{width}.png")
                 assert clipped(driver) == []
                 assert serious(driver) == []
                 assert unreachable(driver) == []
