@@ -148,21 +148,16 @@ class Events:
                 if kind == "dark_state" and event.get("state") != "over" and "since_dark_exposure" in event:
                     self.dark.append(event)
             if kind == "blame":
-                self._take_blame(event)
+                cause = str(event.get("cause", "?"))
+                self.first_case.setdefault(cause, sentence_of(event))
+                if event.get("what") == "late":
+                    n = int(event.get("decisions", 1))
+                    self.late[cause] += n
+                    self._decisions.add(f"late {cause}", [int(event.get("first_decision", -1))], [n])
+                else:
+                    self.lost[cause] += int(event.get("exposures", 1))
             elif kind in ("gate_refused", "gate_expired") and "decision" in event:
                 self._decisions.add(kind, [int(event["decision"])])
-
-    def _take_blame(self, event: Mapping[str, Any]) -> None:
-        cause, late = str(event.get("cause", "?")), event.get("what") == "late"
-        where = f"decision {event.get('first_decision')}" if late else f"exposure {event.get('first_exposure')}"
-        doubt = "" if event.get("sure", True) else ", not surely"
-        self.first_case.setdefault(cause, f"from {where} on{doubt}: {event.get('why', '')}")
-        if late:
-            n = int(event.get("decisions", 1))
-            self.late[cause] += n
-            self._decisions.add(f"late {cause}", [int(event.get("first_decision", -1))], [n])
-        else:
-            self.lost[cause] += int(event.get("exposures", 1))
 
     def causes(self) -> list[tuple[str, int, int, str]]:
         """Return cause, late decisions, lost exposures and the first case of each, the most frequent first."""

@@ -176,17 +176,8 @@ def write_markdown(
     """Write the summary as Markdown; UsageError if it exists, unless `force`. `run`: name -> text about what was run."""
     facts = summary.as_json()
     simulated = "\n> **SIMULATED**: the clicks come from a simulated instrument, not from light.\n" * facts["simulated"]
-    late, missing = (
-        "{decisions} late from decision {first_decision} on",
-        "{exposures} missing from exposure {first_exposure} on",
-    )
     causes = [
-        (
-            (late if one["what"] == "late" else missing).format_map(one),
-            one["cause"],
-            "yes" if one["sure"] else "no",
-            one["why"],
-        )
+        (rows_of(one, "causes")[0][1], one["cause"], "yes" if one["sure"] else "no", one["why"])
         for one in facts["blame"]
     ]
     lines = [

@@ -44,29 +44,23 @@ def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> Non
         events = Events(decisions)
         for block in (part[:50], part[50:]):
             decisions.take(block)
+        late = {"kind": "blame", "what": "late"}
         events.take(
             [
                 {"kind": "gate_refused", "decision": int(mine[0]), "text": "late"},
                 {"kind": "gate_refused", "command_id": 3},  # of no decision
                 {"kind": "gate_expired", "decision": int(mine[2])},
-                {"kind": "blame", "what": "late", "cause": "link", "decisions": 2, "first_decision": first, "why": "w"},
-                {
-                    "kind": "blame",
-                    "what": "late",
-                    "cause": "host",
-                    "decisions": 3,
-                    "first_decision": first + 9,
-                    "sure": False,
-                },
+                late | {"cause": "link", "decisions": 2, "first_decision": first, "why": "w"},
+                late | {"cause": "host", "decisions": 3, "first_decision": first + 9, "sure": False, "why": "v"},
                 {"kind": "blame", "what": "missing", "cause": "link", "exposures": 7},
                 {"kind": "gate_expired", "decision": 1 << 62},  # that there is not
             ]
         )
         assert decisions.pulses() == {"asked": len(mine), "done": len(mine) - 2, "refused": 1, "expired": 1}
-        assert events.causes() == [
-            ("link", 2, 7, f"from decision {first} on: w"),
-            ("host", 3, 0, f"from decision {first + 9} on, not surely: "),
-        ]
+        link, host = events.causes()
+        assert (link[:3], host[:3]) == (("link", 2, 7), ("host", 3, 0))
+        assert f"Late from decision {first} on (2 decisions): the cause is link: w" in link[3]
+        assert f"Late from decision {first + 9} on (3 decisions): the cause is host, not surely: v" in host[3]
         over, place = decisions.over, first - int(part["index"][0])
         assert over.sums["late link"].tolist() == np.bincount([place // over.width], [2], BINS).tolist()
         assert over.sums["late host"].tolist() == np.bincount([(place + 9) // over.width], [3], BINS).tolist()
