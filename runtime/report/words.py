@@ -79,12 +79,14 @@ def _further(facts: Facts) -> dict[str, Any]:
     found: dict[str, Any] = {name: None if one is None else [one] for name, one in known.items()}
     found |= {"ends": accuracy_interval(facts), "light": facts.get("illumination_mean", facts.get("illumination"))}
     found["share"] = {name: _share(facts, name) for name in _SHARES if f"{name}_ci" in facts}
-    found["text"] = {"aborted": ", ".join(f"{name} {n}" for name, n in facts.get("aborted", {}).items()) or "none"}
+    found["text"] = {}
+    if "passages" in facts:
+        found["text"]["aborted"] = ", ".join(f"{name} {n}" for name, n in facts["aborted"].items()) or "none"
     if "verdict" in facts:
         granted = ", ".join(f"{what}: {answer}" for what, answer in facts.get("realtime", {}).items())
         found["text"] |= {
             "objects": "of objects that passed alone" if "passages" in facts else objects_words(facts),
-            "latency": latency_words(facts),
+            "latency": "not measured in virtual time" if _is_virtual(facts) else latency_words(facts),
             "exposures": exposure_words(facts.get("exposure_timing", {})),
             "realtime": granted or "virtual time: nothing asked for",
             "page_faults": fault_words(facts.get("page_faults", {})),
@@ -99,6 +101,10 @@ def _further(facts: Facts) -> dict[str, Any]:
         ]
         found |= {"repeats": stream["repeated"], "differing": f" ({', '.join(unlike)})" if unlike else ""}
     return found
+
+
+def _is_virtual(facts: Facts) -> bool:
+    return bool(facts["device"].get("virtual_time"))
 
 
 def objects_words(facts: Facts) -> str:
@@ -186,7 +192,7 @@ def write_markdown(
         f"**{facts['verdict']}**",
         *(f"- {markdown(fault)}" for fault in facts["faults"]),
         *_table("Results", ("figure", "value", ""), rows_of(facts, "figures", "flow", "walks")),
-        *_table("Timing", ("microseconds", *QUANTILES), stage_rows(facts)),
+        *_table("Timing", ("microseconds", *QUANTILES), [] if _is_virtual(facts) else stage_rows(facts)),
         *(f"- {name}: {markdown('; '.join(filter(None, texts)))}" for name, *texts in rows_of(facts, "timing")),
         *(_table("Late and missing work", ("what", "cause", "sure", "why"), causes) if causes else ()),
     ]
@@ -199,7 +205,8 @@ def write_markdown(
 
 def _table(heading: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     lines = [f"| {' | '.join(map(markdown, row))} |" for row in (head, *rows)]
-    return ["", f"## {heading}", "", lines[0], "|" + " --- |" * len(head), *lines[1:], ""]
+    table = [lines[0], "|" + " --- |" * len(head), *lines[1:], ""] if lines[1:] else []
+    return ["", f"## {heading}", "", *table]
 
 
 def stage_rows(facts: Facts) -> list[tuple[str, ...]]:

@@ -55,7 +55,7 @@ def test_cells_are_decided_once_gated_on_time_and_replayed(flow_folder: Path, pa
     assert summary["flow"]["gate_classes"] == ["b", "c"]
     page = Path(summary["report"]).read_text()
     assert "SIMULATED" in page
-    assert "yield (targets pulsed)" in page
+    assert f"; yield {summary['yield']:.3%} (" in page
     recording = read_recording(Path(summary["recording"]))
     assert recording.n_decisions == counts["decisions"]
     replayed = pans("replay", summary["recording"])

@@ -235,7 +235,7 @@ def test_clicks_are_exported_by_channel_and_reported(runs: Path, tmp_path: Path,
     assert [int(row["channel"]) for row in rows] == clicks.channel.tolist()
     assert {row["photons"] for row in rows} == {""}  # clicks, not photon numbers
     assert main(["report", str(path), "--out", str(tmp_path / "page.html")]) == 0
-    assert "shows 3 patterns at once" in (tmp_path / "page.html").read_text()
+    assert "patterns, side by side" in (tmp_path / "page.html").read_text()
     facts = pans("info", runs / "walk.pans")
     assert (facts["automaton"]["channels"], facts["automaton"]["outcomes"]) == (CHANNELS, 1 << CHANNELS)
 
