@@ -315,19 +315,15 @@ class _Run:
                         limits=part_limits(options),
                     )
                 )
-            result = self._watched(options, link, recorder)
-            summary = self._summary(options, result)
-            if recorder is not None and (kept := recorder.keep_deleted()) is not None:
-                options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
-                fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
-                warn(fault)
-                summary = replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
+            options, result, summary = self._watched(options, link, recorder)
             if recorder is not None:
                 summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
         return self._conclude(options, result, summary)
 
-    def _watched(self, options: RunOptions, link: Link, recorder: Recorder | None) -> RunResult:
-        """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
+    def _watched(
+        self, options: RunOptions, link: Link, recorder: Recorder | None
+    ) -> tuple[RunOptions, RunResult, Summary]:
+        """Run, with all observers: the dark counts' guard, the live view, metrics and the state file, which get the verdict."""
         from pans.runtime.link.fit import scene_words
         from pans.runtime.live import Observers, Recovery
         from pans.runtime.live.loop import running
@@ -379,14 +375,17 @@ class _Run:
             what = self.dark.profile, self.bundle, self.plan, self.core, self.options
             result = around.ending.enter_context(running(link, *what, recorder, recovery, observers))
             monitor.close_notes()
-            return result
+            options, summary = self._summary(options, result, recorder)
+            seen.conclude(summary.verdict, summary.faults)
+        return options, result, summary
 
-    def _summary(self, options: RunOptions, result: RunResult) -> Summary:
+    def _summary(self, options: RunOptions, result: RunResult, recorder: Recorder | None) -> tuple[RunOptions, Summary]:
+        """Return the summary; and the options with what is left of a recording that was deleted during the run."""
         from pans.runtime.report.summary import summarise, walk_figures
 
         walks = walk_figures(result, self.plan, self.bundle, self.profile.name, options.confidence)
         shown = None if walks is None else walks.illumination_mean
-        return summarise(
+        summary = summarise(
             result,
             illumination=self.bundle.illumination() * self.frames if shown is None else shown,
             expected_decisions=self.expected_decisions,
@@ -395,6 +394,12 @@ class _Run:
             walks=walks,
             registration=None if self.registration is None else self.registration.facts(),
         )
+        if recorder is None or (kept := recorder.keep_deleted()) is None:
+            return options, summary
+        fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
+        warn(fault)
+        options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
+        return options, replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
 
     def _conclude(self, options: RunOptions, result: RunResult, summary: Summary) -> Outcome:
         """Write the page and return what came of the run."""

@@ -5,7 +5,6 @@ A run that is refused leaves nothing behind.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shutil
@@ -27,14 +26,13 @@ from pans.runtime.live.run_options import RunOptions
 from pans.runtime.outputs import check_outputs, locked, make_folder, new_run_folder, refuse_existing
 from pans.runtime.record.parts import files_of_parts
 from pans.runtime.record.recorder import PartLimits
+from pans.runtime.watch.state_file import read_state
 
 if TYPE_CHECKING:
     from pans.runtime.core.plan import Plan
     from pans.runtime.decide.verdict import Decider
     from pans.runtime.report.summary import Summary
 
-STATE_FORMAT = "pans-state 1"
-STATE_MAX_BYTES = 1 << 16
 # options that name a file to read
 NAME_FILES = ("bundle", "profile", "flow", "act_profile", "calibration", "registration")
 
@@ -51,13 +49,13 @@ def check_run_files(options: RunOptions) -> None:
     if options.out_root is not None:
         outputs.append(options.out_root / ".new" / "run")
     state, force = options.state, options.force
-    if state is not None:
-        check_outputs([state], inputs=inputs, force=force, ours=is_state_file)  # its folder must be there
-        outputs.append(state)
 
     def is_ours(path: Path) -> bool:
-        return path == state and is_state_file(path)
+        return path == state and read_state(path) is not None
 
+    if state is not None:
+        check_outputs([state], inputs=inputs, force=force, ours=is_ours)  # its folder must be there
+        outputs.append(state)
     check_outputs(outputs, inputs=inputs, force=force, ours=is_ours, makes_folders=True)
     _check_disk(options)
 
@@ -124,17 +122,6 @@ def _recorded_files(options: RunOptions) -> set[Path]:
     if options.recording is None:
         return set()
     return {path for path in (options.recording, *files_of_parts(options.recording)) if os.path.lexists(path)}
-
-
-def is_state_file(path: Path) -> bool:
-    """Return whether `path` is a state file of a run, which the next one may replace."""
-    try:
-        if path.stat().st_size > STATE_MAX_BYTES:
-            return False
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(found, dict) and found.get("format") == STATE_FORMAT
 
 
 def files_of_url(device: str) -> list[str]:

@@ -108,8 +108,8 @@ class ChannelHealth:
 
     @property
     def present(self) -> list[Finding]:
-        """The states that last, the oldest first."""
-        return [state.finding for state in self._states.values()]
+        """The states that last, the oldest first; any thread may ask."""
+        return [state.finding for state in list(self._states.values())]
 
     def rates(self) -> F64:
         """Present click probability of a dark exposure, float64 (n,): expected, or estimated since a state began."""

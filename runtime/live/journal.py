@@ -32,7 +32,7 @@ class Journal:
         self.events: list[dict[str, Any]] = []
         self.trouble: dict[str, Any] | None = None  # the latest
         self.recorder = recorder
-        self._kept: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # of all notes, by kind
 
     def take(self, event: CoreEvent) -> None:
         """Note what a core or a verdict tells."""
@@ -45,8 +45,8 @@ class Journal:
         if troubles:
             self.trouble = event
         log_event(kind, facts, logging.WARNING if troubles else logging.INFO)
-        if len(self.events) < MAX_EVENTS and self._kept[kind] < MAX_OF_A_KIND:
-            self._kept[kind] += 1
+        self.counts[kind] += 1
+        if len(self.events) < MAX_EVENTS and self.counts[kind] <= MAX_OF_A_KIND:
             self.events.append(event)
         if self.recorder is not None:
             self.recorder.add_event(event)

@@ -47,7 +47,7 @@ NOT_THE_SERVICES = ("INVOCATION_ID", "JOURNAL_STREAM", "MAINPID")
 WATCHDOG = Range(16, 3600)  # a run that looks for its lost device may be silent for 15 s
 START = Range(1, 86400)
 ANALYZE_S = 60
-MONITORING = ("prometheus-alerts.yml", "grafana-dashboard.json")
+MONITORING = ("prometheus.yml", "prometheus-alerts.yml", "grafana-dashboard.json")
 OF_ACTION = {  # options that have an effect with each action, beside --name, --user and --unit-dir
     "install": {"config", "folder", "run_as", "watchdog_s", "force"},
     "show": {"config", "folder", "run_as", "watchdog_s"},

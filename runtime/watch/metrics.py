@@ -48,9 +48,10 @@ FIGURES = {
     "host_clock_synchronised": ("pans_host_clock_synchronised", False, "Whether the computer's clock is synchronised"),
     "parts": ("pans_recording_parts", True, "Parts of the recording that were begun"),
 }
-CAUSES = {
-    "late_cause": ("pans_late_decisions_by_cause", "Late decisions by who is to blame"),
-    "lost_cause": ("pans_lost_exposures_by_cause", "Lost exposures by who is to blame"),
+LABELLED = {  # picture key -> (metric, counts up, label, help)
+    "late_cause": ("pans_late_decisions_by_cause", True, "cause", "Late decisions by who is to blame"),
+    "lost_cause": ("pans_lost_exposures_by_cause", True, "cause", "Lost exposures by who is to blame"),
+    "alarms": ("pans_alarm", False, "kind", "1 while the detector in the dark, or the light, is not as it should be"),
 }
 
 
@@ -104,14 +105,16 @@ class Collector:
             if key in picture:
                 value = picture[key] * (1e-6 if key.endswith("_us") else 1)
                 yield (CounterMetricFamily if counts else GaugeMetricFamily)(name, words, value=value)
-        for key, (name, words) in CAUSES.items():
-            family = CounterMetricFamily(name, words, labels=["cause"])
-            for cause, count in picture.get(key, {}).items():
-                family.add_metric([cause], count)
+        for key, (name, counts, label, words) in LABELLED.items():
+            family = (CounterMetricFamily if counts else GaugeMetricFamily)(name, words, labels=[label])
+            for which, value in picture.get(key, {}).items():
+                family.add_metric([which], value)
             yield family
-        running = GaugeMetricFamily("pans_running", "1 while the device measures and the loop turns")
-        running.add_metric([], float(picture.get("state") == "running"))
-        yield running
+        words, running = "1 while the device measures and the loop turns", picture.get("state") == "running"
+        yield GaugeMetricFamily("pans_running", words, value=float(running))
+        if "last_verdict" in picture:
+            words, failed = "1 if the latest run that ended did not PASS", picture["last_verdict"] != "PASS"
+            yield GaugeMetricFamily("pans_last_run_failed", words, value=float(failed))
 
 
 class _Handler(WSGIRequestHandler):

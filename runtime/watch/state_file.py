@@ -6,6 +6,7 @@ each attempt.
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 import time
@@ -23,10 +24,14 @@ from pans.runtime.outputs import replace_file
 from .repeated import Repeated
 
 if TYPE_CHECKING:
+    from pans.runtime.core.dark_guard import DarkGuard
     from pans.runtime.live import LiveRun
     from pans.runtime.record import Recorder
 
 FORMAT = "pans-state 1"
+MAX_BYTES = 1 << 16
+# kinds of findings in the dark; light: the clicks of decisions have changed
+ALARMS = ("hot", "burst", "drift", "quiet", "dead", "light")
 EVERY_S = 1.0
 GOODBYE_S = 5.0
 OTHER_WRITER_S = 1.0
@@ -42,6 +47,22 @@ def loop_age_s(run: LiveRun) -> float:
 def is_stalled(run: LiveRun) -> bool:
     """Whether the loop should have turned by now."""
     return loop_age_s(run) > (STALLED_AFTER_S if run.outage_ns is None else LOST_STALLED_AFTER_S)
+
+
+def read_state(path: Path) -> dict[str, Any] | None:
+    """Return what the state file at `path` says; None where there is none, or another file."""
+    try:
+        found = json.loads(path.read_bytes()) if path.stat().st_size <= MAX_BYTES else None
+    except (OSError, ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) and found.get("format") == FORMAT else None
+
+
+def alarms_of(run: LiveRun) -> dict[str, int]:
+    """Return for each of ALARMS whether it lasts, 1 or 0; a change of the light lasts to the end of the run."""
+    guard: DarkGuard | None = getattr(run.core, "guard", None)
+    present = {} if guard is None else {finding.kind for finding in guard.serious}
+    return {kind: int(kind in present) for kind in ALARMS} | {"light": int(run.journal.counts["light_changed"] > 0)}
 
 
 def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float) -> dict[str, Any]:
@@ -82,6 +103,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         "dark_clicks": int(tallies[DARK_CLICKS]),
         **{key: ticks * run.plan.tick_us for key, ticks in exposed.items()},
         "reconnects": run.reconnects,
+        "alarms": alarms_of(run),
         "last_error": f"{trouble.get('kind')}: {reason}" if trouble else "",
     }
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 import os
 import socket
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from .host import HostWatch
 from .repeated import Repeated
-from .state_file import StateFile, is_stalled, picture_of
+from .state_file import StateFile, is_stalled, picture_of, read_state
 
 if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 NOTIFY_EVERY_S = 1.0  # without WATCHDOG_USEC
 NOTIFICATIONS_PER_TIMEOUT = 3
+MAX_FAULTS = 20  # of the state file; the recording has them all
 
 
 class Watchers:
@@ -47,6 +49,7 @@ class Watchers:
         self._state: StateFile | None = None
         self._notifier: Notifier | None = None
         self._started_s = time.monotonic()
+        self._outcome: dict[str, Any] = {}
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
@@ -56,6 +59,8 @@ class Watchers:
             if self._metrics is not None:
                 self._metrics.look = self.look
             if self._wanted.state is not None:
+                if (before := read_state(self._wanted.state)) is not None:  # one that was killed has no verdict
+                    self._outcome = {"last_verdict": before.get("verdict") or "cut"}
                 self._state = StateFile(self._wanted.state, self.look)
                 opening.callback(self._state.close)
             self._notifier = Notifier.of_environment()
@@ -87,10 +92,14 @@ class Watchers:
         if self._notifier is not None:
             self._notifier.begin(run)
 
+    def conclude(self, verdict: str, faults: Sequence[str]) -> None:
+        """State what came of the run: PASS or FAIL, and why."""
+        self._outcome = {"verdict": verdict, "faults": [*faults][:MAX_FAULTS], "last_verdict": verdict}
+
     def look(self) -> dict[str, Any]:
         """Return the picture as it is now."""
         facts = {} if self._host is None else self._host.facts
-        return picture_of(self._run, self._recorder, self._started_s) | facts
+        return picture_of(self._run, self._recorder, self._started_s) | facts | self._outcome
 
     def note_news(self, run: LiveRun) -> None:
         """Note in the journal of `run` what was found about the computer; called by the loop."""

@@ -22,11 +22,11 @@ from storage import Ended, Fault, FaultyStorage, compiler
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
-from pans.runtime.commands.run_files import STATE_FORMAT, is_state_file
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.instrument.calibration import load_calibration
 from pans.runtime.record import read_recording
 from pans.runtime.report.verify import verify_file
+from pans.runtime.watch.state_file import FORMAT, read_state
 from pans.runtime.wire.messages import FrameDecoder, MessageType, Opcode, decode_command
 
 pytestmark = [
@@ -108,7 +108,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     for name, data in PRECIOUS.items():
         (inputs / name).write_bytes(data)
     shutil.copy(SHIPPED / "fashion10.pans", inputs / "b.pans")
-    (inputs / "state.json").write_text(f'{{"format":"{STATE_FORMAT}"}}')
+    (inputs / "state.json").write_text(f'{{"format":"{FORMAT}"}}')
     np.save(inputs / "p.npy", np.ones((2, 4)))
     np.save(inputs / "t.npy", np.zeros((4, 2)))
     rng = np.random.default_rng(0)
@@ -165,7 +165,7 @@ def check_readable(path: Path, *, whole: bool) -> None:
     elif path.suffix == ".json" and path.name in ("c.json", "old.json"):
         load_calibration(path)
     elif path.name == "state.json":
-        assert is_state_file(path)
+        assert read_state(path) is not None
         json.loads(path.read_text())
     elif path.suffix == ".pansrec":
         verdict = verify_file(path)

@@ -133,6 +133,7 @@ def test_silence_is_counted_from_ready_to_the_end() -> None:
 def test_monitoring_files_are_written_once(tmp_path: Path, pans: Pans) -> None:
     out = tmp_path / "m"
     found = pans("service monitoring", "--out", out)
-    assert [Path(path).name for path in found["files"]] == ["prometheus-alerts.yml", "grafana-dashboard.json"]
+    names = ["prometheus.yml", "prometheus-alerts.yml", "grafana-dashboard.json"]
+    assert [Path(path).name for path in found["files"]] == names
     assert all(Path(path).read_bytes() == (SHIPPED / Path(path).name).read_bytes() for path in found["files"])
     assert main(["service", "monitoring", "--out", str(out)]) == 2

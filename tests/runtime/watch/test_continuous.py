@@ -26,11 +26,13 @@ from pans.runtime.cli import main
 from pans.runtime.commands.one_run import _exit_code
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
+from pans.runtime.live.run_options import RunOptions
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_parts
 from pans.runtime.watch.metrics import MetricsServer
 from pans.runtime.watch.state_file import StateFile, picture_of
+from pans.runtime.watch.watchers import Watchers
 
 DEVICE = "sim:ideal?scene=uniform&seed=3"
 PATIENCE_S = 600.0  # kernels may be compiled, and on a busy machine
@@ -57,13 +59,31 @@ def test_a_state_file_that_cannot_be_written_does_not_end_the_run(tmp_path: Path
     assert "No such file" in state.trouble
 
 
+def test_a_run_knows_the_verdict_of_the_one_before(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+
+    def run(concludes: tuple[str, ...]) -> list[str | None]:
+        with Watchers(RunOptions(state=path), None, None, Stop(continuous=True), None) as seen:
+            found = [seen.look().get("last_verdict")]
+            for verdict in concludes:
+                seen.conclude(verdict, ["the light has changed"])
+            return [*found, seen.look().get("last_verdict")]
+
+    assert run(("FAIL",)) == [None, "FAIL"]
+    assert json.loads(path.read_text())["faults"] == ["the light has changed"]
+    assert run(()) == ["FAIL", "FAIL"]  # it ends without a verdict, as one that was killed
+    assert run(("PASS",)) == ["cut", "PASS"]
+
+
 def test_metrics_are_served() -> None:
     pytest.importorskip("prometheus_client")
     picture: dict[str, Any] = {"decisions": 7, "late_cause": {"link": 3}, "state": "running", "handles": 7}
+    picture |= {"alarms": {"hot": 1, "light": 0}, "last_verdict": "cut"}
     with closing(MetricsServer("0", lambda: picture)) as server:
         lines = urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics").read().decode().splitlines()
     causes = 'pans_late_decisions_by_cause_total{cause="link"} 3.0'
     assert {"pans_decisions_total 7.0", causes, "pans_running 1.0", "pans_open_handles 7.0"} <= set(lines)
+    assert {'pans_alarm{kind="hot"} 1.0', 'pans_alarm{kind="light"} 0.0', "pans_last_run_failed 1.0"} <= set(lines)
 
 
 def test_signals_become_words_while_somebody_looks() -> None:
@@ -115,6 +135,7 @@ def test_sigterm_ends_a_continuous_run_well(bundle_file: Path, tmp_path: Path, l
     assert process.returncode == (130 if limit else 0 if summary["verdict"] == "PASS" else failed)
     state = _state(tmp_path)
     assert (state["state"], state["decisions"]) == ("stopped", summary["decisions"])
+    assert (state["verdict"], state["faults"]) == (summary["verdict"], summary["faults"])
     assert all(verdict.ok for verdict in verify_parts(tmp_path / "out"))
     assert sum(read_recording(path).n_decisions for path in parts_in(tmp_path / "out")) == summary["decisions"]
 
@@ -164,10 +185,13 @@ def test_the_state_names_only_what_is_written(tmp_path: Path) -> None:
         run.core.tallies = np.zeros(16, np.int64)
         run.timing.total.max_ns, run.timing.total.quantile_ns.return_value = 0, 0
         run.lateness.incidents.causes = run.lateness.incidents.missing = {}
+        run.core.guard, run.journal.counts = None, {"light_changed": 2}
         recorder.add_decisions(np.zeros(3, DECISION_DTYPE))
         assert picture_of(run, recorder, 0.0)["decisions"] == 0
         recorder.flush()
         assert picture_of(run, recorder, 0.0)["decisions"] == 3
+        run.core.guard = SimpleNamespace(serious=[SimpleNamespace(kind="hot")])
+        assert [kind for kind, lasts in picture_of(run, recorder, 0.0)["alarms"].items() if lasts] == ["hot", "light"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs files that are read without a name")

@@ -1,4 +1,4 @@
-"""The shipped dashboard and alert rules: each metric that they name is served by a real run; promtool accepts the rules."""
+"""The shipped files for Prometheus and Grafana: a real run serves each metric that they name, and the rules fire when they should."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from pans.firmware_sim.testing import small_setup
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
-from pans.runtime.watch.metrics import CAUSES, FIGURES, MetricsServer
+from pans.runtime.watch.metrics import FIGURES, LABELLED, MetricsServer
 
 RULES, DASHBOARD = SHIPPED / "prometheus-alerts.yml", SHIPPED / "grafana-dashboard.json"
 METRIC = re.compile(r"\bpans_[a-z0-9_]+")
@@ -42,7 +42,8 @@ def test_every_metric_that_is_named_is_served_by_a_run(tmp_path: Path, monkeypat
     )
     (text,) = answers
     served = {re.split("[{ ]", line)[0] for line in text.splitlines() if line[:1] != "#"}
-    of_causes = {f"{name}_total" for name, _ in CAUSES.values()}  # a run without trouble has no causes to tell
+    # a run without trouble has no causes to tell
+    of_causes = {f"{name}_total" for name, _, label, _ in LABELLED.values() if label == "cause"}
     for path in (RULES, DASHBOARD):
         named = set(METRIC.findall(path.read_text()))
         assert named - served - of_causes == set(), path.name
@@ -60,7 +61,7 @@ def test_the_dashboard_is_one_that_grafana_reads_and_labels_exist() -> None:
         assert panel["targets"], panel["title"]
         for target in panel["targets"]:
             assert 'instance=~"$instance"' in target["expr"]
-    assert set(LABELS.findall(RULES.read_text())) <= {"instance"}
+    assert set(LABELS.findall(RULES.read_text())) <= {"instance", "kind"}
     assert set(LABELS.findall(DASHBOARD.read_text())) <= {"instance", "cause"}
 
 
@@ -72,8 +73,48 @@ def test_prometheus_reads_every_expression_of_the_dashboard(tmp_path: Path) -> N
     assert f"SUCCESS: {len(rules)} rules found" in promtool("check", "rules", str(tmp_path / "rules.yml"))
 
 
-def test_promtool_accepts_the_rules() -> None:
-    assert "SUCCESS: 10 rules found" in promtool("check", "rules", str(RULES))
+def test_promtool_accepts_configuration_and_rules() -> None:
+    said = promtool("check", "config", str(SHIPPED / "prometheus.yml"))
+    assert "SUCCESS: 12 rules found" in said
+    assert "prometheus.yml is valid" in said
+
+
+def test_rules_fire_at_once_or_after_enough_history(tmp_path: Path) -> None:
+    """Of a run that begins at minute 0, has an alarm from minute 60 to 90, and grows by 1 MB a minute."""
+    states = {  # minute -> the states of these three rules
+        0: {"PansRunFailed": "firing"},
+        59: {"PansRunFailed": "firing"},
+        60: {"PansAlarm": "firing"},
+        90: {},
+        419: {},
+        421: {"PansMemoryGrows": "pending"},
+        782: {"PansMemoryGrows": "firing"},
+    }
+    series = {
+        "pans_alarm{kind='hot'}": "0x59 1x29 0x900",
+        "pans_alarm{kind='light'}": "0x990",
+        "pans_last_run_failed": "1x990",
+        "pans_uptime_seconds": "0+60x990",
+        "pans_resident_memory_bytes": "0+1000000x990",
+    }
+    found = 'count by (alertname, alertstate) (ALERTS{alertname=~"PansAlarm|PansRunFailed|PansMemoryGrows"})'
+    test = {
+        "interval": "1m",
+        "input_series": [{"series": name, "values": values} for name, values in series.items()],
+        "promql_expr_test": [
+            {
+                "eval_time": f"{minute}m",
+                "expr": found,
+                "exp_samples": [
+                    {"labels": f'{{alertname="{name}", alertstate="{state}"}}', "value": 1}
+                    for name, state in wanted.items()
+                ],
+            }
+            for minute, wanted in states.items()
+        ],
+    }
+    (tmp_path / "test.json").write_text(json.dumps({"rule_files": [str(RULES)], "tests": [test]}))
+    promtool("test", "rules", str(tmp_path / "test.json"))
 
 
 def promtool(*words: str, text: str = "") -> str:
