@@ -29,6 +29,7 @@ from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import DISK_NEARLY_FULL, INTERRUPTED, RECORDING_DELETED, REFUSED, Stop, stop_signals
 from pans.runtime.live.run_options import FLOW, RunOptions
+from pans.runtime.outputs import RUNS
 from pans.runtime.timing.realtime import check_core, lacking
 
 from .run_files import check_run_files, claimed, gone_if_refused, part_limits, recording_header, what_was_run
@@ -166,6 +167,13 @@ def check_together(options: RunOptions) -> None:
         refuse_without(options, "--calibration or --registration", {"calibration_max_age_h": MAX_AGE_H})
     if options.keep_mb and not options.rotate_mb:
         raise UsageError("--keep-mb deletes parts, and there are none", remedy="say how large with --rotate-mb")
+    if options.keep_runs_mb:
+        if options.out_root is None or not options.keep_mb:
+            remedy = "leave --out and --record out, and bound each run with --rotate-mb and --keep-mb"
+            raise UsageError(f"--keep-runs-mb deletes earlier runs in {RUNS} that are in parts", remedy=remedy)
+        if options.keep_runs_mb < 2 * options.keep_mb:
+            what = f"--keep-runs-mb {options.keep_runs_mb:g} is below twice --keep-mb {options.keep_mb:g}"
+            raise UsageError(what, remedy="leave room for this run and the one before")
     if options.rotate_mb and options.on_dark != "warn":
         raise UsageError(
             f"--rotate-mb with --on-dark {options.on_dark}: what the guard has learnt is not in a part, which could not be replayed",

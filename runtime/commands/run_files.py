@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from pans.runtime import __version__
-from pans.runtime.cli import EXIT_USAGE
+from pans.runtime.cli import EXIT_USAGE, say
 from pans.runtime.cli.option_fields import changed_options
 from pans.runtime.container import MIB
 from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.live.run_options import RunOptions
+from pans.runtime.operate.runs import make_room
 from pans.runtime.outputs import check_outputs, locked, make_folder, new_run_folder, refuse_existing
 from pans.runtime.record.parts import files_of_parts
 from pans.runtime.record.recorder import PartLimits
@@ -85,6 +86,10 @@ def claimed(options: RunOptions) -> Iterator[RunOptions]:
     """Make the folders of `options` and hold them while it runs; yield it with its own folder. Folders that stay empty go."""
     made: list[Path] = []
     if options.out_root is not None:
+        if options.keep_runs_mb and options.out_root.is_dir():
+            room = round(options.keep_runs_mb * MIB) - options.keep_bytes
+            for line in make_room(options.out_root, options.command, room):
+                say(f"pans: {line}")
         options = replace(options, out=new_run_folder(options.bundle.stem, options.out_root), out_root=None)
         made.append(options.out)  # type: ignore[arg-type]
     folders = {path.parent for path in (options.recording, options.page, options.trace) if path is not None}

@@ -153,6 +153,13 @@ class RunOptions:
     keep_mb: float | None = option(
         None, "delete the oldest parts above N MiB (default: keep all)", range=Range(1e-6, 1e9), metavar="N", group=DAYS
     )
+    keep_runs_mb: float | None = option(
+        None,
+        f"at the start, delete the oldest runs in {RUNS} of the same command, so that all stay within N MiB (default: keep all)",
+        range=Range(1e-6, 1e9),
+        metavar="N",
+        group=DAYS,
+    )
     disk_reserve_mb: float = option(
         DISK_RESERVE_MB,
         f"stop in order before less than N MiB are free on the recording's disk (default {DISK_RESERVE_MB:g}; 0: never)",

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import LATEST, RUNS, locked
 from pans.runtime.ranges import Range
 from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
+from pans.runtime.record.parts import part_number
 from pans.runtime.safe_text import one_line
 
 OURS = re.compile(r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock")
@@ -45,11 +47,19 @@ class Run:
     verdict: str  # PASS, FAIL, "running", or "cut" without an END
     decisions: int | None
     accuracy: float | None
+    dark_per_exposure: float | None  # clicks per dark exposure
     bytes: int  # of the run's own files
     simulated: bool
     locked: bool
+    command: str  # the command line
+    faults: tuple[str, ...]
     files: tuple[Path, ...] = field(repr=False)
     summary: Mapping[str, Any] = field(repr=False, default_factory=dict)
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether every recording is a part."""
+        return all(part_number(path) is not None for path in self.files if path.suffix == ".pansrec")
 
     def as_json(self) -> dict[str, Any]:
         """Return the facts but for files and summary, JSON-able."""
@@ -79,6 +89,8 @@ def run_of(folder: Path) -> Run | None:
         return None
     files = tuple(path for path in entries if OURS.fullmatch(path.name))
     (header, bundle), summary = _begin(recordings[0]), _end(recordings[-1])
+    dark, faults = summary.get("dark"), summary.get("faults")
+    watched = isinstance(dark, dict) and dark.get("exposures")
     started = datetime.fromtimestamp(recordings[0].stat().st_mtime, UTC)
     with suppress(ValueError):
         started = datetime.fromisoformat(str(header.get("created_utc", "")))
@@ -90,9 +102,12 @@ def run_of(folder: Path) -> Run | None:
         verdict="running" if is_locked else str(summary.get("verdict", "cut"))[:20],
         decisions=_number(summary.get("decisions")),
         accuracy=_number(summary.get("accuracy")),
+        dark_per_exposure=_number(dark.get("per_exposure")) if watched else None,
         bytes=sum(path.stat().st_size for path in files),
         simulated=bool(header.get("simulated") or summary.get("simulated")),
         locked=is_locked,
+        command=str(header.get("command", "")),
+        faults=tuple(map(str, faults)) if isinstance(faults, list) else (),
         files=files,
         summary=summary,
     )
@@ -188,6 +203,21 @@ def delete_run(run: Run) -> Iterator[str]:
         yield f"{run.folder}: kept, as other files are in it: {', '.join(rest[:5])}"
 
 
+def make_room(root: Path, command: str, most: int) -> Iterator[str]:
+    """Delete the oldest runs in `root` so that those that stay have at most `most` bytes together; yield what was done, and what stays.
+
+    Runs of another command line, of which the recording is not in parts, or that have not ended do not count and stay.
+    """
+    ours = [run for run in runs_in(root) if run.command == command and not run.locked and run.in_parts]
+    sizes = accumulate(run.bytes for run in ours)  # the newest first
+    for run in [run for run, size in zip(ours, sizes) if size > most][::-1]:
+        try:
+            yield from delete_run(run)
+            yield f"{run.folder}: {_size(run.bytes)} deleted"
+        except UsageError as error:  # it began to run since it was listed
+            yield error.message
+
+
 # ---- the command ----
 
 
@@ -264,14 +294,15 @@ def _prune(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _table(runs: Sequence[Run]) -> list[str]:
-    rows = [("begun", "verdict", "decisions", "accuracy", "size", "bundle", "folder")]
+    rows = [("begun", "verdict", "decisions", "accuracy", "dark clicks/exposure", "size", "bundle", "folder")]
     for run in runs:
         verdict = one_line(f"{run.verdict}{' SIMULATED' if run.simulated else ''}", 40)
         begun = run.started.astimezone().strftime("%Y-%m-%d %H:%M")
         decisions = "" if run.decisions is None else str(run.decisions)
         accuracy = "" if run.accuracy is None else f"{100 * run.accuracy:.1f} %"
+        dark = "" if run.dark_per_exposure is None else f"{run.dark_per_exposure:.2g}"
         names = one_line(run.bundle, 40), one_line(run.folder.name, 80)
-        rows.append((begun, verdict, decisions, accuracy, _size(run.bytes), *names))
+        rows.append((begun, verdict, decisions, accuracy, dark, _size(run.bytes), *names))
     widths = [max(map(len, column)) for column in zip(*rows)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows] if runs else []
 

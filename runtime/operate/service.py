@@ -10,6 +10,7 @@ import argparse
 import getpass
 import os
 import re
+import shlex
 import shutil
 import signal
 import socket
@@ -32,7 +33,10 @@ from pans.runtime.container import read_file
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import RUNS, check_outputs, make_folder, write_file
 from pans.runtime.ranges import Range
+from pans.runtime.safe_text import one_line
 from pans.runtime.timing.realtime import FIFO_PRIORITY
+
+from .runs import Run, runs_in
 
 MARK = "# Written by `pans service install`; change the file of options, not this one."
 SYSTEM_UNITS, USER_UNITS = Path("/etc/systemd/system"), Path("~/.config/systemd/user")
@@ -263,6 +267,8 @@ def _written_folders(config: Path, folder: Path) -> Iterator[Path]:
     for name in ("out", "record"):
         if getattr(options, name) is not None:
             warn(f"{config.name} has `{name}`: a second start is refused, as the files of the first are there")
+    if not options.keep_runs_mb:
+        warn(f"{config.name} has no `keep-runs-mb`: each restart leaves another folder of recordings")
     yield folder / RUNS if options.out is None and options.record is None else folder
     for name in ("record", "state", "trace", "log_file"):
         if (path := getattr(options, name)) is not None:
@@ -306,7 +312,15 @@ def _verify(args: argparse.Namespace, name: str, path: Path) -> int:
             run_as_systemd(command, folder, watchdog_s=every_s, seconds=args.start, start_s=START_S, stop_s=STOP_S),
             watchdog_s,
         )
-    return _judge(args, path, findings, {"unit": str(path)})
+    last = _last_run(command, folder)
+    return _judge(args, path, findings, {"unit": str(path), "last_run": None if last is None else last.as_json()}, last)
+
+
+def _last_run(command: list[str], folder: Path) -> Run | None:
+    """Return the latest run of the service that has ended; None before the first one."""
+    runs = runs_in(folder / RUNS) if (folder / RUNS).is_dir() else []
+    line = shlex.join(["pans", *command[command.index("run") :]])
+    return next((run for run in runs if run.command == line and not run.locked), None)
 
 
 def _remove(args: argparse.Namespace, name: str, path: Path) -> int:
@@ -383,12 +397,22 @@ def _finding(check: str, ok: bool, found: str, remedy: str) -> dict[str, Any]:
     return {"check": check, "ok": ok, "found": found, "remedy": "" if ok else remedy}
 
 
-def _judge(args: argparse.Namespace, path: Path, findings: list[dict[str, Any]], payload: dict[str, Any]) -> int:
-    """Print the findings and return the exit code."""
+def _judge(
+    args: argparse.Namespace,
+    path: Path,
+    findings: list[dict[str, Any]],
+    payload: dict[str, Any],
+    last: Run | None = None,
+) -> int:
+    """Print the findings and what came of the `last` run; return the exit code, which the findings alone decide."""
     lines = [str(path)]
     for one in findings:
         lines.append(f"  {'ok' if one['ok'] else 'WRONG':<6} {one['check']}: {one['found']}")
         lines += [f"         remedy: {one['remedy']}"] if one["remedy"] else []
+    if last is not None:
+        begun = last.started.astimezone().strftime("%Y-%m-%d %H:%M")
+        lines.append(f"  last run begun {begun}: {one_line(last.verdict)} ({last.folder})")
+        lines += [f"         fault: {one_line(fault)}" for fault in last.faults]
     lines += [f"next: {line}" for line in payload.get("next", ())]
     emit(args, payload | {"findings": findings}, "\n".join(lines))
     return EXIT_FINE if all(one["ok"] for one in findings) else EXIT_ALERT

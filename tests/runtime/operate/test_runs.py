@@ -1,16 +1,19 @@
 """`pans runs`: what lies in a folder, and what prune may delete: nothing foreign, nothing that is going on, nothing without --yes."""
 
+import re
+import shlex
 import shutil
+import sys
 from argparse import ArgumentTypeError
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import fixed_run, json_of
+from commands import Pans, fixed_run, json_of
 
 from pans.runtime.cli import main
-from pans.runtime.operate.runs import Run, duration_s, prunable, run_of, size_bytes
+from pans.runtime.operate.runs import RUN_LOCK, Run, duration_s, prunable, run_of, size_bytes
 from pans.runtime.outputs import locked
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
@@ -45,10 +48,15 @@ def test_the_list_says_what_the_summary_says(root: Path, capsys: pytest.CaptureF
         assert told == (decisions, "fashion10", True, False)
         assert run["verdict"] in ("PASS", "FAIL")
         assert run["verdict"] in summary
+        assert all(f"- {fault}" in summary for fault in run["faults"])
+        clicks, exposures = re.findall(r"dark clicks per dark exposure \| (\d+) in (\d+)", summary)[0]
+        assert run["dark_per_exposure"] == pytest.approx(int(clicks) / int(exposures))
         assert run["bytes"] == sum(path.stat().st_size for path in (root / name).iterdir())
         assert datetime.now(UTC) - datetime.fromisoformat(run["started"]) < timedelta(hours=1)
     assert main(["runs", str(root)]) == 0
-    assert "2 runs" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "2 runs" in out
+    assert "dark clicks/exposure" in out
 
 
 def test_a_cut_run_and_one_that_goes_on(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,9 +81,44 @@ def test_prune_lists_first_and_deletes_only_what_is_ours(root: Path, capsys: pyt
     assert sorted(path.name for path in root.rglob("*")) == ["notes.txt", "whole"]
 
 
+def test_a_run_that_begins_makes_room_among_its_own_earlier_ones(
+    root: Path, pans: Pans, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The oldest ended runs in parts of the same command line go, until what stays and the new run fit; nothing else goes."""
+    for name in ("parts-1", "parts-2", "parts-3", "parts-4", "going on", "other"):
+        shutil.copytree(root / "parts", root / name)
+    (root / "parts-1" / "notes.txt").write_text("precious")
+    own = run_of(root / "parts")
+    assert own is not None
+    for path in (root / "other").glob("*.pansrec"):
+        assert own.command.encode() in path.read_bytes()
+        path.write_bytes(path.read_bytes().replace(own.command.encode(), own.command.encode()[:-1] + b"!"))
+    monkeypatch.chdir(root.parent)
+    monkeypatch.setattr(sys, "argv", shlex.split(own.command))
+    keep = 1.1 * own.bytes / 2**20
+    bound = ["--rotate-mb", str(keep / 3), "--keep-mb", str(keep), "--keep-runs-mb", str(3 * keep)]
+    with locked(root / "going on" / RUN_LOCK):
+        found = pans(*fixed_run(20), *bound, code=None)
+    left = {path.name for path in root.iterdir() if not path.is_symlink()} - {Path(found["recording"]).parent.name}
+    assert left == {"parts-1", "parts-3", "parts-4", "going on", "other", "whole"}
+    assert [path.name for path in (root / "parts-1").iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--keep-runs-mb", "9"], "--keep-mb"),
+        (["--keep-runs-mb", "9", "--rotate-mb", "1", "--keep-mb", "5"], "below twice"),
+        (["--keep-runs-mb", "9", "--rotate-mb", "1", "--keep-mb", "2", "--out", "x"], "leave --out"),
+    ],
+)
+def test_a_bound_that_cannot_be_kept_is_refused(words: list[str], said: str, pans: Pans) -> None:
+    assert said in pans.refuses(*fixed_run(4), *words)
+
+
 def made(name: str, days: float, size: int, *, is_locked: bool = False) -> Run:
     started = NOW - timedelta(days=days)
-    return Run(Path(name), started, "b", "PASS", 1, None, size, True, is_locked, ())
+    return Run(Path(name), started, "b", "PASS", 1, None, None, size, True, is_locked, "", (), ())
 
 
 def test_all_conditions_hold_and_the_newest_are_kept() -> None:

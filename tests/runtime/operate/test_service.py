@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import Pans
+from commands import Pans, fixed_run
 
 from pans.firmware_sim.testing import small_setup
 from pans.runtime import SHIPPED
@@ -102,13 +102,25 @@ def test_foreign_units_stay(lab: Path, pans: Pans) -> None:
 
 
 @pytest.mark.skipif(not hasattr(socket, "AF_UNIX") or sys.platform == "win32", reason="needs AF_UNIX")
-def test_a_run_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(lab: Path, pans: Pans) -> None:
+def test_a_run_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(
+    lab: Path, pans: Pans, capsys: pytest.CaptureFixture[str]
+) -> None:
     service(pans, "install", "--config", "lab.toml")
     found = service(pans, "verify", "--name", "lab", "--start", "4", code=None)
     said = {one["check"]: one for one in found["findings"]}
     assert all(said[name]["ok"] for name in ("READY", "WATCHDOG", "STOPPING")), said
     assert said["end"]["found"].startswith(("exit code 0", "exit code 4"))  # late, on a busy machine
-    assert json.loads(Path("state.json").read_text())["ended"] == "stopped by SIGTERM"
+    state = json.loads(Path("state.json").read_text())
+    assert state["ended"] == "stopped by SIGTERM"
+    assert main([*fixed_run(4)]) in (0, 1)  # another one in the folder of the service's runs
+    last = service(pans, "verify", "--name", "lab", code=None)["last_run"]
+    assert (last["verdict"], last["faults"]) == (state["verdict"], state["faults"])
+    assert last["decisions"] == state["decisions"] == found["last_run"]["decisions"]
+    capsys.readouterr()
+    main(["service", "verify", "--name", "lab", "--unit-dir", "units"])
+    out = capsys.readouterr().out
+    assert f"{last['verdict']} ({last['folder']})" in out
+    assert all(f"fault: {fault}" in out for fault in last["faults"])
 
 
 @pytest.mark.skipif(not hasattr(socket, "AF_UNIX") or sys.platform == "win32", reason="needs AF_UNIX")
