@@ -5,8 +5,9 @@ The Markdown page is written beside the recording without any extra; `pans repor
 
 from __future__ import annotations
 
+import os
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Formatter
@@ -19,11 +20,12 @@ from pans.runtime.intervals import wilson_interval
 from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown, one_line
 from pans.runtime.timing.ledger import STAGES
-from pans.runtime.timing.realtime import fault_words
+from pans.runtime.timing.realtime import fault_words, load_average
 
 if TYPE_CHECKING:
     from .summary import Summary
 
+BUSY = 0.05  # of the time: who waits longer for a processor shares it with other programs
 UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host takes
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 _SHARES = ("accuracy", "accuracy_labelled", "missed", "doubled", "yield", "purity")
@@ -34,7 +36,8 @@ Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 def closing_words(summary: Summary, recording: str, report: str) -> str:
     """The lines that the command ends with."""
     facts = summary.as_json()
-    last = [*(("fault", fault, "") for fault in facts["faults"]), ("recording", recording, ""), ("report", report, "")]
+    last = [*(("fault", fault, "") for fault in facts["faults"]), *(("busy", words, "") for words in _busy_words(facts))]
+    last += [("recording", recording, ""), ("report", report, "")]
     simulated = "SIMULATED · " * facts["simulated"]
     head = f"{simulated}{facts['verdict']}: {facts['decisions']} decisions ({objects_words(facts)})"
     return "\n".join([head, *lines_of(rows_of(facts, "closing", "flow", "walks") + last)])
@@ -105,6 +108,21 @@ def _further(facts: Facts) -> dict[str, Any]:
 
 def _is_virtual(facts: Facts) -> bool:
     return bool(facts["device"].get("virtual_time"))
+
+
+def _busy_words(facts: Facts) -> Iterator[str]:
+    """Yield how busy the computer was, if that made most decisions late, and what to do about it.
+
+    A simulated instrument shares the computer: what is late there looks like its link's or its own delay.
+    """
+    waited_ms = facts["page_faults"].get("waited_ms", 0)
+    waits = facts["simulated"] and waited_ms >= BUSY * 1000 * facts["seconds"]
+    if not facts["late"] or not (waits or 2 * facts["late_cause"].get("host", 0) >= facts["late"]):
+        return
+    loop = f"; the loop waited {waited_ms} ms of {facts['seconds']:.1f} s for a processor" if waited_ms else ""
+    yield f"other programs kept the computer busy: load {load_average():.1f} on {os.cpu_count()} cores{loop}"
+    accuracy = "late decisions are as accurate as others" if facts["lost"] else "accuracy is not affected"
+    yield f"{accuracy}; end other programs and run again, or see what `pans doctor` recommends"
 
 
 def objects_words(facts: Facts) -> str:

@@ -234,6 +234,11 @@ def first_line(path: Path) -> str:
         return ""
 
 
+def load_average() -> float:
+    """Return how many programs computed or waited for a processor in the last minute, in the mean; 0.0 where that is not known."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+
+
 def steal_ms(root: Path = Path("/")) -> float | None:
     """Return for how long the hypervisor ran something else since the start, all cores together; None where that is not known."""
     fields = first_line(root / "proc/stat").split()
@@ -289,7 +294,7 @@ def _spinning() -> Iterator[str]:
 
 
 class ThreadCounts:
-    """Page faults of the calling thread, and how often it lost its core, since construction or the last `restart`.
+    """Page faults of the calling thread, how often it lost its core, and for how long it waited for one, since the last `restart`.
 
     A minor fault is the first touch of a page, one to a few microseconds; a major one waits for the disk.
     """
@@ -302,7 +307,7 @@ class ThreadCounts:
         self._before = _counts()
 
     def since(self) -> dict[str, int]:
-        """Return {minor, major, involuntary_switches} so far; {} where the system has no such counts."""
+        """Return {minor, major, involuntary_switches, waited_ms} so far; {} where the system has no such counts."""
         return {name: count - self._before[name] for name, count in _counts().items() if name in self._before}
 
 
@@ -313,7 +318,10 @@ def _counts() -> dict[str, int]:
         usage = resource.getrusage(resource.RUSAGE_THREAD)
     except (ImportError, AttributeError, ValueError):  # Windows; macOS knows whole processes only
         return {}
-    return {name: int(getattr(usage, field)) for name, field in COUNTED.items()}
+    counts = {name: int(getattr(usage, field)) for name, field in COUNTED.items()}
+    if times := first_line(Path("/proc/thread-self/schedstat")).split():  # computing, waiting, time slices; ns
+        counts["waited_ms"] = int(times[1]) // 1_000_000
+    return counts
 
 
 def fault_words(counts: Mapping[str, int]) -> str:
@@ -325,4 +333,5 @@ def fault_words(counts: Mapping[str, int]) -> str:
     if not counts:
         return "not told by this system"
     switches = counts.get("involuntary_switches", 0)
-    return f"{counts.get('minor', 0)} minor, {counts.get('major', 0)} major; the core was taken away {switches} times"
+    waited = f", which was waited for {counts['waited_ms']} ms" if "waited_ms" in counts else ""
+    return f"{counts.get('minor', 0)} minor, {counts.get('major', 0)} major; the core was taken away {switches} times{waited}"

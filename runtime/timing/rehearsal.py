@@ -26,6 +26,7 @@ from .realtime import (
     cores_of,
     first_line,
     isolated_cores,
+    load_average,
     scheduled,
     shallow_idle,
     steal_ms,
@@ -80,7 +81,7 @@ class Rehearsal:
 
 def rehearse(seconds: float = SECONDS, report: Callable[[float], None] = lambda share: None) -> Rehearsal:
     """Measure for about `seconds`, and `report` the share that is done; arms that need SCHED_FIFO alone are left out without it."""
-    began, load, stolen, collecting = time.perf_counter(), _load(), steal_ms(), gc.isenabled()
+    began, load, stolen, collecting = time.perf_counter(), load_average(), steal_ms(), gc.isenabled()
     gc.collect()
     gc.disable()
     try:
@@ -100,7 +101,7 @@ def rehearse(seconds: float = SECONDS, report: Callable[[float], None] = lambda 
             gc.enable()
     now = steal_ms()
     steal = None if now is None or stolen is None else now - stolen
-    return Rehearsal(cores, host, device, granted, turns, steal, (load, _load()), time.perf_counter() - began)
+    return Rehearsal(cores, host, device, granted, turns, steal, (load, load_average()), time.perf_counter() - began)
 
 
 def _one_turn(wanted: Sequence[str], turns: Turns, seconds: float, host: int | None) -> None:
@@ -198,7 +199,3 @@ def pair_of(
     shared = next((group for group in siblings if host in group), frozenset({host}))
     others = sorted(order[1:], key=lambda core: core in shared)
     return host, others[0] if others else None
-
-
-def _load() -> float:
-    return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0

@@ -59,6 +59,26 @@ def seen(summary: Summary, p50: float, p99: float, uncertainty_us: float) -> Sum
 
 
 @pytest.mark.parametrize(
+    ("causes", "simulated", "waited_ms", "busy"),
+    [
+        ({"host": 3, "device": 2}, False, 340, True),
+        ({"host": 2, "device": 3}, False, 340, False),  # an instrument of its own
+        ({"link": 5}, True, 340, True),  # the simulator waits for the same processors
+        ({"link": 5}, True, 34, False),
+        ({}, True, 340, False),
+    ],
+)
+def test_a_busy_computer_is_named_where_it_made_decisions_late(
+    summary: Summary, causes: dict[str, int], simulated: bool, waited_ms: int, busy: bool
+) -> None:
+    facts: dict[str, Any] = {"late": sum(causes.values()), "late_cause": causes, "simulated": simulated}
+    facts |= {"page_faults": {"waited_ms": waited_ms}, "seconds": 6.0}
+    said = closing_words(replace(summary, **facts), "r", "s")
+    assert ("the loop waited 340 ms of 6.0 s for a processor" in said) == ("accuracy is not affected" in said) == busy
+    assert ("late decisions are as accurate" in closing_words(replace(summary, **facts, lost=1), "r", "s")) == busy
+
+
+@pytest.mark.parametrize(
     ("p50", "p99", "uncertainty_us", "words"),
     [
         (120.0, 900.0, 5000.0, "p50 120 us, p99 900 us, p99.9 3000 us, max 3000 us; late"),

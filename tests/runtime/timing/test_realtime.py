@@ -1,6 +1,7 @@
 """What a process asks of its machine: held while it lasts, undone afterwards, refused with a reason; what the kernel counts."""
 
 import gc
+import hashlib
 import mmap
 import os
 import subprocess
@@ -237,5 +238,29 @@ def test_each_page_that_this_thread_touches_first_is_a_minor_fault() -> None:
     assert counts.since()["minor"] < PAGES
 
 
+@pytest.mark.skipif(not Path("/proc/thread-self/schedstat").exists(), reason="needs the scheduler's statistics")
+def test_time_in_which_another_thread_has_the_core_is_waited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two threads that each hash for a while on one core, without the interpreter's lock: this one waits about as long."""
+    data, core = bytes(1 << 24), os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(core)})
+    try:
+        counts, other = ThreadCounts(), threading.Thread(target=hash_for, args=(0.4, data))
+        other.start()
+        hash_for(0.4, data)
+        waited_ms = counts.since()["waited_ms"]
+        other.join()
+    finally:
+        os.sched_setaffinity(0, core)
+    assert 100 <= waited_ms <= 10_000
+
+
+def hash_for(seconds: float, data: bytes) -> None:
+    until_s = time.monotonic() + seconds
+    while time.monotonic() < until_s:
+        hashlib.sha256(data)
+
+
 def test_words_say_when_the_system_does_not_tell() -> None:
     assert fault_words({}) == "not told by this system"
+    counts = {"minor": 1, "major": 0, "involuntary_switches": 3, "waited_ms": 7}
+    assert fault_words(counts).endswith("taken away 3 times, which was waited for 7 ms")
