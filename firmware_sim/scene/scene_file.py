@@ -25,6 +25,7 @@ from pans.runtime.instrument.checked_toml import (
     near,
     position_of,
     read_toml,
+    toml_text,
     type_remedy,
 )
 from pans.runtime.instrument.profile import Profile
@@ -113,7 +114,7 @@ def _open(name_or_path: str | Path) -> SceneFile:
 
 def read_scene_file(path: Path, name: str) -> SceneFile:
     """Read the scene at `path` and call it `name`; ConfigError with file:line:col for whatever makes no sense."""
-    text = _read(path)
+    text = toml_text(path, MAX_FILE_BYTES, "a scene")
     tables, positions = read_toml(text, str(path))
     check = _Check(tables, positions, path)
     changes = check.changes()
@@ -121,19 +122,6 @@ def read_scene_file(path: Path, name: str) -> SceneFile:
     if kind == "still":
         return SceneFile(name, check.images(values["images"]), changes)
     return SceneFile(name, check.cells(values) if kind == "cells" else check.tape(values), changes)
-
-
-def _read(path: Path) -> str:
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MAX_FILE_BYTES + 1)
-        if len(data) > MAX_FILE_BYTES:
-            raise ConfigError(f"{path}:1:1: a scene file may hold at most {MAX_FILE_BYTES} bytes, found more")
-        return data.decode("utf-8-sig").replace("\r\n", "\n")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}:1:1: not UTF-8: {error}", remedy="save the file as UTF-8") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pans.runtime import SHIPPED
-from pans.runtime.container import other_kind, read_file
 from pans.runtime.core.plan import Plan
-from pans.runtime.errors import ConfigError, PansError, UsageError
-from pans.runtime.instrument.checked_toml import position_of, read_toml
+from pans.runtime.errors import ConfigError, UsageError
+from pans.runtime.instrument.checked_toml import position_of, read_toml, toml_text
 from pans.runtime.intervals import binomial_tail
 from pans.runtime.ranges import Range
 
@@ -84,19 +83,7 @@ def flow_of_header(header: dict[str, Any]) -> FlowSettings:
 def read_flow(name: str) -> FlowSettings:
     """Read settings from a TOML file, or from the shipped `cells` or `tape`; ConfigError with file:line:col for what is wrong."""
     path = SHIPPED / f"flow-{name}.toml" if name in KINDS else Path(name)
-    try:
-        data = read_file(path, MAX_FILE_BYTES)
-        what, taker = other_kind(data, "TOML")
-        if what:
-            raise ConfigError(f"{path}: not the settings of a flow: it is {what}", remedy=taker)
-        text = data.decode("utf-8-sig").replace("\r\n", "\n")
-    except ConfigError:
-        raise
-    except (PansError, UnicodeDecodeError) as error:
-        reason = error.message if isinstance(error, PansError) else error
-        raise ConfigError(
-            f"{path}: the flow settings cannot be read: {reason}", remedy="--flow cells, tape or a file"
-        ) from error
+    text = toml_text(path, MAX_FILE_BYTES, "the settings of a flow", remedy="--flow cells, tape or a file")
     tables, positions = read_toml(text, str(path))
     known = {one.name: one for one in fields(FlowSettings)}
     for key, value in tables.items():

@@ -1,7 +1,7 @@
 """TOML files whose faults are reported with file:line:col: where a key stands, what it may hold, what to write instead.
 
-`read_toml` takes text and returns the parsed tables and the positions of their keys, or raises ConfigError. A `Key` is the rule of one
-value. profile_schema.py and the simulator's scenes say which keys there are.
+`toml_text` reads a file, `read_toml` takes text and returns the parsed tables and the positions of their keys, or raises ConfigError. A
+`Key` is the rule of one value. profile_schema.py and the simulator's scenes say which keys there are.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import tomllib
 from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from pans.runtime.errors import ConfigError
+from pans.runtime.container import other_kind, read_file
+from pans.runtime.errors import ConfigError, PansError
 
 KeyPath = tuple[str, ...]
 Position = tuple[int, int]  # line, column; both count from 1
@@ -26,6 +28,27 @@ _STRING = re.compile(
     r'"""(?:[^\\]|\\.)*?"{3,5}' r"|'''.*?'{3,5}" r'|"(?:[^"\\\n]|\\.)*"' r"|'[^'\n]*'" r"|#[^\n]*", re.DOTALL
 )  # strings and comments: what brackets and newlines inside of them must not be taken for structure
 _TOMLLIB_WHERE = re.compile(r" \(at line (\d+), column (\d+)\)$")
+
+
+def toml_text(path: Path, most: int, what: str, *kinds: str, remedy: str = "") -> str:
+    """Return the text of a TOML file of at most `most` bytes, without a byte order mark and with plain line ends, whoever saved it.
+
+    ConfigError where `what` cannot be read or is of another kind (container.other_kind; `kinds` are allowed besides plain TOML), and
+    with line and column for a byte that is not UTF-8.
+    """
+    try:
+        data = read_file(path, most)
+    except PansError as error:
+        raise ConfigError(error.message, remedy=remedy or error.remedy) from error
+    kind, taker = other_kind(data, "TOML", *kinds)
+    if kind:
+        raise ConfigError(f"{path}: not {what}: it is {kind}", remedy=f"{taker}; {remedy}" if remedy else taker)
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        line, column = data.count(b"\n", 0, error.start) + 1, error.start - data.rfind(b"\n", 0, error.start)
+        found = f"byte 0x{data[error.start]:02x} is not UTF-8"
+        raise ConfigError(f"{path}:{line}:{column}: {found}", remedy="save the file as UTF-8") from error
 
 
 def read_toml(text: str, where: str) -> tuple[dict[str, Any], Mapping[KeyPath, Position]]:

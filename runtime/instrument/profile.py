@@ -20,13 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import other_kind
 from pans.runtime.errors import ConfigError, UsageError
 from pans.runtime.html_card import html_card
 from pans.runtime.imaging import IDENTITY, Imaging, checked_flat
 from pans.runtime.npz_file import read_arrays
 
-from .checked_toml import Key, KeyPath, Position, found, near, position_of, read_toml, type_remedy
+from .checked_toml import Key, KeyPath, Position, found, near, position_of, read_toml, toml_text, type_remedy
 from .profile_schema import SCHEMA, SECTIONS, Clock, Detector, Exposure, ObjectModulator, Optics, Projector, Timing
 
 __all__ = [
@@ -41,6 +40,7 @@ __all__ = [
 ]
 
 MAX_PROFILE_BYTES = 1 << 20
+WANTED = "a hardware profile"
 MAX_FLAT_BYTES = 1 << 26
 MOST_AFTERPULSES = 0.6  # of those that come at any time: beyond 1 - 1/e every one would cause another
 FARTHEST_CROSSTALK = 8  # channels
@@ -138,7 +138,7 @@ def profile_text(name_or_path: str | Path) -> str:
     """Return the TOML text of the shipped profile of that name, or of the file at that path; ConfigError as of `load_profile`."""
     if _is_shipped(name_or_path):
         shipped = resources.files("pans.hw_profiles").joinpath(f"{name_or_path}.toml")
-        return _decoded(shipped.read_bytes(), shipped.name)
+        return toml_text(Path(str(shipped)), MAX_PROFILE_BYTES, WANTED, "profile")
     path = Path(name_or_path)
     if not path.is_file():
         known = ", ".join(shipped_profiles())
@@ -147,12 +147,7 @@ def profile_text(name_or_path: str | Path) -> str:
             f"there is no profile {str(name_or_path)!r}: neither a file nor one of the shipped profiles ({known})",
             remedy=f"did you mean {near[0]}?" if near else "give a shipped name or the path of a .toml file",
         )
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_PROFILE_BYTES + 1)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}", remedy="check its permissions") from error
-    return _decoded(data, str(path))
+    return toml_text(path, MAX_PROFILE_BYTES, WANTED, "profile")
 
 
 def shipped_profiles() -> tuple[str, ...]:
@@ -188,22 +183,6 @@ def _read_flat(path: Path) -> NDArray[np.float64]:
         raise ConfigError(
             f"{path}: not a readable flat field: {error}",
             remedy="write it with numpy.savez(FILE, flat=FLAT / FLAT.mean())",
-        ) from error
-
-
-def _decoded(data: bytes, where: str) -> str:
-    if len(data) > MAX_PROFILE_BYTES:
-        raise _too_large(where)
-    what, taker = other_kind(data, "profile", "TOML")
-    if what:
-        raise ConfigError(f"{where}: not a hardware profile: it is {what}", remedy=taker)
-    try:
-        return data.decode("utf-8-sig").replace("\r\n", "\n")  # the same hash and positions whichever system saved it
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        column = error.start - (data.rfind(b"\n", 0, error.start) + 1) + 1
-        raise ConfigError(
-            f"{where}:{line}:{column}: byte 0x{data[error.start]:02x} is not UTF-8", remedy="save the file as UTF-8"
         ) from error
 
 

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime import __version__
-from pans.runtime.container import other_kind, read_file
-from pans.runtime.errors import ConfigError, PansError, UsageError
-from pans.runtime.instrument.checked_toml import position_of, read_toml
+from pans.runtime.errors import ConfigError, UsageError
+from pans.runtime.instrument.checked_toml import position_of, read_toml, toml_text
 from pans.runtime.outputs import check_outputs, write_file
 
 FILE_MAX_BYTES = 1 << 20
@@ -87,18 +86,8 @@ def _options(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
 
 def _read(path: Path, options: Mapping[str, argparse.Action]) -> tuple[dict[str, Any], Callable[[str], str]]:
     """Return the keys of the file with their values, and a call that says where a key stands."""
-    try:
-        data = read_file(path, FILE_MAX_BYTES)
-    except PansError as error:
-        raise type(error)(error.message, remedy="name a TOML file that --write-config has written") from error
-    what, taker = other_kind(data, "TOML")
-    if what:
-        remedy = f"{taker}; `pans run ... --write-config FILE` writes a file of options"
-        raise ConfigError(f"{path}: not a file of options: it is {what}", remedy=remedy)
-    try:
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}:1:1: not UTF-8: {error.reason} at byte {error.start}") from error
+    remedy = "name a TOML file that --write-config has written"
+    text = toml_text(path, FILE_MAX_BYTES, "a file of options", remedy=remedy)
     given, positions = read_toml(text, str(path))
 
     def where(name: str) -> str:
