@@ -117,3 +117,19 @@ def in_python_words(keywords: Container[str] | None = None) -> Iterator[None]:
         error.message, error.remedy = (_OPTION.sub(keyword, text) for text in (error.message, error.remedy))
         error.args = (error.message,)
         raise
+
+
+@contextmanager
+def refusing(what: str, remedy: str = "") -> Iterator[None]:
+    """Turn an error of the operating system into a UsageError that says `what` cannot be done, and the system's reason.
+
+    >>> with refusing("notes.txt: cannot be read"):
+    ...     raise FileNotFoundError(2, "No such file or directory")
+    Traceback (most recent call last):
+        ...
+    pans.runtime.errors.UsageError: notes.txt: cannot be read: No such file or directory
+    """
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"{what}: {error.strerror or error}", remedy=remedy) from error

@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from .errors import UsageError
+from .errors import UsageError, refusing
 from .ranges import Range
 from .safe_text import one_line
 
@@ -234,11 +234,8 @@ def _check_log(path: Path) -> None:
         return
     if not path.is_file():
         raise UsageError(f"{path}: is not a regular file", remedy=_OTHER_NAME)
-    try:
-        with open(path, "rb") as file:
-            line = file.readline(FIRST_LINE_MAX_BYTES)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}", remedy=_OTHER_NAME) from error
+    with refusing(f"{path}: cannot be read", _OTHER_NAME), open(path, "rb") as file:
+        line = file.readline(FIRST_LINE_MAX_BYTES)
     if line and not is_log_line(line):
         raise UsageError(f"{path}: exists, and is not a log of pans", remedy=_OTHER_NAME)
 

@@ -17,7 +17,7 @@ from datetime import datetime
 from itertools import count
 from pathlib import Path
 
-from .errors import UsageError
+from .errors import UsageError, refusing
 
 RUNS = Path("pans-runs")
 LATEST = "latest"
@@ -118,17 +118,9 @@ def _folder_of(path: Path, makes_folders: bool) -> Path:
 def _check_writable(folder: Path) -> None:
     """Make a file and remove it: permissions alone do not tell of read-only or full file systems."""
     probe = folder / f".pans-{secrets.token_hex(8)}.probe"
-    with _refusing(f"{folder}: cannot be written to", "choose a folder that can be written to"):
+    with refusing(f"{folder}: cannot be written to", "choose a folder that can be written to"):
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         os.unlink(probe)
-
-
-@contextmanager
-def _refusing(what: str, remedy: str) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise UsageError(f"{what}: {error.strerror or error}", remedy=remedy) from error
 
 
 def write_file(path: str | Path, data: bytes | memoryview, *, force: bool = False) -> None:
@@ -157,7 +149,7 @@ def whole_file(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     """Yield a name beside `path` to write to; what is there at the end is synced and becomes `path`, after an error nothing does."""
     target = Path(path)
     beside = beside_name(target)
-    with _refusing(f"{target}: cannot be written", "make room on that disk, or choose another place"):
+    with refusing(f"{target}: cannot be written", "make room on that disk, or choose another place"):
         try:
             yield beside
             _sync(beside, os.O_RDWR)  # Windows syncs only what is open for writing
@@ -197,7 +189,7 @@ def place_new(beside: str | Path, target: str | Path) -> None:
 def make_folder(folder: Path) -> None:
     """Make `folder` and those above it where they are missing, so that they survive a power cut; UsageError if that fails."""
     made = [one for one in (folder, *folder.parents) if not one.exists()]
-    with _refusing(f"{folder}: the folder cannot be made", "choose a place that can be written to"):
+    with refusing(f"{folder}: the folder cannot be made", "choose a place that can be written to"):
         folder.mkdir(parents=True, exist_ok=True)
     for one in reversed(made):
         sync_folder(one.parent)

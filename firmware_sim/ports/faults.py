@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pans.runtime.container import open_regular
 from pans.runtime.errors import ConfigError, UsageError
+from pans.runtime.instrument.checked_toml import read_toml, toml_text
 
 MAX_FILE_BYTES = 1 << 16
 UNITS_NS = {"us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
@@ -149,14 +148,7 @@ def _nanoseconds(name: str, word: str, where: str) -> int:
 
 
 def _file_pairs(path: Path) -> list[tuple[str, str]]:
-    try:
-        with open_regular(path) as file:
-            data = file.read(MAX_FILE_BYTES + 1)
-        table = tomllib.loads(data.decode("utf-8")) if len(data) <= MAX_FILE_BYTES else None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: no TOML: {error}") from error
-    if table is None or set(table) != {"faults"} or not isinstance(table["faults"], dict):
-        raise ConfigError(f"{path}: expected one table [faults] in at most {MAX_FILE_BYTES} bytes")
+    table, _ = read_toml(toml_text(path, MAX_FILE_BYTES, "a list of faults"), str(path))
+    if set(table) != {"faults"} or not isinstance(table["faults"], dict):
+        raise ConfigError(f"{path}: expected one table [faults]")
     return [(name, value if isinstance(value, str) else str(value)) for name, value in table["faults"].items()]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime import SHIPPED
 from pans.runtime.container import canonical_json, open_regular, parse_json_object
-from pans.runtime.errors import UsageError, as_usage_error
+from pans.runtime.errors import UsageError, as_usage_error, refusing
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import demand
 
@@ -274,8 +274,5 @@ def load_bundle(name_or_path: str | Path) -> tuple[Bundle, str]:
     if not os.path.lexists(path):
         remedy = f"name a .pans file, or a shipped bundle: {', '.join(shipped_bundles())}"
         raise UsageError(f"{path}: there is no such bundle", remedy=remedy)
-    try:
-        with open_regular(path) as file:
-            return read_bundle(file, os.fstat(file.fileno()).st_size, str(path))
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    with refusing(f"{path}: cannot be read"), open_regular(path) as file:
+        return read_bundle(file, os.fstat(file.fileno()).st_size, str(path))

@@ -159,7 +159,10 @@ def shipped_profiles() -> tuple[str, ...]:
 def parse_profile(text: str, where: str) -> Profile:
     """Check the TOML `text` (named `where` in messages) and return its facts; raises ConfigError at the first fault."""
     if len(text.encode()) > MAX_PROFILE_BYTES:
-        raise _too_large(where)
+        raise ConfigError(
+            f"{where}:1:1: a profile may hold at most {MAX_PROFILE_BYTES} bytes, found more",
+            remedy="is this a profile? see docs/reference/profiles.md",
+        )
     check = ProfileCheck(*read_toml(text, where), where)
     stated, sources, measure = check.values()
     parts = {name: section(**stated[name]) for name, section in SECTIONS.items() if name in stated}
@@ -184,13 +187,6 @@ def _read_flat(path: Path) -> NDArray[np.float64]:
             f"{path}: not a readable flat field: {error}",
             remedy="write it with numpy.savez(FILE, flat=FLAT / FLAT.mean())",
         ) from error
-
-
-def _too_large(where: str) -> ConfigError:
-    return ConfigError(
-        f"{where}:1:1: a profile may hold at most {MAX_PROFILE_BYTES} bytes, found more",
-        remedy="is this a profile? see docs/reference/profiles.md",
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Protocol
 
-from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.errors import LinkError, UsageError, refusing
 from pans.runtime.offered import load_offered, package_of
 from pans.runtime.outputs import refuse_existing
 
@@ -130,14 +130,13 @@ class TracedLink:
         self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
         self.now_ns = link.now_ns
         self.pause: Any = getattr(link, "pause", time.sleep)
-        try:
-            if force:
-                path.unlink(missing_ok=True)
-            self._file = open(path, "x", encoding="ascii", buffering=1)  # noqa: SIM115 - closed with the link
-        except FileExistsError as error:
-            raise refuse_existing(path) from error
-        except OSError as error:
-            raise UsageError(f"{path}: the trace cannot be written: {error.strerror or error}") from error
+        with refusing(f"{path}: the trace cannot be written"):
+            try:
+                if force:
+                    path.unlink(missing_ok=True)
+                self._file = open(path, "x", encoding="ascii", buffering=1)  # noqa: SIM115 - closed with the link
+            except FileExistsError as error:
+                raise refuse_existing(path) from error
         self._note("#", f"{link.name} opened; > to the device, < from it; seconds since then")
 
     def read(self, timeout_s: float) -> bytes:

@@ -29,9 +29,9 @@ from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.cli.command import parser_of
-from pans.runtime.cli.finding import find_commands, load_command
+from pans.runtime.cli.finding import find_commands, load_command, missing_extra
 from pans.runtime.cli.reading_bar import progress_bar
-from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.errors import LinkError, UsageError, refusing
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
@@ -184,8 +184,7 @@ def need_distributed() -> Any:
     try:
         return importlib.import_module("distributed")
     except ImportError as error:
-        what = "--dask needs the packages dask and distributed, which are not installed"
-        raise UsageError(what, remedy="pip install 'pans-runtime[dask]'") from error
+        raise missing_extra("--dask", "distributed", "dask") from error
 
 
 # ---- the journal ----
@@ -216,14 +215,11 @@ class Journal:
     def add(self, item: Item, row: Mapping[str, Any]) -> None:
         """Write one result, synced."""
         self.rows[item.key] = {"format": FORMAT, "key": item.key, "item": item.path, **dict(item.varied), **row}
-        try:
-            with open(self.path, "ab") as file:
-                file.write((json.dumps(self.rows[item.key]) + "\n").encode())
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            what = f"{self.path}: cannot be written: {error.strerror or error}"
-            raise UsageError(what, remedy="make room, then continue with --resume") from error
+        refused = refusing(f"{self.path}: cannot be written", "make room, then continue with --resume")
+        with refused, open(self.path, "ab") as file:
+            file.write((json.dumps(self.rows[item.key]) + "\n").encode())
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def flat_rows(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:

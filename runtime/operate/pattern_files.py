@@ -17,7 +17,7 @@ from pans.runtime import __version__
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.onnx_model import protobuf
 from pans.runtime.container import read_file
-from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.errors import DamagedFileError, UsageError, refusing
 from pans.runtime.images import levels_png, read_grey_png
 
 PICTURES_MAX = 65_535
@@ -104,10 +104,8 @@ def read_pattern_pngs(folder: Path) -> tuple[NDArray[np.float64], tuple[int, int
 
     UsageError for a folder without PNG files, DamagedFileError for a picture that is not plain grey or has another shape.
     """
-    try:
+    with refusing(f"{folder}: cannot be read", "name a folder"):
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".png")
-    except OSError as error:
-        raise UsageError(f"{folder}: cannot be read: {error.strerror or error}", remedy="name a folder") from error
     if not 1 <= len(paths) <= PICTURES_MAX:
         raise UsageError(
             f"{folder}: {len(paths)} PNG files, allowed 1 to {PICTURES_MAX}", remedy="one grey PNG for each pattern"

@@ -30,7 +30,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, sa
 from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
 from pans.runtime.container import read_file
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, refusing
 from pans.runtime.outputs import RUNS, check_outputs, make_folder, write_file
 from pans.runtime.ranges import Range
 from pans.runtime.safe_text import one_line
@@ -325,11 +325,8 @@ def _last_run(command: list[str], folder: Path) -> Run | None:
 
 def _remove(args: argparse.Namespace, name: str, path: Path) -> int:
     read_unit(path)
-    try:
+    with refusing(f"{path}: cannot be removed", "run it as its owner"):
         path.unlink()
-    except OSError as error:
-        what = f"{path}: cannot be removed: {error.strerror or error}"
-        raise UsageError(what, remedy="run it as its owner") from error
     following = [f"{_manager(args)} disable --now {path.name}", f"{_manager(args)} daemon-reload"]
     emit(args, {"removed": str(path), "next": following}, f"{path} is removed\nnext: {' && '.join(following)}")
     return EXIT_FINE

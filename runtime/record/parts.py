@@ -10,6 +10,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from glob import escape
 from itertools import pairwise
@@ -18,7 +19,7 @@ from typing import Any
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.container import Block
-from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.errors import DamagedFileError, UsageError, refusing
 
 from .format import PART_EVENT, Kind
 from .recording import Recording, read_recording
@@ -72,13 +73,9 @@ def files_of_parts(first: Path) -> list[Path]:
     """Return the parts of the recording `first`, and those that were made ahead and never begun: a later run replaces them."""
     stem, suffix = re.escape(first.stem), re.escape(first.suffix)
     wanted = re.compile(rf"{stem}-\d{{4,}}{suffix}|\.{stem}-\d{{4,}}{suffix}\.[0-9a-f]+\.partial")
-    try:
-        names = sorted(name for name in os.listdir(first.parent) if wanted.fullmatch(name))
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise UsageError(f"{first.parent}: cannot be read: {error.strerror or error}") from error
-    return [first.with_name(name) for name in names]
+    with refusing(f"{first.parent}: cannot be read"), suppress(FileNotFoundError):
+        return [first.with_name(name) for name in sorted(os.listdir(first.parent)) if wanted.fullmatch(name)]
+    return []
 
 
 # ---- the chain ----

@@ -26,7 +26,7 @@ from pans.runtime.container import MIB, canonical_json
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_commands
-from pans.runtime.errors import PansError, RecordingError, UsageError
+from pans.runtime.errors import PansError, RecordingError, UsageError, refusing
 from pans.runtime.outputs import refuse_existing
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.commands import Arm, pack_command
@@ -499,7 +499,5 @@ def _finish_part(full: RecordingFile, following: str, struck: list[Path]) -> Non
 
 
 def _remove(old: Path) -> None:
-    try:
+    with refusing(f"{old}: cannot be replaced"):
         old.unlink(missing_ok=True)
-    except OSError as error:
-        raise UsageError(f"{old}: cannot be replaced: {error.strerror or error}") from error

@@ -29,7 +29,7 @@ from pans.runtime.container import (
     read_block,
 )
 from pans.runtime.core.decision import DECISION_DTYPE
-from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.errors import DamagedFileError, UsageError, refusing
 from pans.runtime.html_card import html_card
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.framing import Messages
@@ -331,19 +331,16 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
     says what is wrong; only a file without a whole header still raises. UsageError if the file is not there.
     """
     scan, damage = _Scan(Path(path)), ""
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            try:
-                for block in _blocks(file, _start(file, str(path)), str(path)):
-                    scan.take(block)
-            except DamagedFileError as error:
-                if not salvage or not scan.kinds:
-                    whole = f"{scan.kinds.total()} whole blocks before it"
-                    raise DamagedFileError(f"{error.message}; {whole}", remedy=error.remedy) from error
-                damage = error.message
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    with refusing(f"{path}: cannot be read"), open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        try:
+            for block in _blocks(file, _start(file, str(path)), str(path)):
+                scan.take(block)
+        except DamagedFileError as error:
+            if not salvage or not scan.kinds:
+                whole = f"{scan.kinds.total()} whole blocks before it"
+                raise DamagedFileError(f"{error.message}; {whole}", remedy=error.remedy) from error
+            damage = error.message
     if not scan.kinds:
         raise DamagedFileError(f"{path}: cut after {size} bytes, within its header: nothing of it can be read")
     return Recording(

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.container import MIB, block_ends, canonical_json, file_prologue
-from pans.runtime.errors import RecordingError, UsageError
+from pans.runtime.errors import RecordingError, UsageError, refusing
 from pans.runtime.outputs import beside_name, place_new, refuse_existing, sync_folder
 
 from .format import FORMAT_VERSION, LIMITS, MAGIC, Kind
@@ -75,15 +75,14 @@ class RecordingFile:
         """Give the file its own name; UsageError if that is in use, unless `overwrite`, or cannot be given."""
         if self._hidden is None:
             return
-        try:
-            if overwrite:
-                os.replace(self._hidden, self.path)
-            else:
-                place_new(self._hidden, self.path)
-        except FileExistsError as error:
-            raise refuse_existing(self.path) from error
-        except OSError as error:
-            raise UsageError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+        with refusing(f"{self.path}: cannot be written"):
+            try:
+                if overwrite:
+                    os.replace(self._hidden, self.path)
+                else:
+                    place_new(self._hidden, self.path)
+            except FileExistsError as error:
+                raise refuse_existing(self.path) from error
         self._hidden = None
         sync_folder(self.path.parent)
 
@@ -172,10 +171,8 @@ class RecordingFile:
 
 
 def _create(name: Path, path: Path) -> Any:
-    try:
+    with refusing(f"{path}: cannot be written"):
         return open(name, "x+b", buffering=0)  # one write per block, nothing is held back
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _folder_beside(folder: Path) -> Path:

@@ -14,7 +14,7 @@ from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler
 
 from pans.runtime.cli.finding import missing_extra
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, refusing
 
 LOOPBACK = "127.0.0.1"
 REQUEST_S = 2.0  # without a byte from a client
@@ -147,12 +147,8 @@ class MetricsServer:
         except ImportError as error:
             raise missing_extra("--metrics", "prometheus-client", "metrics") from error
         registry = CollectorRegistry(auto_describe=False)
-        try:
+        with refusing(f"--metrics {address}: cannot listen there", "choose another port"):
             self._server, self._thread = start_http_server(port, self.host, registry)
-        except OSError as error:
-            raise UsageError(
-                f"--metrics {address}: cannot listen there: {error.strerror or error}", remedy="choose another port"
-            ) from error
         self.port = self._server.server_port
         self._server.RequestHandlerClass = _Handler
         self._app = make_wsgi_app(registry)

@@ -73,7 +73,7 @@ def test_faults_come_from_a_file_too(tmp_path: Path) -> None:
     path.write_text("loss = 1\n")
     with pytest.raises(ConfigError, match="one table"):
         parse_faults(str(path))
-    with pytest.raises(UsageError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="cannot be read"):
         parse_faults(str(tmp_path / "none.toml"))
 
 
