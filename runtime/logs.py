@@ -145,16 +145,20 @@ def plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-class _BoundedQueue(logging.handlers.QueueHandler):
-    """Puts lines into the queue and counts those for which there is no room."""
+class _Counting(logging.Handler):
+    """Counts the lines that cannot be written."""
 
     lost = 0
 
-    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        return record  # it stays in this process
-
     def handleError(self, record: logging.LogRecord) -> None:
         self.lost += 1
+
+
+class _BoundedQueue(_Counting, logging.handlers.QueueHandler):
+    """Puts lines into the queue and counts those for which there is no room."""
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        return record  # it stays in this process
 
 
 class _Listener(logging.handlers.QueueListener):
@@ -188,24 +192,19 @@ class _KindLimit(logging.Filter):
         return True
 
 
-class _JournalHandler(logging.StreamHandler):  # type: ignore[type-arg]
+class _JournalHandler(_Counting, logging.StreamHandler):  # type: ignore[type-arg]
     """The events of a run on a stderr that leads to the journal, with their priorities; what the command says is there already."""
 
     def __init__(self) -> None:
         super().__init__(sys.stderr)
-        self.lost = 0
         self.setFormatter(_Lines(_journal_line))
         self.addFilter(lambda record: hasattr(record, "facts"))
 
-    def handleError(self, record: logging.LogRecord) -> None:
-        self.lost += 1
 
-
-class _FileHandler(logging.handlers.RotatingFileHandler):
+class _FileHandler(_Counting, logging.handlers.RotatingFileHandler):
     """A log of ours, appended to; what cannot be written is counted."""
 
     def __init__(self, path: Path, lines: logging.Formatter, rotate_mb: float | None) -> None:
-        self.lost = 0
         if path.is_dir():  # `/` and `.` have no name beside which old ones could stand
             raise UsageError(f"{path}: is a folder, expected the name of a file", remedy=_OTHER_NAME)
         for old in (path, *(path.with_name(f"{path.name}.{number}") for number in range(1, KEPT + 1))):
@@ -217,9 +216,6 @@ class _FileHandler(logging.handlers.RotatingFileHandler):
             reason = getattr(error, "strerror", None) or error
             raise UsageError(f"{path}: cannot be written to: {reason}", remedy=_OTHER_NAME) from error
         self.setFormatter(lines)
-
-    def handleError(self, record: logging.LogRecord) -> None:
-        self.lost += 1
 
     def close(self) -> None:
         try:

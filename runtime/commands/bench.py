@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
+from pans.runtime.cli.option_fields import refuse_without
 from pans.runtime.errors import UsageError
 from pans.runtime.offered import load_offered
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
 NAMES = ("decide", "link", "loop", "ingest", "turn")
-USES = {"bundle": "decide", "inputs": "decide", "load": "loop"}  # options of one benchmark alone
+OF_ONE = {"decide": {"bundle": [], "inputs": []}, "loop": {"load": False}}  # options of one benchmark alone
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -38,9 +39,9 @@ def _run(args: argparse.Namespace) -> int:
     from pans.runtime.bench.rows import BenchOptions, machine_facts, table_text, write_plot
     from pans.runtime.cli.finding import needed
 
-    for option, name in USES.items():
-        if getattr(args, option) and args.what not in (name, "all"):
-            raise UsageError(f"--{option} has no effect on `pans bench {args.what}`", remedy=f"it belongs to {name}")
+    for name, options_of_it in OF_ONE.items():
+        if args.what not in (name, "all"):
+            refuse_without(args, name, options_of_it)
     if args.inputs and len(args.inputs) != len(args.bundle):
         what = f"{len(args.inputs)} times --inputs and {len(args.bundle)} times --bundle"
         raise UsageError(what, remedy="give one --inputs for each --bundle")

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -139,7 +139,8 @@ def run_once(
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
         try:
             # ports first: a busy one is refused before anything is compiled or opened
-            with _metrics_of(options) as metrics, _osc_of(options) as osc, ExitStack() as ending:
+            with ExitStack() as listened, ExitStack() as ending:
+                metrics, osc = _listeners_of(options, listened)
                 with _monitor_of(options) as monitor:
                     around = _Around(stop, watchdog, monitor, metrics, osc, besides, ending)
                     done = _prepare_and_run(options, profile, around)
@@ -498,20 +499,18 @@ def _traced(options: RunOptions, link: Link, path: Path, around: _Around) -> Lin
     return traced
 
 
-def _metrics_of(options: RunOptions) -> AbstractContextManager[MetricsServer | None]:
-    if not options.metrics:
-        return nullcontext()
-    from pans.runtime.watch.metrics import MetricsServer
+def _listeners_of(options: RunOptions, opened: ExitStack) -> tuple[MetricsServer | None, OscSender | None]:
+    """Return what serves and sends figures, as far as it is asked for; `opened` closes both."""
+    metrics, osc = None, None
+    if options.metrics:
+        from pans.runtime.watch.metrics import MetricsServer
 
-    return closing(MetricsServer(options.metrics))
+        metrics = opened.enter_context(closing(MetricsServer(options.metrics)))
+    if options.osc:
+        from pans.runtime.watch.osc import OscSender
 
-
-def _osc_of(options: RunOptions) -> AbstractContextManager[OscSender | None]:
-    if not options.osc:
-        return nullcontext()
-    from pans.runtime.watch.osc import OscSender
-
-    return closing(OscSender(options.osc))
+        osc = opened.enter_context(closing(OscSender(options.osc)))
+    return metrics, osc
 
 
 def _monitor_of(options: RunOptions) -> Monitor:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
-
-if TYPE_CHECKING:
-    from pans.runtime.instrument.profile import Profile
+from pans.runtime.instrument.profile import (
+    Profile,
+    load_profile,
+    parse_profile,
+    profile_template,
+    profile_text,
+    shipped_profiles,
+)
+from pans.runtime.outputs import check_outputs, write_file
 
 ACTIONS = ("list", "show", "check", "new")
 DEFAULT_BASE = "oled-qcmos"
@@ -32,8 +38,6 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from pans.runtime.instrument.profile import load_profile, shipped_profiles
-
     if args.names:
         raise UsageError("`pans profile list` takes no names", remedy=f"pans profile show {args.names[0]}")
     profiles = [load_profile(name) for name in shipped_profiles()]
@@ -45,8 +49,6 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> int:
-    from pans.runtime.instrument.profile import load_profile, profile_text
-
     name = _only_name(args, "pans profile show oled-qcmos")
     profile = load_profile(name)
     emit(args, {**_facts(name, profile), "toml": profile.text}, profile_text(name).rstrip("\n"))
@@ -55,7 +57,6 @@ def _show(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> int:
     from pans.runtime.detector.limits import law_warnings
-    from pans.runtime.instrument.profile import load_profile
 
     if not args.names:
         raise UsageError("no profile was named", remedy="pans profile check my-lab.toml")
@@ -72,9 +73,6 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _new(args: argparse.Namespace) -> int:
-    from pans.runtime.instrument.profile import parse_profile, profile_template, shipped_profiles
-    from pans.runtime.outputs import check_outputs, write_file
-
     path, base = Path(_only_name(args, "pans profile new my-lab.toml")), args.base or DEFAULT_BASE
     if path.suffix != ".toml":
         remedy = f"pans profile new {path.name or 'my-lab'}.toml"

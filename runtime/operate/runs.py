@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, warn
+from pans.runtime.cli.option_fields import refuse_without
 from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import LATEST, RUNS, locked
@@ -90,7 +91,7 @@ def run_of(folder: Path) -> Run | None:
     files = tuple(path for path in entries if OURS.fullmatch(path.name))
     (header, bundle), summary = _begin(recordings[0]), _end(recordings[-1])
     dark, faults = summary.get("dark"), summary.get("faults")
-    watched = isinstance(dark, dict) and dark.get("exposures")
+    dark = dark if isinstance(dark, dict) and dark.get("exposures") else {}
     started = datetime.fromtimestamp(recordings[0].stat().st_mtime, UTC)
     with suppress(ValueError):
         started = datetime.fromisoformat(str(header.get("created_utc", "")))
@@ -102,7 +103,7 @@ def run_of(folder: Path) -> Run | None:
         verdict="running" if is_locked else str(summary.get("verdict", "cut"))[:20],
         decisions=_number(summary.get("decisions")),
         accuracy=_number(summary.get("accuracy")),
-        dark_per_exposure=_number(dark.get("per_exposure")) if watched else None,
+        dark_per_exposure=_number(dark.get("per_exposure")),
         bytes=sum(path.stat().st_size for path in files),
         simulated=bool(header.get("simulated") or summary.get("simulated")),
         locked=is_locked,
@@ -256,10 +257,7 @@ def _run(args: argparse.Namespace) -> int:
     folder = Path(rest[0]) if rest else RUNS
     if prunes:
         return _prune(args, folder)
-    for name in ("older_than", "larger_than", "keep", "yes"):
-        if getattr(args, name) not in (None, False):
-            option = name.replace("_", "-")
-            raise UsageError(f"--{option} has no effect on a list", remedy=f"pans runs prune --{option} ...")
+    refuse_without(args, "prune", {"older_than": None, "larger_than": None, "keep": None, "yes": False})
     runs, latest = runs_in(folder), folder / LATEST
     total = sum(run.bytes for run in runs)
     named = {"folder": str(folder), "latest": str(latest.resolve()) if latest.is_symlink() else None}
