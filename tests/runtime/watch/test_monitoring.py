@@ -80,24 +80,27 @@ def test_promtool_accepts_configuration_and_rules() -> None:
 
 
 def test_rules_fire_at_once_or_after_enough_history(tmp_path: Path) -> None:
-    """Of a run that begins at minute 0, has an alarm from minute 60 to 90, and grows by 1 MB a minute."""
-    states = {  # minute -> the states of these three rules
-        0: {"PansRunFailed": "firing"},
+    """Of a run that begins at minute 0, is scraped from minute 1 to 941, has an alarm from minute 60 to 90, and grows by 1 MB a minute."""
+    states = {  # minute -> the states of four rules
+        0: {"PansRunFailed": "firing", "PansGone": "pending"},
+        1: {"PansRunFailed": "firing"},
         59: {"PansRunFailed": "firing"},
         60: {"PansAlarm": "firing"},
         90: {},
         419: {},
         421: {"PansMemoryGrows": "pending"},
         782: {"PansMemoryGrows": "firing"},
+        960: {"PansMemoryGrows": "firing", "PansGone": "firing"},
     }
     series = {
         "pans_alarm{kind='hot'}": "0x59 1x29 0x900",
         "pans_alarm{kind='light'}": "0x990",
+        "pans_running": "_ 1x940 _x50",
         "pans_last_run_failed": "1x990",
         "pans_uptime_seconds": "0+60x990",
         "pans_resident_memory_bytes": "0+1000000x990",
     }
-    found = 'count by (alertname, alertstate) (ALERTS{alertname=~"PansAlarm|PansRunFailed|PansMemoryGrows"})'
+    found = 'count by (alertname, alertstate) (ALERTS{alertname=~"PansAlarm|PansGone|PansRunFailed|PansMemoryGrows"})'
     test = {
         "interval": "1m",
         "input_series": [{"series": name, "values": values} for name, values in series.items()],
