@@ -18,7 +18,10 @@ from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
 NAMES = ("decide", "link", "loop", "ingest", "turn")
-OF_ONE = {"decide": {"bundle": [], "inputs": []}, "loop": {"load": False}}  # options of one benchmark alone
+OF_ONE: dict[str, dict[str, Any]] = {
+    "decide": {"bundle": [], "inputs": []},
+    "loop": {"load": False},
+}  # options of one benchmark alone
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
