@@ -90,6 +90,8 @@ def test_folders_that_the_run_writes_to_are_writable(lab: Path, pans: Pans) -> N
     inside = str(lab).replace("%", "%%")
     assert set(paths) == {inside, f"{inside}/out", "/var/tmp/pans-test-logs"}
     assert not Path("units").exists()
+    assert main(["service", "show", "--config", "lab.toml"]) == 0
+    assert "keep-runs-mb" in pans.said().err  # each restart would leave another folder
 
 
 def test_foreign_units_stay(lab: Path, pans: Pans) -> None:

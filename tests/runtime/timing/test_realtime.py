@@ -244,14 +244,14 @@ def test_time_in_which_another_thread_has_the_core_is_waited(monkeypatch: pytest
     data, core = bytes(1 << 24), os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(core)})
     try:
-        counts, other = ThreadCounts(), threading.Thread(target=hash_for, args=(0.4, data))
+        counts, other = ThreadCounts(), threading.Thread(target=hash_for, args=(0.3, data))
         other.start()
-        hash_for(0.4, data)
+        hash_for(0.3, data)
         waited_ms = counts.since()["waited_ms"]
         other.join()
     finally:
         os.sched_setaffinity(0, core)
-    assert 100 <= waited_ms <= 10_000
+    assert 60 <= waited_ms <= 10_000
 
 
 def hash_for(seconds: float, data: bytes) -> None:
