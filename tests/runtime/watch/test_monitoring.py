@@ -62,7 +62,7 @@ def test_the_dashboard_is_one_that_grafana_reads_and_labels_exist() -> None:
         for target in panel["targets"]:
             assert 'instance=~"$instance"' in target["expr"]
     assert set(LABELS.findall(RULES.read_text())) <= {"instance", "kind"}
-    assert set(LABELS.findall(DASHBOARD.read_text())) <= {"instance", "cause"}
+    assert set(LABELS.findall(DASHBOARD.read_text())) <= {"instance", "cause", "kind"}
 
 
 def test_prometheus_reads_every_expression_of_the_dashboard(tmp_path: Path) -> None:
