@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from .errors import DamagedFileError, UsageError
+from .errors import DamagedFileError, UsageError, refusing
 
 MIB = 1 << 20
 FILE_MAX_BYTES = 64 * MIB  # of a bundle: its arrays, its sessions and the program stay below 400 MiB together
@@ -149,16 +149,13 @@ _NO_FILES = {
 
 def read_file(path: str | Path, max_bytes: int = FILE_MAX_BYTES) -> bytes:
     """Return the bytes of `path`; UsageError when it is not there, DamagedFileError above `max_bytes`."""
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size > max_bytes:
-                what, taker = other_kind(file.read(KIND_BYTES))
-                found = f", it is {what}" if what else ""
-                raise DamagedFileError(f"{path}: {size} bytes{found}, allowed at most {max_bytes}", remedy=taker)
-            data = file.read(max_bytes + 1)  # the file may grow meanwhile
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}", remedy="check the disk") from error
+    with refusing(f"{path}: cannot be read", "check the disk"), open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > max_bytes:
+            what, taker = other_kind(file.read(KIND_BYTES))
+            found = f", it is {what}" if what else ""
+            raise DamagedFileError(f"{path}: {size} bytes{found}, allowed at most {max_bytes}", remedy=taker)
+        data = file.read(max_bytes + 1)  # the file may grow meanwhile
     if len(data) > max_bytes:
         raise DamagedFileError(f"{path}: more than {max_bytes} bytes")
     return data

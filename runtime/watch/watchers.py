@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -31,26 +32,22 @@ NOTIFICATIONS_PER_TIMEOUT = 3
 MAX_FAULTS = 20  # of the state file; the recording has them all
 
 
+@dataclass
 class Watchers:
     """State file, metrics and messages of one run; enter before it, `prepared` when it is there."""
 
-    def __init__(
-        self,
-        wanted: RunOptions,
-        recorder: Recorder | None,
-        watchdog: Watchdog | None,
-        stop: Stop,
-        metrics: MetricsServer | None,
-    ) -> None:
-        self._wanted, self._recorder, self._watchdog, self._stop = wanted, recorder, watchdog, stop
-        self._metrics = metrics
-        self._host: HostWatch | None = None
-        self._run: LiveRun | None = None
-        self._state: StateFile | None = None
-        self._notifier: Notifier | None = None
-        self._started_s = time.monotonic()
-        self._outcome: dict[str, Any] = {}
-        self._open = ExitStack()
+    _wanted: RunOptions
+    _recorder: Recorder | None
+    _watchdog: Watchdog | None
+    _stop: Stop
+    _metrics: MetricsServer | None
+    _host: HostWatch | None = None
+    _run: LiveRun | None = None
+    _state: StateFile | None = None
+    _notifier: Notifier | None = None
+    _started_s: float = field(default_factory=time.monotonic)
+    _outcome: dict[str, Any] = field(default_factory=dict)
+    _open: ExitStack = field(default_factory=ExitStack)
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
