@@ -48,7 +48,6 @@ def _configure_replay(parser: argparse.ArgumentParser) -> None:
 
 
 def _replay(args: argparse.Namespace) -> int:
-
     if args.pictures is not None:
         check_outputs([args.pictures], inputs=[args.recording, args.bundle, args.truth], force=args.force)
     of_parts, pictures = is_of_parts(args.recording), PictureLog() if args.pictures or args.truth else None
@@ -57,7 +56,9 @@ def _replay(args: argparse.Namespace) -> int:
     rows: list[dict[str, Any]] = []
     lines: list[str] = []
     for path in parts_in(args.recording) if of_parts else [args.recording]:
-        recording, found = _replayed(args, path, pictures)
+        recording = read_recording(path)
+        bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
+        found = replay(recording, bundle, pictures)
         rows.append({"decisions": found.decisions, "sha256": found.sha256, **_facts(recording, found)})
         of_one = f"{found.decisions} decisions, SHA-256 {found.sha256}"
         head = f"{path.name}: {found.decisions} decisions" if of_parts else of_one
@@ -79,13 +80,6 @@ def _replay(args: argparse.Namespace) -> int:
         payload |= pictures.compare(args.truth)
     emit(args, payload, "\n".join(lines))
     return EXIT_FINE if identical else EXIT_ALERT
-
-
-def _replayed(args: argparse.Namespace, path: Path, pictures: PictureLog | None = None) -> tuple[Recording, Replayed]:
-
-    recording = read_recording(path)
-    bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
-    return recording, replay(recording, bundle, pictures)
 
 
 def _facts(recording: Recording, found: Replayed) -> dict[str, Any]:
