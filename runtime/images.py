@@ -497,28 +497,36 @@ def shipped_scene(name: str) -> Path | None:
     return Path(str(found)) if "/" not in name and found.is_file() else None
 
 
+def scene_arrays(path: Path, most: int) -> dict[str, NDArray[Any]]:
+    """Return `images` of a .npz file, uint8 (n, height, width) and not empty, with its `labels` and `classes` if there are any.
+
+    UsageError for another file, or for arrays of more than `most` bytes together.
+    """
+    remedy = "write a scene with numpy.savez(FILE, images=, labels=, classes=)"
+    try:
+        arrays = read_arrays(path, ("images", "labels", "classes"), most)
+    except ValueError as error:
+        raise UsageError(f"{path}: not a readable scene: {error}", remedy=remedy) from error
+    images = arrays.get("images", np.zeros(0))
+    if images.dtype != np.uint8 or images.ndim != 3 or not images.size:
+        found = f"{images.dtype} {images.shape}" if "images" in arrays else "no array `images`"
+        raise UsageError(
+            f"{path}: images must be uint8 (objects, height, width) and not empty, found {found}", remedy=remedy
+        )
+    return arrays
+
+
 def read_labelled(name: str) -> LabelledPictures:
     """Return images uint8 (n, h, w), labels int64 (n,) and class names ("" for unnamed ones); UsageError says what is wrong."""
     path = Path(name)
     if path.is_dir():
         return read_class_folder(path, LABELLED_MAX_BYTES)
     path = path if path.exists() else shipped_scene(name) or path
-    try:
-        arrays = read_arrays(path, ("images", "labels", "classes"), LABELLED_MAX_BYTES)
-    except ValueError as error:
-        raise UsageError(
-            f"{path}: no file of labelled images: {error}",
-            remedy="name a .npz file with images and labels, a folder of class folders, or a shipped scene",
-        ) from error
-    images, labels = arrays.get("images", np.zeros(0)), arrays.get("labels", np.zeros(0))
-    if images.dtype != np.uint8 or images.ndim != 3 or not images.size or labels.shape != images.shape[:1]:
-        raise UsageError(
-            f"{path}: images {images.dtype} {images.shape}, labels {labels.dtype} {labels.shape}, "
-            "allowed: uint8 (n, height, width), integers (n,)",
-            remedy="save them with numpy.savez(FILE, images=, labels=)",
-        )
-    if labels.dtype.kind not in "iu":
-        raise UsageError(f"{path}: labels are {labels.dtype}, allowed: integers")
+    arrays = scene_arrays(path, LABELLED_MAX_BYTES)
+    images, labels = arrays["images"], arrays.get("labels", np.zeros(0))
+    if labels.dtype.kind not in "iu" or labels.shape != images.shape[:1]:
+        found = f"labels are {labels.dtype} {labels.shape}"
+        raise UsageError(f"{path}: {found}, allowed: integers, one for each of {len(images)} images")
     classes = tuple(str(name) for name in arrays.get("classes", np.zeros(0, str)).ravel())
     return LabelledPictures(images, labels.astype(np.int64), classes, "")
 

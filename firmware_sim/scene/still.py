@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import ConfigError, PansError, UsageError
-from pans.runtime.images import read_class_folder
+from pans.runtime.images import read_class_folder, scene_arrays
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging
-from pans.runtime.npz_file import read_arrays
 from pans.runtime.registration.target import built_in_target
 
 MAX_OBJECTS = 1 << 17
@@ -106,8 +105,6 @@ def load_images(name: str, base: Path) -> Scene:
 
 def scene_from_arrays(name: str, images: NDArray[Any], labels: NDArray[Any] | None, classes: tuple[str, ...]) -> Scene:
     """Make a `Scene` of images uint8 (n, height, width), labels integer (n,) or None, and class names; ConfigError."""
-    if images.ndim != 3 and images.dtype == np.uint8:
-        raise ConfigError(f"{name}: images must be (objects, height, width), found {_kind(images)}")
     if images.dtype != np.uint8 or images.ndim != 3 or not images.size:
         raise ConfigError(f"{name}: images must be uint8 (objects, height, width) and not empty, found {_kind(images)}")
     if len(images) > MAX_OBJECTS or images.shape[1] * images.shape[2] > MAX_PIXELS:
@@ -139,14 +136,9 @@ def _target(name: str) -> Scene:
 
 def _read_scene(path: Path, name: str) -> Scene:
     try:
-        arrays = read_arrays(path, ("images", "labels", "classes"), MAX_SCENE_BYTES)
-    except (ValueError, UsageError) as error:
-        raise ConfigError(
-            f"{path}: not a readable scene file: {error}",
-            remedy="write it with numpy.savez(FILE, images=, labels=, classes=)",
-        ) from error
-    if "images" not in arrays:
-        raise ConfigError(f"{path}: no array `images`, found {', '.join(sorted(arrays)) or 'nothing'}")
+        arrays = scene_arrays(path, MAX_SCENE_BYTES)
+    except UsageError as error:
+        raise ConfigError(error.message, remedy=error.remedy) from error
     for array in arrays.values():
         array.flags.writeable = False  # nobody else has them: no copy
     checked = scene_from_arrays(str(path), arrays["images"], arrays.get("labels"), _classes(path, arrays))

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
-from pans.runtime.images import likeness, shipped_scene
-from pans.runtime.npz_file import npz_bytes, read_arrays
+from pans.runtime.images import likeness, scene_arrays, shipped_scene
+from pans.runtime.npz_file import npz_bytes
 from pans.runtime.outputs import write_file
 
 from .replaying import ClickLog
@@ -62,13 +62,4 @@ class PictureLog(ClickLog):
 
 def _images(name: Path) -> NDArray[np.uint8]:
     path = name if name.exists() else shipped_scene(str(name)) or name
-    try:
-        images = read_arrays(path, ("images",), TRUTH_MAX_BYTES).get("images", np.zeros(0))
-    except ValueError as error:
-        raise UsageError(
-            f"{path}: no scene with an array `images`: {error}",
-            remedy="name a shipped scene or a .npz file with images",
-        ) from error
-    if images.dtype != np.uint8 or images.ndim != 3 or not images.size:
-        raise UsageError(f"{path}: images are {images.dtype} {images.shape}, allowed: uint8 (n, height, width)")
-    return np.asarray(images)
+    return scene_arrays(path, TRUTH_MAX_BYTES)["images"]

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import UsageError
-from pans.runtime.npz_file import read_arrays
 
 CELLS = ("#.#..#", "##.#..", "..#..#", "..#...", "..#..#", "##.###")
 SIDE = 28
@@ -44,20 +43,10 @@ def read_target(path: Path) -> U8:
 
     UsageError for a file that is neither, for too few or too many pixels, and for a picture without contrast.
     """
-    if path.suffix == ".npz":
-        try:
-            images = read_arrays(path, ("images", "labels", "classes"), TARGET_BYTES).get("images")
-        except ValueError as error:
-            raise UsageError(f"{path}: not a readable scene: {error}", remedy="numpy.savez(FILE, images=)") from error
-        if images is None or images.ndim != 3 or images.dtype != np.uint8 or not images.size:
-            raise UsageError(
-                f"{path}: no array `images`, uint8 (objects, rows, columns)", remedy="numpy.savez(FILE, images=)"
-            )
-        picture = images[0]
-    else:
-        from pans.runtime.images import read_grey
+    from pans.runtime.images import read_grey, scene_arrays
 
-        picture = read_grey(path, MOST_PIXELS)
+    is_scene = path.suffix == ".npz"
+    picture = scene_arrays(path, TARGET_BYTES)["images"][0] if is_scene else read_grey(path, MOST_PIXELS)
     return _checked(picture, str(path))
 
 

@@ -57,7 +57,7 @@ def test_every_shipped_scene_loads() -> None:
     [
         ({"pictures": IMAGES}, "no array `images`"),
         ({"images": IMAGES.astype(np.float32)}, "must be uint8"),
-        ({"images": IMAGES[0]}, "must be .objects, height, width."),
+        ({"images": IMAGES[0]}, "objects, height, width"),
         ({"images": IMAGES[:0]}, "not empty"),
         ({"images": IMAGES, "labels": np.zeros(2, np.int16)}, "one for each image"),
         ({"images": IMAGES, "labels": np.zeros(3)}, "must be integers"),
