@@ -36,7 +36,10 @@ Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 def closing_words(summary: Summary, recording: str, report: str) -> str:
     """The lines that the command ends with."""
     facts = summary.as_json()
-    last = [*(("fault", fault, "") for fault in facts["faults"]), *(("busy", words, "") for words in _busy_words(facts))]
+    last = [
+        *(("fault", fault, "") for fault in facts["faults"]),
+        *(("busy", words, "") for words in _busy_words(facts)),
+    ]
     last += [("recording", recording, ""), ("report", report, "")]
     simulated = "SIMULATED · " * facts["simulated"]
     head = f"{simulated}{facts['verdict']}: {facts['decisions']} decisions ({objects_words(facts)})"

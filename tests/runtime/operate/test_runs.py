@@ -49,7 +49,7 @@ def test_the_list_says_what_the_summary_says(root: Path, capsys: pytest.CaptureF
         assert run["verdict"] in ("PASS", "FAIL")
         assert run["verdict"] in summary
         assert all(f"- {fault}" in summary for fault in run["faults"])
-        clicks, exposures = re.findall(r"dark clicks per dark exposure \| (\d+) in (\d+)", summary)[0]
+        clicks, exposures = re.findall(r"(\d+) clicks in (\d+) dark exposures", summary)[0]
         assert run["dark_per_exposure"] == pytest.approx(int(clicks) / int(exposures))
         assert run["bytes"] == sum(path.stat().st_size for path in (root / name).iterdir())
         assert datetime.now(UTC) - datetime.fromisoformat(run["started"]) < timedelta(hours=1)
