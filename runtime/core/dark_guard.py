@@ -470,18 +470,6 @@ class DarkGuard:
             channels=tuple(rows),
         )
 
-    def words(self) -> str:
-        """One line on the present state, for the live view; "" when nothing is wrong."""
-        return "; ".join(
-            f"{finding.kind} ({finding.level}, {finding.rate / finding.expected:.3g} times the expected rate"
-            + (
-                f", channel {', '.join(map(str, finding.channels))})"
-                if len(finding.channels) < self.watch.n_channels
-                else ")"
-            )
-            for finding in self.health.present
-        )
-
 
 def cut_out(pattern: NDArray[np.bool_], first: int, n: int) -> NDArray[np.bool_]:
     """Return places `first` to `first` + `n` of `pattern`, bool (m,), repeated without end."""

@@ -25,6 +25,17 @@ TROUBLE = (
 )
 
 
+def words_of(event: dict[str, Any]) -> str:
+    """Return why an event happened, in its own words, or its facts; of late or missing work the cause, how sure it is, and where."""
+    found = next((str(event[key]) for key in ("why", "reason", "message", "text", "words") if event.get(key)), "")
+    found = found or ", ".join(f"{key} {value}" for key, value in event.items() if key != "kind")
+    if event["kind"] != "blame":
+        return found
+    first = event.get("first_decision")
+    where = "" if first is None else f" (from decision {first})"
+    return f"{event['cause']}{'' if event['sure'] else ', not surely'}: {found}{where}"
+
+
 class Journal:
     """The notes of one run, across reconnections."""
 

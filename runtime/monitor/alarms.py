@@ -29,13 +29,17 @@ INSTANT = {
 
 @dataclass(slots=True)
 class Alarm:
-    """What was wrong, in seconds of the run; `end_s` is None while it is, and `begin_s` of what has no length."""
+    """What was wrong, in seconds of the run; `end_s` is None while it is, and `begin_s` of what has no length.
+
+    What is found in counts began before it was noticed: there `begin_s` is the beginning of the data that it was found in.
+    """
 
     name: str
     level: str  # note, warn or bad
     begin_s: float
     end_s: float | None
     cause: str
+    noticed_s: float
 
 
 class Alarms:
@@ -51,15 +55,18 @@ class Alarms:
         """Compare the latest picture with what was wrong before."""
         picture = history.picture
         now_s = float(picture["elapsed_s"])
-        for kind, words in picture.get("events", ()):
-            if kind in INSTANT:
-                self._add(Alarm(*INSTANT[kind], now_s, now_s, one_line(words, 300)))
+        for kind, words, since in picture.get("events", ()):
+            begin_s = now_s if since is None else history.when("decisions", since)
+            self._add(Alarm(*INSTANT[kind], begin_s, now_s, one_line(words, 300), now_s))
         present = self._present(history, now_s)
         for name in [name for name in self._open if name not in present or picture["ended"]]:
             self._open.pop(name).end_s = min(now_s, self._grew_s.get(name, now_s))
         for name, (level, cause) in {} if picture["ended"] else present.items():
             if name not in self._open:
-                self._open[name] = self._add(Alarm(name, level, now_s, None, cause))
+                begin_s = now_s
+                if name == "dark counts" and picture.get("dark_states"):
+                    begin_s = history.when("dark_exposures", min(since for *_, since in picture["dark_states"]))
+                self._open[name] = self._add(Alarm(name, level, begin_s, None, cause, now_s))
             self._open[name].cause = cause
 
     def _add(self, alarm: Alarm) -> Alarm:

@@ -15,6 +15,7 @@ from .history import RECENT_S, History, quantile_us
 NAME_CHARACTERS = 40
 NO_LABEL = 0xFFFF  # of a decision that abstained (decide/verdict.py), which would load numpy
 CLASSES_SHOWN = 20
+RISE_SEEN = 3.0  # times the expected dark counts: where a larger rise is not excluded, too little was seen
 DISK_LOW_S, DISK_SHORT_S = 3600.0, 86_400.0
 DISK_KNOWN_S = 10.0  # before, the recording is its header
 GIB, MIB = 1 << 30, 1 << 20
@@ -51,7 +52,7 @@ def headline(history: History) -> str:
     accuracy = "" if not picture["known"] else f" · accuracy {picture['right'] / picture['known']:.1%}"
     clicks = picture["clicks"] / decisions if decisions else 0.0
     p99 = quantile_us(history.latency, 0.99) or 0.0
-    dark, dark_level = _dark_state(picture)
+    dark, _, dark_level = _dark_state(picture)
     return (
         f"{decisions}{f' of {expected}' if expected else ''} decisions{accuracy} · {clicks:.2f} clicks each"
         f" · p99 {p99 / 1000:.2f} ms · late {picture['late']} · lost {picture['lost']}"
@@ -154,31 +155,38 @@ def _dark(picture: dict[str, Any]) -> Row:
     if not exposures:
         return Row("instrument", "dark counts", "no dark exposures yet", "note")
     low, high = wilson_interval(clicks, exposures)
-    text = f"{clicks / exposures:.3g} per exposure, 95 % interval {low:.2g} to {high:.2g}"
+    text = f"in the whole run {clicks / exposures:.3g} per exposure, 95 % interval {low:.2g} to {high:.2g}"
     expected = picture.get("dark_expected")
     if expected is not None:
         top = picture["dark_high"]
         text += f"; expected {expected:.2g}" + (f", at most {top:.2g}" if top > expected * 1.0001 else "")
-    words, level = _dark_state(picture)
-    return Row("instrument", "dark counts", text + (f"; {words}" if words else ""), level)
+    _, words, level = _dark_state(picture)
+    return Row("instrument", "dark counts", f"{words}; {text}" if words else text, level)
 
 
-def _dark_state(picture: dict[str, Any]) -> tuple[str, str]:
-    """Return what the dark counts are, in words, and its level; ("", "") where nothing is expected of them or none came.
+def _dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
+    """Return what the dark counts are, in a few words and in all, and its level; all "" where nothing is expected of them or none came.
 
-    A rate whose interval excludes what is expected is not called so, long before there is evidence for an alarm.
+    An alarm's words have the rate of the exposures that it was raised on. A rate whose interval excludes what is expected is not
+    called so, long before there is evidence for an alarm; nor is one whose interval reaches beyond RISE_SEEN times that.
     """
-    if words := picture.get("dark_words"):
-        return one_line(words, 200), LEVELS.get(picture.get("dark_level", ""), "note")
+    if states := picture.get("dark_states"):
+        level, ratio, *_ = states[0]
+        return f"{ratio:.3g} times as expected", "; ".join(one_line(one[2], 300) for one in states), LEVELS[level]
     expected = picture.get("dark_expected")
     if expected is None or not picture["dark_exposures"]:
-        return "", ""
+        return "", "", ""
     low, high = wilson_interval(picture["dark_clicks"], picture["dark_exposures"])
     if low <= picture["dark_high"] and high >= picture.get("dark_low", expected):
-        return "as expected", "good"
+        rise = f"no rise of the mean above {high / expected:.3g} times"
+        if high <= RISE_SEEN * expected:
+            return "as expected", f"as expected, {rise}", "good"
+        more = f"{rise} is all that can be said (--dark-slots gives more dark exposures)"
+        return "too few to judge", f"too few to judge, {more}", ""
     after = picture.get("dark_alarm_after")
     then = "no alarm at this rate" if after is None else f"alarm after about {after:,} more dark exposures at this rate"
-    return f"{'higher' if low > picture['dark_high'] else 'lower'} than expected, not yet sure ({then})", "note"
+    off = f"{'higher' if low > picture['dark_high'] else 'lower'} than expected, not yet sure"
+    return off, f"{off} ({then})", "note"
 
 
 def _machine(history: History) -> list[Row]:
@@ -256,9 +264,9 @@ def health(history: History) -> list[tuple[str, str, str]]:
     if picture["state"] != "running" and not picture["ended"]:
         link = "bad", f"The run is: {picture['state']}, after {picture['elapsed_s']:,.0f} s."
     dark, exposures = history.dark(sums)
-    words, level = _dark_state(picture)
+    words, _, level = _dark_state(picture)
     rate = f"{dark / exposures:.2g} dark counts per exposure" if exposures else "No dark exposures yet"
-    detector = level or "note", f"{rate}{f': {words}' if words else ''}."
+    detector = level or "note", f"{rate}{f', {words}' if words else ''}."
     return [(name, *one) for name, one in zip(("machine", "link", "detector"), (machine, link, detector))]
 
 

@@ -92,6 +92,17 @@ class History:
         seconds = float(last["elapsed_s"]) - float(first["elapsed_s"])
         return (last.get(name, 0) - first.get(name, 0)) / seconds if seconds > 0 else 0.0
 
+    def when(self, name: str, count: float) -> float:
+        """Return when the sum `name` of the run was `count`, in seconds of the run, between the ends of the bin that it lies in."""
+        at = SUMS.index(name)
+        for bins in self.bins.values():
+            later = self.picture[name] - count
+            for one in reversed(bins):
+                if one.sums[at] > 0 and later <= one.sums[at]:
+                    return one.end_s - (one.end_s - one.begin_s) * max(0.0, later) / one.sums[at]
+                later -= one.sums[at]
+        return 0.0
+
     def recent(self) -> tuple[dict[str, float], Counter[int]]:
         """Return the sums and the latencies of the last minute."""
         sums, latency = dict.fromkeys(SUMS, 0.0), Counter[int]()

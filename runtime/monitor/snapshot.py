@@ -25,8 +25,11 @@ from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.decide.verdict import log_evidence
 from pans.runtime.instrument.channel_health import LEVELS
+from pans.runtime.live.journal import words_of
 from pans.runtime.timing.ledger import upper_edge
 from pans.runtime.watch.state_file import state_of
+
+from .alarms import INSTANT
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
@@ -197,8 +200,10 @@ class Snapshots:
             "dark_low": float(watch.low.mean()),
             "dark_high": float(watch.high.mean()),
             "dark_alarm_after": watch.alarm_after(),
-            "dark_words": guard.words(),
-            "dark_level": max((one.level for one in guard.health.present), key=LEVELS.index, default=""),
+            "dark_states": [
+                [one.level, one.rate / one.expected, one.words, one.since * watch.n_channels]
+                for one in sorted(guard.health.present, key=lambda one: -LEVELS.index(one.level))
+            ],
         }
 
     def _clock(self) -> dict[str, Any]:
@@ -213,7 +218,7 @@ class Snapshots:
             "exposed": [told.exposures, told.start_error * tick_us, told.length_error * tick_us] if tells else None,
             "clock_uncertainty_us": self._run.timing.worst_uncertainty_ns / 1000,
             "trouble": "" if trouble is None else _trouble_of(trouble),
-            "events": [[event["kind"], _words_of(event)] for event in news if event["kind"] != "late"],
+            "events": [[e["kind"], words_of(e), e.get("since")] for e in news if e["kind"] in INSTANT],
         }
 
     def _disk_facts(self) -> dict[str, Any]:
@@ -230,14 +235,9 @@ class Snapshots:
         return self._disk
 
 
-def _words_of(event: dict[str, Any]) -> str:
-    found = next((str(event[key]) for key in ("why", "reason", "message", "text", "words") if event.get(key)), "")
-    return found or ", ".join(f"{key} {value}" for key, value in event.items() if key != "kind")
-
-
 def _trouble_of(event: dict[str, Any]) -> str:
-    kind = "late or missing work" if event["kind"] == "blame" else str(event["kind"]).replace("_", " ")
-    return f"{kind}: {_words_of(event)}"
+    kind = "cause of late or missing work" if event["kind"] == "blame" else str(event["kind"]).replace("_", " ")
+    return f"{kind}: {words_of(event)}"
 
 
 def _facts_of(row: Decision) -> list[Any]:

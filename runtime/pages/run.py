@@ -18,6 +18,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.flow.matching import abort_reason
 from pans.runtime.intervals import wilson_interval
+from pans.runtime.monitor.figures import RISE_SEEN
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import iter_exposures
 from pans.runtime.record.parts import first_decision
@@ -269,6 +270,7 @@ def run_page(recording: Recording) -> bytes:
     confusion = passing["confusion"] if passing else decisions.confusion
     return render(
         "run.html",
+        rise_seen=RISE_SEEN,
         recording=recording,
         summary=summary,
         bundle=bundle,

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.container import canonical_json
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.errors import UsageError
+from pans.runtime.live.journal import words_of
 from pans.runtime.outputs import replace_file
 
 from .repeated import Repeated
@@ -83,8 +84,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
     timing, stream, tallies = run.timing, run.core.tracker.counters, run.core.tallies
     told = run.core.exposed
     exposed = {"exposure_start_us": told.start_error, "exposure_length_us": told.length_error} if told.exposures else {}
-    incidents, trouble = run.lateness.incidents, run.journal.trouble or {}
-    reason = next((trouble[key] for key in ("why", "reason", "message", "text") if trouble.get(key)), "")
+    incidents, trouble = run.lateness.incidents, run.journal.trouble
     return picture | {
         "state": state_of(run),
         "loop_age_s": round(loop_age_s(run), 3),
@@ -104,7 +104,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         **{key: ticks * run.plan.tick_us for key, ticks in exposed.items()},
         "reconnects": run.reconnects,
         "alarms": alarms_of(run),
-        "last_error": f"{trouble.get('kind')}: {reason}" if trouble else "",
+        "last_error": f"{trouble['kind']}: {words_of(trouble)}" if trouble else "",
     }
 
 

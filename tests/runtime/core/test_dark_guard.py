@@ -289,7 +289,7 @@ def test_empty_fields_as_counts() -> None:
     for _ in range(200):
         events += guard.take_empty(256, np.array([2, 3, 12], np.int64))
     assert [(finding.kind, finding.channels) for finding in events] == [("hot", (2,))]
-    assert "channel 2" in guard.words()
+    assert "channel 2" in guard.health.present[0].words
 
 
 def test_tables_and_masks_need_a_bundle() -> None:

@@ -21,6 +21,7 @@ from pans.runtime.monitor.history import LEVELS, History
 live_page = pytest.importorskip("pans.runtime.monitor.live_page", reason="needs bokeh")
 NASTY = '<img src=x onerror="document.title=1">\x1b[2J'
 GREY = "AAECAwQFBgcICQoLDA0ODw=="  # 16 pixels
+BOX = "scrollTo(0, 0); return deep(document, arguments[0])[0].getBoundingClientRect().toJSON()"
 PROGRAM = [sys.executable, "-P", "-m", "pans.runtime.monitor.child", "--serve", "127.0.0.1:0"]
 
 
@@ -44,10 +45,10 @@ def messages(n: int = 30, step_s: float = 20.0, hot: range = range(0)) -> Iterat
             **dict.fromkeys(("lost", "gaps", "reconnects", "contradictions"), 0),
             **{name: 20 * k for name in ("decisions", "known", "objects", "photons_known")},
             **{"abstained": k, "right": 15 * k, "clicks": 90 * k, "photons": 160.0 * k, "exposures": 600 * k},
-            **{"late": k // 10, "trouble": NASTY, "events": [["note", NASTY]] if k == 5 else []},
+            **{"late": k // 10, "trouble": NASTY, "events": [["note", NASTY, None]] if k == 5 else []},
             **{"latency": [[300_000 + 10_000 * (k % 5), 18], [900_000, 2]], "latency_max_us": 1500.0},
             **{"dark_exposures": 50 * k, "dark_clicks": dark, "dark_expected": 0.015, "dark_low": 0.014},
-            **{"dark_high": 0.02, "dark_words": "hot" if k in hot else "", "dark_level": "alarm" if k in hot else ""},
+            **{"dark_high": 0.02, "dark_states": [["alarm", 25.0, "hot", 50 * (hot[0] - 2)]] if k in hot else []},
             **{"clock_drift_ppm": -20 + k % 3, "clock_uncertainty_us": 70.0, "disk_free_bytes": 1 << 36},
             **{"recording": "run.pansrec", "recording_bytes": 1 << 22, "class_decided": list(range(10))},
             **{"class_truth": [10] * 10, "class_right": [5] * 10, "latest": [[k, k, 1, 0.5, 2, 0, 0]]},
@@ -156,7 +157,17 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         words = driver.execute_script(
             DEEP + "return deep(document, '.bk-clearfix').map(one => one.innerText).join(' ')"
         )
-        for text in ("75.0%", "600 of 1,000", "SIMULATED", "dark counts", "hot", "90.0", "○●○●", "<img src=x onerror="):
+        for text in (
+            "75.0%",
+            "600 of 1,000",
+            "SIMULATED",
+            "dark counts",
+            "hot",
+            "noticed",
+            "90.0",
+            "○●○●",
+            "<img src=x onerror=",
+        ):
             assert text in words
         for width in (1400, 390):
             for dark in (False, True):
@@ -183,6 +194,12 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         assert console(driver) == []
         served.process.stdin.close()
         wait_for(driver, DEEP + said)
+        wait_for(driver, DEEP + "return deep(document, '.entries > .error').length")  # Bokeh: the connection is lost
+        for width in (390, 1400):
+            look(driver, width)
+            lost, simulated = (driver.execute_script(DEEP + BOX, one) for one in (".entries > .error", ".banner"))
+            assert lost["top"] > simulated["bottom"] > simulated["top"] >= 0
+            assert 0 <= lost["left"] < lost["right"] <= width
 
 
 def wait_for(driver: Any, script: str) -> None:

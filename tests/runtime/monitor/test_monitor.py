@@ -71,21 +71,25 @@ def test_an_alarm_has_a_beginning_an_end_and_a_cause() -> None:
     history.take({"kind": "begin", "deadline_us": 100.0})
     for k in range(1, 41):
         facts = {"state": "device lost" if 5 <= k < 8 else "running", "late": min(max(k - 9, 0), 4)}
-        facts |= {"dark_exposures": k, "dark_clicks": k, "dark_words": "hot", "dark_level": "alarm"} if k >= 30 else {}
-        facts |= {"events": [["note", "lamp \x1b[2J moved"], ["session", ""]]} if k == 20 else {}
+        facts |= {"dark_exposures": 10 * k, "dark_clicks": k, "decisions": 100 * k}
+        facts |= {"dark_states": [["warning", 5.0, "dim", 290], ["alarm", 9.0, "hot", 255]]} if k >= 30 else {}
+        facts |= {"events": [["note", "lamp \x1b[2J moved", None]]} if k == 20 else {}
+        facts |= {"events": [["light_changed", "fell", 1850]]} if k == 22 else {}
         history.take(picture(float(k), **facts, **({"trouble": "the host slept"} if k > 9 else {})))
         alarms.take(history)
-    history.take(picture(41.0, ended="completed", late=4, trouble=""))
+    history.take(picture(41.0, ended="completed", late=4, trouble="", dark_exposures=400, decisions=4000))
     alarms.take(history)
     found = {one.name: one for one in alarms.all}
     assert len(found) == len(alarms.all)
-    spans = {name: (one.begin_s, one.end_s, one.level) for name, one in found.items()}
+    spans = {name: (one.begin_s, one.noticed_s, one.end_s, one.level) for name, one in found.items()}
     assert spans == {
-        "state": (5, 8, "bad"),
-        "late": (10, 13, "bad"),
-        "note": (20, 20, "note"),
-        "dark counts": (30, 41, "bad"),
+        "state": (5, 5, 8, "bad"),
+        "late": (10, 10, 13, "bad"),
+        "note": (20, 20, 20, "note"),
+        "light": (18.5, 22, 22, "warn"),
+        "dark counts": (25.5, 30, 41, "warn"),
     }
+    assert found["dark counts"].cause.startswith("dim; hot; in the whole run 0.1 per exposure")
     assert found["late"].cause == "4 decisions in the whole run; the host slept"
     assert found["note"].cause == "lamp \\x1b[2J moved"
 
@@ -134,7 +138,7 @@ def test_what_is_wrong_is_marked_and_in_words() -> None:
     late |= {"class_decided": [30, 20], "class_truth": [25, 25], "class_right": [20, 10], "latency": [[1_700_000, 50]]}
     late |= {"disk_free_bytes": 1 << 20, "recording_bytes": 1 << 20, "recording": "run.pansrec"}
     late |= {"latest": [[49, 3, 0, 0.5, 2, 1, 0]]}
-    history.take(late | {"trouble": "lost\n\x1b[31m", "dark_words": "", "dark_exposures": 100, "dark_clicks": 3})
+    history.take(late | {"trouble": "lost\n\x1b[31m", "dark_exposures": 100, "dark_clicks": 3})
     rows = {row.name: row for row in rows_of(history)}
     assert rows["late"].level == rows["lost"].level == rows["disk"].level == rows["budget"].level == "bad"
     assert rows["lost"].text == "7 exposures in 2 gaps"
@@ -166,24 +170,30 @@ def test_exposures_off_the_plan_are_marked(told: list[float] | None, words: str,
 
 
 @pytest.mark.parametrize(
-    ("clicks", "words", "level"),
-    [(2, "higher than expected, not yet sure (alarm after about", "note"), (0, "as expected", "good")],
+    ("clicks", "exposures", "words", "level"),
+    [
+        (2, 1000, "higher than expected, not yet sure (alarm after about", "note"),
+        # 1.96**2 / (5 + 1.96**2) of 5 may click
+        (0, 5, "too few to judge, no rise of the mean above 1.55e+04 times", ""),
+        (6, 200_000, "as expected, no rise of the mean above 2.34 times", "good"),
+    ],
 )
-def test_a_rate_whose_interval_excludes_the_expected_one_is_not_called_expected(
-    clicks: int, words: str, level: str
+def test_dark_counts_are_as_expected_only_where_a_rise_would_have_been_seen(
+    clicks: int, exposures: int, words: str, level: str
 ) -> None:
     watch = ChannelWatch(1, np.array([2.8e-5]))
-    dark = np.zeros((1000, 1), np.uint8)
+    dark = np.zeros((exposures, 1), np.uint8)
     dark[:clicks] = 1
     watch.update_words(dark)
     history = History()
     history.take({"kind": "begin"})
-    seen = {"dark_exposures": 1000, "dark_clicks": clicks, "dark_expected": 2.8e-5, "dark_high": 2.8e-5}
-    history.take(picture(1.0, **seen, dark_low=2.8e-5, dark_words="", dark_alarm_after=watch.alarm_after()))
+    seen = {"dark_exposures": exposures, "dark_clicks": clicks, "dark_expected": 2.8e-5, "dark_high": 2.8e-5}
+    history.take(picture(1.0, **seen, dark_low=2.8e-5, dark_alarm_after=watch.alarm_after()))
     row = next(row for row in rows_of(history) if row.name == "dark counts")
     assert words in row.text
-    assert (row.level, "as expected" in row.text) == (level, clicks == 0)
-    assert ("dark counts" in headline(history)) == (clicks > 0)
+    assert (row.level, "as expected" in row.text) == (level, level == "good")
+    assert words.partition(" (")[0].partition(", no rise")[0] in health(history)[2][2]
+    assert ("dark counts" in headline(history)) == (level == "note")
 
 
 @pytest.mark.parametrize("n_channels", [1, 4])
