@@ -336,13 +336,14 @@ class _Run:
         from pans.runtime.link.fit import scene_words
         from pans.runtime.live import Observers, Recovery
         from pans.runtime.live.loop import running
-        from pans.runtime.monitor.snapshot import begin_facts
         from pans.runtime.watch.watchers import Watchers
 
         around, monitor, besides = self.around, self.around.monitor, self.around.besides
         recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
-        facts = begin_facts(
-            self.bundle,
+        facts = dict(
+            kind="begin",
+            classes=list(self.bundle.classes),
+            encoder=self.bundle.encoder,
             title=f"{self.bundle.name} on {self.profile.name}",
             simulated=link.simulated,
             expected=self.expected_decisions,
@@ -352,7 +353,7 @@ class _Run:
             illumination=self.bundle.illumination() * self.frames,
             clicks_stated=self.dark.light.stated,
         )
-        monitor.begin(self.bundle, recorder, facts, around.stop)
+        monitor.begin(facts, around.stop)
         with Watchers(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
 
             def prepared(run: LiveRun) -> None:
@@ -365,7 +366,7 @@ class _Run:
                 if not link.virtual and (missing := lacking()):
                     say(f"pans: {sys.platform} has no {', no '.join(missing)}; decisions that are late are counted")
                 seen.prepared(run)
-                monitor.prepared(run)
+                monitor.prepared(run, self.bundle, lambda: seen.host)
                 if besides is not None and besides.prepared is not None:
                     besides.prepared(run)
                 if self.flow_run is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
 
 from pans.runtime.safe_text import one_line
 
@@ -14,7 +13,7 @@ from .history import History
 KEPT = 200
 QUIET_S = 10.0  # without another late decision, lost exposure or contradiction: the alarm is over
 LASTING = ("state", "dark counts", "exposures", "disk")  # figures that are bad as long as they are
-GROWING = {"late": "late", "lost": "lost", "contradictions": "contradictions", "repeats": "repeats_differing"}
+GROWING = ("late", "lost", "contradictions")
 # kinds of events without an end that is known: name, level
 INSTANT = {
     "note": ("note", "note"),
@@ -29,7 +28,7 @@ INSTANT = {
 
 @dataclass(slots=True)
 class Alarm:
-    """What was wrong, in seconds of the run; `end_s` is None while it is, and `begin_s` of what has no length.
+    """What was wrong, in seconds of the run; `end_s` is None while it is, and `noticed_s` of what has no length.
 
     What is found in counts began before it was noticed: there `begin_s` is the beginning of the data that it was found in.
     """
@@ -48,42 +47,36 @@ class Alarms:
     def __init__(self) -> None:
         self.all: deque[Alarm] = deque(maxlen=KEPT)
         self._open: dict[str, Alarm] = {}
-        self._counted: dict[str, int] = {}
-        self._grew_s: dict[str, float] = {}
+        self._counted = dict.fromkeys(GROWING, 0)
+        self._grew_s = dict.fromkeys(GROWING, -QUIET_S)
 
     def take(self, history: History) -> None:
         """Compare the latest picture with what was wrong before."""
-        picture = history.picture
-        now_s = float(picture["elapsed_s"])
+        picture, now_s = history.picture, float(history.picture["elapsed_s"])
         for kind, words, since in picture.get("events", ()):
             begin_s = now_s if since is None else history.when("decisions", since)
-            self._add(Alarm(*INSTANT[kind], begin_s, now_s, one_line(words, 300), now_s))
-        present = self._present(history, now_s)
-        for name in [name for name in self._open if name not in present or picture["ended"]]:
+            self.all.append(Alarm(*INSTANT[kind], begin_s, now_s, one_line(words, 300), now_s))
+        present = {} if picture["ended"] else self._present(history, now_s)
+        for name in self._open.keys() - present:
             self._open.pop(name).end_s = min(now_s, self._grew_s.get(name, now_s))
-        for name, (level, cause) in {} if picture["ended"] else present.items():
+        for name, (level, cause) in present.items():
             if name not in self._open:
-                begin_s = now_s
-                if name == "dark counts" and picture.get("dark_states"):
-                    begin_s = history.when("dark_exposures", min(since for *_, since in picture["dark_states"]))
-                self._open[name] = self._add(Alarm(name, level, begin_s, None, cause, now_s))
+                begin_s, states = now_s, picture.get("dark_states")
+                if name == "dark counts" and states:
+                    begin_s = history.when("dark_exposures", min(since for *_, since in states))
+                self._open[name] = Alarm(name, level, begin_s, None, cause, now_s)
+                self.all.append(self._open[name])
             self._open[name].cause = cause
-
-    def _add(self, alarm: Alarm) -> Alarm:
-        self.all.append(alarm)
-        return alarm
 
     def _present(self, history: History, now_s: float) -> dict[str, tuple[str, str]]:
         """Return level and cause of what is wrong now."""
-        picture: dict[str, Any] = history.picture
-        rows = {row.name: row for row in rows_of(history)}
-        found = {name: (rows[name].level, rows[name].text) for name in LASTING if name in rows}
-        present = {name: one for name, one in found.items() if one[0] in ("warn", "bad")}
-        for name, key in GROWING.items():
-            if (count := picture.get(key, 0)) > self._counted.get(name, 0):
+        picture, rows = history.picture, {row.name: row for row in rows_of(history)}
+        present = {name: row[1:] for name in LASTING if (row := rows.get(name)) and row.level in ("warn", "bad")}
+        trouble = f"; {one_line(picture['trouble'], 300)}" if picture["trouble"] else ""
+        for name in GROWING:
+            if picture[name] > self._counted[name]:
                 self._grew_s[name] = now_s
-            self._counted[name] = count
-            if now_s - self._grew_s.get(name, -QUIET_S) < QUIET_S and name in rows:
-                why = f"; {one_line(picture['trouble'], 200)}" if picture["trouble"] else ""
-                present[name] = ("bad", f"{rows[name].text} in the whole run{why}")
-        return present
+            self._counted[name] = picture[name]
+            if now_s - self._grew_s[name] < QUIET_S:
+                present[name] = f"{rows[name].text} in the whole run{trouble}", "bad"
+        return {name: (level, cause) for name, (cause, level) in present.items()}

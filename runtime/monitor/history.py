@@ -16,20 +16,8 @@ from pans.runtime.intervals import wilson_interval
 
 LEVELS = (1.0, 5.0, 30.0, 180.0, 1200.0, 7200.0)  # seconds of a bin
 BINS = 512  # of a level: 8 minutes, 42 minutes, 4 hours, 1 day, 1 week, 6 weeks
-RATE_OVER_S = 5.0
-RECENT_S = 60.0
-SUMS: tuple[str, ...] = (
-    "decisions",
-    "known",
-    "right",
-    "abstained",
-    "late",
-    "lost",
-    "dark_exposures",
-    "dark_clicks",
-    "exposures",
-)
-SUMS += ("clicks", "photons", "photons_known")
+SUMS: tuple[str, ...] = ("decisions", "known", "right", "abstained", "late", "lost", "exposures", "clicks", "photons")
+SUMS += ("photons_known", "dark_exposures", "dark_clicks")
 
 
 @dataclass(slots=True)
@@ -44,7 +32,7 @@ class Bin:
 
 
 class History:
-    """The latest picture, the sums of all, and those of each bin of time: `bins` by their length in seconds."""
+    """The latest picture, the latencies of all, and the sums of each bin of time: `bins` by their length in seconds."""
 
     def __init__(self) -> None:
         self.begin: dict[str, Any] = {}
@@ -53,23 +41,19 @@ class History:
         self.pixels: dict[str, Any] = {}
         self.bins: dict[float, deque[Bin]] = {level: deque(maxlen=BINS) for level in LEVELS}
         self.number = 0  # of pictures
-        self._recent: deque[dict[str, Any]] = deque()
 
     def take(self, message: dict[str, Any]) -> None:
         """Take what the run's process sent: its beginning or a picture."""
+        self.number += 1
         if message.get("kind") == "begin":
             self.begin = message
-        else:
-            self._take_picture(message)
-        self.number += 1
-
-    def _take_picture(self, picture: dict[str, Any]) -> None:
-        grown = {int(duration_ns): int(count) for duration_ns, count in picture.pop("latency", ())}
-        self.pixels.update(picture.pop("pixels", {}))
-        if "word" not in picture and "word" in self.picture:
-            picture["word"] = self.picture["word"]
-        before, now_s = self.picture, float(picture["elapsed_s"])
-        sums = [picture.get(name, 0) - before.get(name, 0) for name in SUMS]
+            return
+        grown = {int(duration_ns): int(count) for duration_ns, count in message.pop("latency", ())}
+        self.pixels.update(message.pop("pixels", {}))
+        before, now_s = self.picture, float(message["elapsed_s"])
+        if "word" in before:
+            message.setdefault("word", before["word"])
+        sums = [message.get(name, 0) - before.get(name, 0) for name in SUMS]
         for level, bins in self.bins.items():
             if not bins or now_s // level > bins[-1].end_s // level:
                 bins.append(Bin(float(before.get("elapsed_s", 0.0)), now_s))
@@ -77,20 +61,15 @@ class History:
             here.end_s = now_s
             here.sums = [a + b for a, b in zip(here.sums, sums)]
             here.latency.update(grown)
-            here.drift_ppm = picture.get("clock_drift_ppm", here.drift_ppm)
+            here.drift_ppm = message.get("clock_drift_ppm", here.drift_ppm)
         self.latency.update(grown)
-        self.picture = picture
-        self._recent.append(picture)
-        while len(self._recent) > 2 and now_s - float(self._recent[1]["elapsed_s"]) >= RATE_OVER_S:
-            self._recent.popleft()
+        self.picture = message
 
-    def rate(self, name: str) -> float:
-        """Return how much `name` grew per second of late."""
-        if len(self._recent) < 2:
-            return 0.0
-        first, last = self._recent[0], self._recent[-1]
-        seconds = float(last["elapsed_s"]) - float(first["elapsed_s"])
-        return (last.get(name, 0) - first.get(name, 0)) / seconds if seconds > 0 else 0.0
+    def recent(self, seconds: float) -> tuple[dict[str, float], Counter[int], float]:
+        """Return the sums and the latencies of the last `seconds`, in whole bins, and how long these are together."""
+        some = [one for one in self.bins[LEVELS[0]] if one.end_s > self.picture["elapsed_s"] - seconds]
+        sums = dict(zip(SUMS, map(sum, zip(*(one.sums for one in some)))))
+        return sums, sum((one.latency for one in some), Counter()), some[-1].end_s - some[0].begin_s
 
     def when(self, name: str, count: float) -> float:
         """Return when the sum `name` of the run was `count`, in seconds of the run, between the ends of the bin that it lies in."""
@@ -103,28 +82,13 @@ class History:
                 later -= one.sums[at]
         return 0.0
 
-    def recent(self) -> tuple[dict[str, float], Counter[int]]:
-        """Return the sums and the latencies of the last minute."""
-        sums, latency = dict.fromkeys(SUMS, 0.0), Counter[int]()
-        for one in self.bins[LEVELS[0]]:
-            if one.end_s > self.picture["elapsed_s"] - RECENT_S:
-                sums = {name: sums[name] + value for name, value in zip(SUMS, one.sums)}
-                latency.update(one.latency)
-        return sums, latency
-
-    def dark(self, sums: dict[str, float]) -> tuple[float, float]:
-        """Return the dark clicks and dark exposures of `sums`, those of the whole run where these hold none."""
-        some = sums if sums["dark_exposures"] > 0 else self.picture
-        return some["dark_clicks"], some["dark_exposures"]
-
     def accuracy(self, sums: dict[str, Any], objects: int | None = None) -> tuple[float, float, float] | None:
         """Return accuracy and its 95 % interval (Wilson), in which the trials of one visit and showings of one object count once."""
         known = int(sums.get("known", 0))
         if known <= 0:
             return None
         share = sums.get("right", 0) / known
-        trials = max(1, int(self.begin.get("trials", 1)))
-        n = max(1, min(known // trials, known if objects is None else objects))
+        n = max(1, min(known // max(1, int(self.begin.get("trials", 1))), known if objects is None else objects))
         low, high = wilson_interval(round(share * n), n)
         return share, min(low, share), max(high, share)
 

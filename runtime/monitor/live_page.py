@@ -17,10 +17,11 @@ import socket
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -28,17 +29,7 @@ from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
 from bokeh.events import RangesUpdate, Reset
-from bokeh.models import (
-    Button,
-    ColumnDataSource,
-    DataRange1d,
-    Div,
-    HoverTool,
-    LinearColorMapper,
-    Range1d,
-    Select,
-    TextInput,
-)
+from bokeh.models import Button, ColumnDataSource, DataRange1d, Div, HoverTool, Range1d, Select, TextInput
 from bokeh.plotting import figure
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
@@ -50,70 +41,29 @@ from tornado.routing import Router
 from tornado.web import Application as Answers
 from tornado.web import OutputTransform, RequestHandler
 
+from pans.runtime.images import grey_png
 from pans.runtime.intervals import wilson_interval
-from pans.runtime.safe_text import one_line
-from pans.runtime.watch.metrics import is_loopback, is_public
+from pans.runtime.watch.metrics import is_loopback
 
+from . import figures
 from .alarms import Alarms
-from .figures import (
-    NAME_CHARACTERS,
-    class_rows,
-    decision_row,
-    duration,
-    headline,
-    health,
-    latest_rows,
-    rows_of,
-    title_of,
-)
 from .history import BINS, LEVELS, SUMS, Bin, History
 from .monitor import NOTE_CHARACTERS
 
 SESSIONS_MAX = 12
 REFRESH_MS, LAST_LOOK_S = 1000, 0.6
-PER_ROW, ROW_HEIGHT = 8, 1.3  # patterns, and the height of a row with its text, in widths of a pattern
 SPANS = {"1 minute": 60, "10 minutes": 600, "1 hour": 3600, "6 hours": 21_600, "1 day": 86_400, "1 week": 604_800}
 SPANS |= {"6 weeks": 3_628_800}
 LEAST, LEAST_DARK = ("1", "30", "100", "300", "1000", "10000"), 10  # decisions of a point, and dark counts
 PATHS = re.compile(r"/|/ws|/static/[\w./-]+|/favicon\.ico")
-BLUE, ORANGE, GREEN, RED, GREY = (
-    "#3b82c4",
-    "#d9670b",
-    "#2e9a6f",
-    "#d1495b",
-    "#7d8289",
-)  # 3:1 on the white and the dark ground
+BLUE, ORANGE, GREEN, RED = "#3b82c4", "#d9670b", "#2e9a6f", "#d1495b"  # 3:1 on the white and the dark ground
 STYLES = ((BLUE, "solid"), (ORANGE, "dashed"))  # of the lines of a figure
-LIMITS = ("chance", "deadline", "stated", "expected_high")  # drawn dotted
 LEVEL_COLOURS = {"bad": RED, "warn": ORANGE, "note": GREEN}
-TEXTS = ("head", "health", "alarms", "word", "latest", "classes", "figures")
+TEXTS = ("head", "health", "alarms", "word", "latest", "figures")
 POLICY = "default-src 'none'; script-src 'self' {}; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
 POLICY += "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-Columns = dict[str, Any]
+PLOTS: dict[str, Any] = tomllib.loads(files(__package__).joinpath("live.toml").read_text(encoding="utf-8"))
 F64 = NDArray[np.float64]
-
-
-class Plot(NamedTuple):
-    """A figure: its unit, its lines (column: legend), whether the first has an interval, and scale and ends of its y axis."""
-
-    unit: str
-    lines: dict[str, str]
-    band: bool = False
-    scale: str = "linear"
-    ends: tuple[float | None, float | None] = (0, None)
-
-
-PLOTS = {
-    "accuracy": Plot("right decisions (%)", {"accuracy": "right", "chance": "guessing"}, band=True, ends=(0, 100)),
-    "latency": Plot("after the exposure (us)", {"p50": "50 %", "p99": "99 %", "deadline": "deadline"}, scale="log"),
-    "dark": Plot(
-        "clicks per dark exposure", {"dark": "measured", "expected_high": "expected, at most"}, band=True, scale="log"
-    ),
-    "light": Plot("per decision", {"clicks": "clicks", "photons": "photons", "stated": "clicks stated"}),
-    "late": Plot("per second", {"lost": "lost exposures", "late": "late decisions"}),
-    "rate": Plot("per second", {"rate": "decisions"}),
-    "drift": Plot("ppm against this computer", {"drift": "clock drift"}, ends=(None, None)),
-}
 
 
 def columns(history: History, level: float, least: float) -> dict[str, F64]:
@@ -124,16 +74,14 @@ def columns(history: History, level: float, least: float) -> dict[str, F64]:
     bins = [one for one in history.bins[level] if one.end_s > one.begin_s]
     n, picture, begun = len(bins), history.picture, history.begin
     at = np.array([(one.begin_s, one.end_s) for one in bins]).reshape(n, 2)
-    total = _added_up(np.array([one.sums for one in bins], np.float64).reshape(n, len(SUMS)))
-    begin = _begins(total[:, SUMS.index("decisions")], least)
-    begin_dark = _begins(total[:, SUMS.index("dark_clicks")], LEAST_DARK)
-    own = dict(zip(SUMS, np.diff(total, axis=0).T))
-    sums, dark = dict(zip(SUMS, (total[1:] - total[begin]).T)), dict(zip(SUMS, (total[1:] - total[begin_dark]).T))
+    own = np.array([one.sums for one in bins], np.float64).reshape(n, len(SUMS))
+    begin, sums = _points(own, "decisions", least)
+    _, dark = _points(own, "dark_clicks", LEAST_DARK)
+    made, late, lost = (own[:, SUMS.index(name)] for name in ("decisions", "late", "lost"))
     found = [history.accuracy({"known": known, "right": right}) for known, right in zip(sums["known"], sums["right"])]
     accuracy = np.array([(np.nan,) * 3 if one is None else one for one in found]).reshape(n, 3).T * 100
-    low, high = (
-        np.array([wilson_interval(*one) for one in zip(dark["dark_clicks"], dark["dark_exposures"])]).reshape(n, 2).T
-    )
+    intervals = [wilson_interval(*one) for one in zip(dark["dark_clicks"], dark["dark_exposures"])]
+    low, high = np.array(intervals).reshape(n, 2).T
     drawn = low[low > 0].min(initial=picture.get("dark_low") or 1.0) / 3  # a logarithm has no place for 0
     with np.errstate(divide="ignore", invalid="ignore"):
         curves = {
@@ -144,33 +92,34 @@ def columns(history: History, level: float, least: float) -> dict[str, F64]:
             **{"dark_low": np.maximum(low, drawn), "dark_high": high},
             **_quantiles(bins, begin, p50=0.5, p99=0.99),
         }
-    curves = {name: np.where(own["decisions"] > 0, curve, np.nan) for name, curve in curves.items()}
     limits = {
         "chance": 100 / len(begun["classes"]) if begun.get("classes") else None,
         **{"deadline": begun.get("deadline_us") or None, "stated": begun.get("clicks_stated")},
         **{"expected_low": picture.get("dark_low"), "expected_high": picture.get("dark_high")},
     }
-    seconds = at[:, 1] - at[begin, 0]
-    return curves | {
-        "s": at.mean(axis=1),
-        "over": seconds,
-        "rate": sums["decisions"] / seconds,
-        **{name: own[name] / (at[:, 1] - at[:, 0]) for name in ("late", "lost")},
-        "drift": np.array([np.nan if one.drift_ppm is None else one.drift_ppm for one in bins]),
+    seconds, own_s = at[:, 1] - at[begin, 0], at[:, 1] - at[:, 0]
+    return {
+        **{name: np.where(made > 0, curve, np.nan) for name, curve in curves.items()},
         **{name: np.full(n, np.nan if value is None else value, np.float64) for name, value in limits.items()},
+        **{"s": at.mean(axis=1), "over": seconds, "rate": sums["decisions"] / seconds},
+        **{"late": late / own_s, "lost": lost / own_s},
+        "drift": np.array([np.nan if one.drift_ppm is None else one.drift_ppm for one in bins]),
     }
+
+
+def _points(own: F64, name: str, least: float) -> tuple[NDArray[np.int64], dict[str, F64]]:
+    """Return the first bin of each bin's point, so that `name` grows by `least` in it, int64 (bins,), and the point's sums."""
+    total = _added_up(own)
+    made = total[:, SUMS.index(name)]
+    begin = np.clip(np.searchsorted(made, made[1:] - least, side="right") - 1, 0, np.arange(len(own)))
+    return begin, dict(zip(SUMS, (total[1:] - total[begin]).T))
 
 
 def _added_up(rows: F64) -> F64:
     return np.vstack([np.zeros((1, rows.shape[1])), rows.cumsum(axis=0)])
 
 
-def _begins(made: F64, least: float) -> NDArray[np.int64]:
-    """Return the first bin of each bin's point, so that `made`, added up, grows by `least` in it; int64 (bins,)."""
-    return np.clip(np.searchsorted(made, made[1:] - least, side="right") - 1, 0, np.arange(len(made) - 1))
-
-
-def _quantiles(bins: list[Bin], begin: NDArray[np.int64], **wanted: float) -> Columns:
+def _quantiles(bins: list[Bin], begin: NDArray[np.int64], **wanted: float) -> dict[str, F64]:
     """Return quantiles of the latencies in us, float64 (bins,), of the bins from `begin` up to each."""
     keys = sorted({key for one in bins for key in one.latency}) or [0]
     place, counts = {key: at for at, key in enumerate(keys)}, np.zeros((len(bins), len(keys)))
@@ -188,8 +137,9 @@ class Page:
     def __init__(self, history: History, *, control: bool) -> None:
         self.history, self.control, self.alarms = history, control, Alarms()
         environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+        environment.globals |= {"say": figures, "plots": PLOTS, "control": control, "zip": zip}
         self.template = environment.from_string(files(__package__).joinpath("live.html").read_text(encoding="utf-8"))
-        self.parts: Any = self.template.module
+        self.parts: Any = self.template.module  # the macros
         self.views: dict[Document, _View] = {}
         self._made: dict[Any, Any] = {}
         self._asked_s = 0.0
@@ -197,6 +147,9 @@ class Page:
 
     def take(self, message: dict[str, Any]) -> None:
         """Take a message of the run."""
+        for one in message.get("pixels", {}).values():
+            grey = np.frombuffer(base64.b64decode(one["grey"]), np.uint8).reshape(one["shape"])
+            one["src"] = f"data:image/png;base64,{base64.b64encode(grey_png(grey)).decode()}"
         self.history.take(message)
         self._made.clear()
         if self.history.picture:
@@ -213,61 +166,28 @@ class Page:
         """Return seconds of the run as milliseconds of the time of day here, which Bokeh takes for UTC."""
         return (self._began.timestamp() + (self._began.utcoffset() or timedelta()).total_seconds() + s) * 1000
 
+    def clock(self, s: float) -> str:
+        """Return seconds of the run as the time of day here."""
+        return f"{self._began + timedelta(seconds=s):%d %b %H:%M:%S}"
+
     def texts(self) -> dict[str, str]:
         """Return the parts of the page that are text, as HTML."""
-        history, picture = self.history, self.history.picture
-        if not picture:
-            return {"head": str(self.parts.waiting(title_of(history)))}
-        word, names = (
-            picture.get("word"),
-            [one_line(name, NAME_CHARACTERS) for name in history.begin.get("classes", ())],
-        )
-        facts = {
-            "title": title_of(history),
-            "state": picture["state"],
-            "ended": one_line(picture["ended"], 200),
-            "elapsed": duration(picture["elapsed_s"]),
-            "headline": headline(history),
-            "progress": (picture["decisions"], history.begin.get("expected", 0)),
-            "health": health(history),
-            "alarms": list(self.alarms.all)[::-1],
-            "clock": lambda s: f"{self._began + timedelta(seconds=s):%d %b %H:%M:%S}",
-            "word": word,
-            "decision": None if word is None else decision_row(history, word["decision"]),
-            "chances": [] if word is None else sorted(zip(word["posterior"], names), reverse=True)[:PER_ROW],
-            "encoder": history.begin.get("encoder"),
-            "latest": latest_rows(history),
-            "classes": class_rows(history),
-            "figures": rows_of(history),
-        }
-        return {name: str(getattr(self.parts, name)(facts)) for name in TEXTS}
+        if not self.history.picture:
+            return {"head": str(self.parts.waiting(self))}
+        return {name: str(getattr(self.parts, name)(self)) for name in TEXTS}
 
-    def curves(self, level: float, least: float) -> Columns:
+    def curves(self, level: float, least: float) -> dict[str, Any]:
         """Return the columns of the figures."""
         found = columns(self.history, level, least)
         return found | {"x": self.milliseconds(found["s"])}
 
-    def marks(self) -> Columns:
+    def marks(self) -> dict[str, Any]:
         """Return the alarms as columns."""
         now_s, some = float(self.history.picture.get("elapsed_s", 0.0)), self.alarms.all
         return {
             "begin": [self.milliseconds(one.begin_s) for one in some],
             "end": [self.milliseconds(now_s if one.end_s is None else one.end_s) for one in some],
             "colour": [LEVEL_COLOURS[one.level] for one in some],
-        }
-
-    def patterns(self) -> Columns:
-        """Return the patterns of the latest word as columns: an image each, where it stands, and what is written below."""
-        word, pixels = self.history.picture.get("word") or {"patterns": [], "clicks": []}, self.history.pixels
-        known = [(n, clicks, pixels[str(n)]) for n, clicks in zip(word["patterns"], word["clicks"]) if str(n) in pixels]
-        grey = [np.frombuffer(base64.b64decode(one["grey"]), np.uint8).reshape(one["shape"]) for _, _, one in known]
-        at = np.arange(len(known))
-        return {
-            "image": [one[::-1] for one in grey],
-            "x": at % PER_ROW + 0.06,
-            "y": -(at // PER_ROW) - 0.68,
-            "text": [f"{n} {'●' if clicks else '○'}{f' {clicks}' if clicks > 1 else ''}" for n, clicks, _ in known],
-            "colour": [ORANGE if clicks else GREY for _, clicks, _ in known],
         }
 
     def ask(self, **what: Any) -> None:
@@ -290,63 +210,60 @@ class _View:
     def __init__(self, document: Document, page: Page) -> None:
         self._page, self._document, self._number, self._follows = page, document, -1, True
         self._drawn = (0.0, 0.0, 0.0)  # level, least, time
-        self._decision: Any = None
         self._curves, self._marks = ColumnDataSource(page.curves(LEVELS[0], 1)), ColumnDataSource(page.marks())
-        self._patterns, self._range = ColumnDataSource(page.patterns()), Range1d(0, 1)
         self._style: dict[str, Any] = {"stylesheets": [str(page.parts.style())]}
-        wide = self._style | {"sizing_mode": "stretch_width"}
-        self._divs = {name: Div(name=name, disable_math=True, **wide) for name in TEXTS}
-        self._span = Select(name="span", title="Time shown", value="10 minutes", options=list(SPANS), **wide)
-        least = "A point takes at least (decisions)"
-        self._least = Select(name="least", title=least, value="100", options=list(LEAST), **wide)
-        now = Button(name="now", label="Follow the run", **wide)
-        self._span.on_change("value", lambda attr, old, new: self._redraw(follows=True))
-        self._least.on_change("value", lambda attr, old, new: self._redraw(follows=self._follows))
+        self._wide = self._style | {"sizing_mode": "stretch_width"}
+        self._divs = {name: Div(name=name, disable_math=True, **self._wide) for name in TEXTS}
+        self._span = self._choice("span", "Time shown", list(SPANS), "10 minutes")
+        self._least = self._choice("least", "A point takes at least (decisions)", list(LEAST), "100")
+        self._range = Range1d(0, 1)
+        now = Button(name="now", label="Follow the run", **self._wide)
         now.on_click(lambda: self._redraw(follows=True))
-        roots = [*self._divs.values(), self._span, self._least, now, self._picture()]
-        roots += [self._figure(name, plot) for name, plot in PLOTS.items()]
+        roots = [*self._divs.values(), self._span, self._least, now, *(self._controls() if page.control else ())]
         with document.models.freeze():  # the models are counted once, not with each root
-            for root in [*roots, *(self._controls(wide) if page.control else ())]:
+            for root in [*roots, *(self._figure(name, **plot) for name, plot in PLOTS.items())]:
                 document.add_root(root)
-        document.template, document.title = page.template, title_of(page.history)
-        document.template_variables["control"] = page.control
+        document.template, document.title = page.template, figures.title_of(page.history)
 
-    def _figure(self, name: str, plot: Plot) -> Any:
-        (low, high), curves, first = plot.ends, self._curves, next(iter(plot.lines))
-        ends = DataRange1d(only_visible=True) if plot.scale == "log" or low is None else DataRange1d(start=low)
-        one = _ground(
+    def _choice(self, name: str, title: str, options: list[str], value: str) -> Any:
+        choice = Select(name=name, title=title, options=options, value=value, **self._wide)
+        choice.on_change("value", lambda attr, old, new: self._redraw(follows=self._follows or name == "span"))
+        return choice
+
+    def _figure(self, name: str, **plot: Any) -> Any:
+        lines, limits, ends = plot["lines"], plot.get("limits", {}), plot.get("ends", ())
+        one = figure(
             name=name,
             height=260,
             sizing_mode="stretch_width",
             x_axis_type="datetime",
-            y_axis_type=plot.scale,
+            y_axis_type=plot.get("scale", "linear"),
             x_range=self._range,
-            y_range=ends if high is None else Range1d(low, high),
+            y_range=Range1d(*ends) if len(ends) == 2 else DataRange1d(**({"start": ends[0]} if ends else {})),
+            y_axis_label=plot["unit"],
             tools="xpan,xbox_zoom,xwheel_zoom,reset,save",
-            y_axis_label=plot.unit,
+            toolbar_location="above",
+            background_fill_color=None,
+            border_fill_color=None,
         )
         one.toolbar.logo, one.xgrid.visible, one.min_border_right = None, False, 16
         one.vstrip(x0="begin", x1="end", source=self._marks, fill_color="colour", fill_alpha=0.15, line_color=None)
         one.vspan(x="begin", source=self._marks, line_color="colour", line_dash="dashed")
-        tips = [("at", "@x{%F %T}"), *((legend, f"@{column}{{0.[0000]}}") for column, legend in plot.lines.items())]
-        bands = {"expected": ("expected", GREEN)} if name == "dark" else {}
-        bands |= {first: ("95 % interval", BLUE)} if plot.band else {}
-        for column, (legend, colour) in bands.items():
-            between = {"y1": f"{column}_low", "y2": f"{column}_high"}
-            one.varea(x="x", **between, source=curves, fill_color=colour, fill_alpha=0.25, legend_label=legend)
-            tips.append((legend, f"@{column}_low{{0.[00000]}} to @{column}_high{{0.[00000]}}"))
-        for (column, legend), style in zip(plot.lines.items(), (*STYLES, (RED, "dotted"))):
-            colour, dash = (RED, "dotted") if column in LIMITS else style
-            line = {"x": "x", "y": column, "source": curves, "color": colour}
-            drawn = one.line(line_width=2, line_dash=dash, legend_label=legend, **line)
-            if column == first:
-                one.scatter(size=3, **line)
-                hover = {
-                    "mode": "vline",
-                    "formatters": {"@x": "datetime"},
-                    "tooltips": [*tips, ("over", "@over{0.[0]} s")],
-                }
-                one.add_tools(HoverTool(renderers=[drawn], **hover))
+        source: dict[str, Any] = {"x": "x", "source": self._curves}
+        tips = [("at", "@x{%F %T}"), *((legend, f"@{key}{{0.[0000]}}") for key, legend in (lines | limits).items())]
+        for key, legend in plot.get("bands", {}).items():
+            between = {"y1": f"{key}_low", "y2": f"{key}_high", "fill_color": BLUE if key in lines else GREEN}
+            one.varea(**source, **between, fill_alpha=0.25, legend_label=legend)
+            tips.append((legend, f"@{key}_low{{0.[00000]}} to @{key}_high{{0.[00000]}}"))
+        styles = [*STYLES[: len(lines)], *[(RED, "dotted")] * len(limits)]
+        drawn = []
+        for (key, legend), (colour, dash) in zip((lines | limits).items(), styles):
+            look = source | {"y": key, "color": colour}
+            drawn.append(one.line(line_width=2, line_dash=dash, legend_label=legend, **look))
+            if key in lines:
+                one.scatter(size=3, **look)
+        tips.append(("over", "@over{0.[0]} s"))
+        one.add_tools(HoverTool(renderers=drawn[:1], mode="vline", formatters={"@x": "datetime"}, tooltips=tips))
         one.add_layout(one.legend[0], "below")
         one.legend[0].update(orientation="horizontal", ncols=2, border_line_color=None, background_fill_alpha=0)
         one.legend[0].update(padding=0, margin=2, spacing=12, **self._style)
@@ -354,29 +271,9 @@ class _View:
         one.on_event(Reset, lambda event: self._redraw(follows=True))
         return one
 
-    def _picture(self) -> Any:
-        """The patterns of a click word."""
-        one = self._words = _ground(
-            name="patterns",
-            x_range=Range1d(0, PER_ROW),
-            y_range=Range1d(-1, 0),
-            sizing_mode="scale_width",
-            aspect_ratio=PER_ROW / ROW_HEIGHT,
-            tools="",
-            toolbar_location=None,
-            outline_line_color=None,
-        )
-        one.axis.visible = one.grid.visible = False
-        grey = LinearColorMapper([f"#{level:02x}{level:02x}{level:02x}" for level in range(256)], low=0, high=255)
-        place: dict[str, Any] = {"x": "x", "y": "y", "source": self._patterns}
-        one.image(image="image", dw=0.86, dh=0.66, color_mapper=grey, **place)
-        one.block(width=0.86, height=0.66, fill_color=None, line_color="colour", line_width=3, **place)
-        one.text(text="text", y_offset=4, text_baseline="top", text_font_size="12px", text_color="colour", **place)
-        return one
-
-    def _controls(self, wide: dict[str, Any]) -> list[Any]:
+    def _controls(self) -> list[Any]:
         title = f"Note (at most {NOTE_CHARACTERS} characters)"
-        note = TextInput(name="note", title=title, max_length=NOTE_CHARACTERS, **wide)
+        note = TextInput(name="note", title=title, max_length=NOTE_CHARACTERS, **self._wide)
         mark = Button(name="mark", label="Mark this moment", button_type="primary", **self._style)
         stop = Button(name="stop", label="Stop the run", button_type="danger", **self._style)
 
@@ -409,16 +306,9 @@ class _View:
         for name, text in page.once("texts", page.texts).items():
             if self._divs[name].text != text:
                 self._divs[name].text = text
-        if not page.history.picture:
-            return
-        self._document.title = f"{page.history.picture['state']}: {title_of(page.history)}"
-        self._draw()
-        decision = (page.history.picture.get("word") or {}).get("decision")
-        if decision != self._decision:
-            self._decision, self._patterns.data = decision, page.once("patterns", page.patterns)
-            rows = max(1, -(-len(self._patterns.data["text"]) // PER_ROW))
-            if self._words.y_range.start != -rows:
-                self._words.y_range.start, self._words.aspect_ratio = -rows, PER_ROW / rows / ROW_HEIGHT
+        if page.history.picture:
+            self._document.title = f"{page.history.picture['state']}: {figures.title_of(page.history)}"
+            self._draw()
 
     def _draw(self) -> None:
         page, picture = self._page, self._page.history.picture
@@ -435,11 +325,6 @@ class _View:
         self._drawn = level, least, now_s
         self._curves.data = page.once((level, least), lambda: page.curves(level, least))
         self._marks.data = page.once("marks", page.marks)
-
-
-def _ground(**facts: Any) -> Any:
-    """Return an empty figure on the ground of the page."""
-    return figure(background_fill_color=None, border_fill_color=None, **({"toolbar_location": "above"} | facts))
 
 
 class _Door(Router):
@@ -484,18 +369,23 @@ class _Headers(OutputTransform):
             headers["Cache-Control"] = "no-store"
         hashes = (f"'sha256-{base64.b64encode(hashlib.sha256(one).digest()).decode()}'" for one in inline)
         headers["Content-Security-Policy"] = POLICY.format(" ".join(hashes))
-        headers["X-Content-Type-Options"], headers["Referrer-Policy"], headers["Server"] = (
-            "nosniff",
-            "no-referrer",
-            "pans",
-        )
+        said = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Server": "pans"}
+        for name, value in said.items():
+            headers[name] = value
         return status_code, headers, chunk
 
 
-async def serve(
-    listening: socket.socket, history: History, draws: list[Callable[[History], None]], *, address: str, control: bool
+def run_server(
+    handle: int, history: History, draws: list[Callable[[History], None]], *, local: bool, control: bool
 ) -> None:
-    """Serve the page at the socket `listening`, bound to `address`, until standard input ends; `draws` show `history` elsewhere, too."""
+    """Serve the page at the listening socket `handle` until standard input ends; `draws` show `history` elsewhere, too."""
+    asyncio.run(_serve(socket.socket(fileno=handle), history, draws, local, control))
+
+
+async def _serve(
+    listening: socket.socket, history: History, draws: list[Callable[[History], None]], local: bool, control: bool
+) -> None:
+    listening.setblocking(False)
     for name in ("bokeh", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # nobody reads them beside a run
     loop, ended, page = IOLoop.current(), asyncio.Event(), Page(history, control=control)
@@ -510,7 +400,7 @@ async def serve(
     )
     app.transforms.append(_Headers)
     limits = {"idle_connection_timeout": 20, "body_timeout": 5, "max_header_size": 1 << 14, "max_body_size": 1 << 12}
-    http = HTTPServer(_Door(app, local=not is_public(address)), **limits)
+    http = HTTPServer(_Door(app, local=local), **limits)
     http.add_socket(listening)
     server = BaseServer(loop, app, http)
     server.start()

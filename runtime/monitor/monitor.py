@@ -7,11 +7,13 @@ Without a terminal and without a page there is no process, only a plain line now
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.util import find_spec
@@ -19,6 +21,7 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Self
 
 from pans.runtime.cli import say
+from pans.runtime.cli.finding import missing_extra
 from pans.runtime.errors import UsageError
 from pans.runtime.safe_text import one_line
 
@@ -27,7 +30,6 @@ if TYPE_CHECKING:
     from pans.runtime.core.decision import Decision, Output
     from pans.runtime.live import LiveRun
     from pans.runtime.live.continuous import Stop
-    from pans.runtime.record import Recorder
 
     from .snapshot import Snapshots
 
@@ -36,6 +38,7 @@ NOTE_CHARACTERS, NOTES_WAITING = 200, 20
 KEPT_DECISIONS = 64
 LINE_EVERY_S = 5.0
 GOODBYE_S = 3.0
+BACKLOG = 64
 
 
 class Monitor:
@@ -47,13 +50,9 @@ class Monitor:
     """
 
     def __init__(self, *, panel: bool, address: str = "", control: bool = False, lines: bool = True) -> None:
-        self._words = [*(["--panel"] if panel else []), *(["--serve", address] if address else [])]
-        self._words += ["--control"] if control else []
-        self._address, self._lines = address, lines and not panel
+        self._panel, self._address, self._control, self._lines = panel, address, control, lines and not panel
         self._child: subprocess.Popen[str] | None = None
         self._snapshots: Snapshots | None = None
-        self._facts: dict[str, Any] = {}
-        self._wanted: tuple[Bundle, Recorder | None] | None = None
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self._latest: deque[Decision] = deque(maxlen=KEPT_DECISIONS)
@@ -63,48 +62,52 @@ class Monitor:
         self.url = ""
 
     def __enter__(self) -> Self:
-        if self._address and not all(map(_is_installed, ("bokeh", "jinja2"))):
-            what = "--serve needs the package bokeh, which is not installed"
-            raise UsageError(what, remedy="pip install 'pans-runtime[ui]'")
-        if self._words:
-            command = [sys.executable, "-P", "-m", "pans.runtime.monitor.child", *self._words]
-            self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        words = ["--panel"] if self._panel else []
+        if not self._address:
+            if words:
+                self._start(words)
+            return self
+        from pans.runtime.watch.metrics import is_loopback, parse_address  # the server's modules load slowly
+
+        for name in ("bokeh", "jinja2"):
+            with suppress(ModuleNotFoundError):
+                if find_spec(name) is not None:
+                    continue
+            raise missing_extra("--serve", name, "ui")
+        host, port = parse_address(self._address, "--serve")
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
-            if self._address:
-                self._wait_for_page()
-        except BaseException:
-            self._end_child()
-            raise
+            listening = socket.create_server((host, port), family=family, backlog=BACKLOG)
+        except OSError as error:
+            why = f"--serve {self._address}: cannot listen there: {error.strerror or error}"
+            raise UsageError(why, remedy="choose another port") from error
+        with listening:
+            words += ["--serve", str(listening.fileno()), *(["--local"] if is_loopback(host) else [])]
+            self._start(words + ["--control"] * self._control, listening.fileno())
+            self.url = f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}/"
         return self
 
-    def _wait_for_page(self) -> None:
-        assert self._child is not None
-        assert self._child.stdout is not None
-        said = json.loads(self._child.stdout.readline() or '{"error": "the drawing process did not start"}')
-        if "error" in said:
-            raise UsageError(
-                f"--serve {self._address}: cannot listen there: {said['error']}", remedy="choose another port"
-            )
-        from pans.runtime.watch.metrics import parse_address  # the server's modules load slowly
-
-        host = parse_address(self._address, "--serve")[0]
+    def _start(self, words: list[str], *handles: int) -> None:
+        command = [sys.executable, "-P", "-m", "pans.runtime.monitor.child", *words]
+        pipe = subprocess.PIPE
+        self._child = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, pass_fds=handles)
         threading.Thread(target=self._listen, args=(self._child.stdout,), name="pans-page", daemon=True).start()
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{said['port']}/"
 
-    def begin(self, bundle: Bundle, recorder: Recorder | None, facts: dict[str, Any], stop: Stop) -> None:
-        """Start to take pictures, in a thread that inherits no privileges of the loop; `facts` are begin_facts'."""
-        self._wanted, self._facts, self._stop = (bundle, recorder), facts, stop
-        if self._child is None and not self._lines:
-            return
-        self._thread = threading.Thread(target=self._keep, name="pans-monitor", daemon=True)
-        self._thread.start()
+    def begin(self, facts: dict[str, Any], stop: Stop) -> None:
+        """Start to take pictures, in a thread that inherits no privileges of the loop.
 
-    def prepared(self, run: LiveRun) -> None:
-        """Show `run` from here on."""
+        `facts` are what is known before a run: title, classes, encoder, simulated, expected decisions, deadline_us and others.
+        """
+        self._stop = stop
+        if self._child is not None or self._lines:
+            self._thread = threading.Thread(target=self._keep, args=(facts,), name="pans-monitor", daemon=True)
+            self._thread.start()
+
+    def prepared(self, run: LiveRun, bundle: Bundle, host: Callable[[], dict[str, Any]]) -> None:
+        """Show `run` from here on; `host` returns what is known about the computer (HostWatch.facts)."""
         from .snapshot import Snapshots
 
-        assert self._wanted is not None
-        snapshots = Snapshots(run, *self._wanted, self._latest)
+        snapshots = Snapshots(run, bundle, self._latest, host)
         if self.url:
             snapshots.tell_words()
         self._run, self._snapshots = run, snapshots
@@ -127,17 +130,26 @@ class Monitor:
         self._ending.set()
         if self._thread is not None:
             self._thread.join(GOODBYE_S)
-        self._end_child()
+        if self._child is None:
+            return
+        with suppress(OSError):  # the process draws what is left; one that does not end is ended
+            if self._child.stdin is not None and (self._thread is None or not self._thread.is_alive()):
+                self._child.stdin.close()
+        try:
+            self._child.wait(GOODBYE_S)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
 
-    # -- the thread ----------------------------------------------------------------------------------------------------
+    # -- the threads ---------------------------------------------------------------------------------------------------
 
-    def _keep(self) -> None:
+    def _keep(self, facts: dict[str, Any]) -> None:
         from .figures import headline, title_of
         from .history import History
 
         history = History()
-        history.take(self._facts)
-        told, line_due_s = self._tell(self._facts), time.monotonic() + LINE_EVERY_S
+        history.take(facts)
+        told, line_due_s = self._tell(facts), time.monotonic() + LINE_EVERY_S
         over = False
         while not over:
             over = self._ending.wait(EVERY_S)
@@ -156,9 +168,7 @@ class Monitor:
 
     def _listen(self, said: IO[str]) -> None:
         """Take what is asked for on the page: a note, or the end of the run."""
-        from pans.runtime.live.continuous import INTERRUPTED  # the process that draws loads nothing of it
-
-        with suppress(ValueError, OSError):  # the process is gone
+        with suppress(ValueError, OSError), said:  # the process is gone
             for line in said:
                 asked = json.loads(line)
                 text = one_line(asked.get("note", ""), NOTE_CHARACTERS).strip()
@@ -166,6 +176,8 @@ class Monitor:
                 if text:
                     self._notes.append({"text": text, "utc": utc})
                 elif asked.get("stop") is True and self._stop is not None:
+                    from pans.runtime.live.continuous import INTERRUPTED  # the process that draws loads nothing of it
+
                     self._notes.append({"text": "stop was pressed on the live page", "utc": utc})
                     self._stop.request(INTERRUPTED)
 
@@ -178,26 +190,3 @@ class Monitor:
         except (OSError, ValueError):  # it is gone: the run goes on without a view
             return False
         return True
-
-    def _end_child(self) -> None:
-        """Let the process draw what is left; one that does not end is ended."""
-        child, self._child = self._child, None
-        if child is None:
-            return
-        with suppress(OSError):
-            if child.stdin is not None and (self._thread is None or not self._thread.is_alive()):
-                child.stdin.close()
-        try:
-            child.wait(GOODBYE_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-        if child.stdout is not None and not self.url:  # else the thread that reads it ends with it
-            child.stdout.close()
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        return find_spec(name) is not None
-    except ModuleNotFoundError:
-        return False

@@ -7,15 +7,11 @@ that changes while it is read is that of one moment or the next.
 from __future__ import annotations
 
 import base64
-import os
-import shutil
 import time
 import zlib
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
-from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +31,6 @@ if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.decision import Decision
     from pans.runtime.live import LiveRun
-    from pans.runtime.record import Recorder
 
 LATEST = 12  # decisions
 LOOKS, LOOK_EVERY_S = 8, 0.003  # for a word that is whole
@@ -43,36 +38,23 @@ SAME = 1e-3  # of two probabilities
 EVENTS_MAX = 50  # of one picture; what is left comes with the next
 PIXELS_MAX = 64  # of a side, as it is shown
 PATTERNS_MAX = 2048  # whose pixels are told in one run
-DISK_EVERY_S = 5.0
+TALLIED = ("decisions", "abstained", "known", "right", "objects", "clicks", "photons_known", "photons")
 BREATH_S = 0.0002  # between two readings, for the loop
 
 
-def begin_facts(bundle: Bundle, **facts: Any) -> dict[str, Any]:
-    """Return what is known before a run begins: classes, sizes, and `facts` (title, device, profile, expected decisions and others)."""
-    return {
-        "kind": "begin",
-        "bundle": bundle.name,
-        "classes": list(bundle.classes),
-        "encoder": bundle.encoder,
-        "n_patterns": bundle.n_patterns,
-        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        **facts,
-    }
-
-
 class Snapshots:
-    """Takes pictures of one run; `latest` are the decisions made last."""
+    """Takes pictures of one run; `latest` are the decisions made last, `host` tells about the computer (HostWatch.facts)."""
 
-    def __init__(self, run: LiveRun, bundle: Bundle, recorder: Recorder | None, latest: deque[Decision]) -> None:
-        self._run, self._bundle, self._recorder, self._latest = run, bundle, recorder, latest
+    def __init__(
+        self, run: LiveRun, bundle: Bundle, latest: deque[Decision], host: Callable[[], dict[str, Any]]
+    ) -> None:
+        self._run, self._bundle, self._latest, self._host = run, bundle, latest, host
         self._began_s = time.monotonic()
         self._counts = np.zeros_like(run.timing.total.counts)
         self._told: set[int] = set()
         self._told_events = 0
         automaton = run.plan.automaton
         self._light = None if automaton is None else bundle.light_of(automaton)  # of each state
-        self._disk: dict[str, Any] = {}
-        self._disk_due_s = 0.0
         self._breathe: Callable[[float], None] = time.sleep
         self._core: Core | None = None  # whose click words are told
 
@@ -86,34 +68,24 @@ class Snapshots:
         """Return the run's figures as they are now; `breathe` is called between the parts."""
         picture: dict[str, Any] = {"kind": "picture", "elapsed_s": round(time.monotonic() - self._began_s, 3)}
         self._breathe = breathe
-        for part in (self._counters, self._latency, self._classes, self._decisions, self._dark, self._clock):
+        for part in (self._counters, self._latency, self._decisions, self._dark, self._clock, self._host):
             picture |= part()
             breathe(BREATH_S)
-        return picture | self._disk_facts()
+        return picture
 
     def _counters(self) -> dict[str, Any]:
-        run, tally, stream = self._run, self._run.tally, self._run.core.tracker.counters
-        core: Any = run.core  # of any kind
+        run, stream, core = self._run, self._run.core.tracker.counters, cast(Any, self._run.core)  # of any kind
         return {
             "state": state_of(run),
             "ended": run.ended,
-            "decisions": tally.decisions,
-            "abstained": tally.abstained,
-            "known": tally.known,
-            "right": tally.right,
-            "objects": tally.objects,
-            "clicks": tally.clicks,
-            "photons_known": tally.photons_known,
-            "photons": tally.photons,
+            **{name: getattr(run.tally, name) for name in TALLIED},
             "walk_light": None if self._light is None else float(core.windows.walks.shown @ self._light),
             "exposures": stream.exposures,
             "lost": stream.lost_exposures,
             "gaps": stream.gaps,
             "late": run.timing.late,
             "reconnects": run.reconnects,
-            "repeated": stream.repeated,
-            "repeats_differing": stream.repeats_differing,
-            "contradictions": sum(run.contradictions.values()) + sum(run.core.contradictions.values()),
+            "contradictions": sum((run.contradictions + core.contradictions).values()) + stream.repeats_differing,
         }
 
     def _latency(self) -> dict[str, Any]:
@@ -123,14 +95,6 @@ class Snapshots:
         grown = self._counts - before
         some = [[upper_edge(bucket), int(grown[bucket])] for bucket in np.flatnonzero(grown).tolist()]
         return {"latency": some, "latency_max_us": total.max_ns / 1000}
-
-    def _classes(self) -> dict[str, Any]:
-        table = self._run.tally.confusion
-        return {
-            "class_truth": table.sum(axis=1).tolist(),
-            "class_decided": table.sum(axis=0).tolist(),
-            "class_right": table.diagonal().tolist(),
-        }
 
     def _decisions(self) -> dict[str, Any]:
         """The latest decisions, the click word of one of them, and the pixels of patterns that are new.
@@ -220,19 +184,6 @@ class Snapshots:
             "trouble": "" if trouble is None else _trouble_of(trouble),
             "events": [[e["kind"], words_of(e), e.get("since")] for e in news if e["kind"] in INSTANT],
         }
-
-    def _disk_facts(self) -> dict[str, Any]:
-        recorder = self._recorder
-        if recorder is None:
-            return {}
-        now_s = time.monotonic()
-        if now_s >= self._disk_due_s:
-            self._disk_due_s = now_s + DISK_EVERY_S
-            path = recorder.open_file.path
-            with suppress(OSError):
-                self._disk = {"disk_free_bytes": shutil.disk_usage(path.parent).free, "recording": path.name}
-                self._disk["recording_bytes"] = os.stat(path).st_size
-        return self._disk
 
 
 def _trouble_of(event: dict[str, Any]) -> str:

@@ -28,7 +28,7 @@ from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.monitor import History, Monitor
 from pans.runtime.monitor.alarms import Alarms
-from pans.runtime.monitor.figures import class_rows, headline, health, latest_rows, rows_of
+from pans.runtime.monitor.figures import headline, health, latest_rows, rows_of
 from pans.runtime.monitor.history import BINS, LEVELS, SUMS, quantile_us
 from pans.runtime.monitor.monitor import NOTE_CHARACTERS
 from pans.runtime.monitor.snapshot import Snapshots
@@ -135,18 +135,17 @@ def test_what_is_wrong_is_marked_and_in_words() -> None:
     history = History()
     history.take({"kind": "begin", "deadline_us": 1000.0, "classes": ["a\x1b[2J", "b"], "expected": 100})
     late = picture(10.0, decisions=50, known=50, right=25, objects=50, clicks=100, late=3, lost=7, gaps=2)
-    late |= {"class_decided": [30, 20], "class_truth": [25, 25], "class_right": [20, 10], "latency": [[1_700_000, 50]]}
-    late |= {"disk_free_bytes": 1 << 20, "recording_bytes": 1 << 20, "recording": "run.pansrec"}
+    late |= {"disk_free_bytes": 1 << 20, "disk_left_s": 10, "latency": [[1_700_000, 50]]}
     late |= {"latest": [[49, 3, 0, 0.5, 2, 1, 0]]}
     history.take(late | {"trouble": "lost\n\x1b[31m", "dark_exposures": 100, "dark_clicks": 3})
     rows = {row.name: row for row in rows_of(history)}
-    assert rows["late"].level == rows["lost"].level == rows["disk"].level == rows["budget"].level == "bad"
+    assert rows["late"].level == rows["lost"].level == rows["disk"].level == rows["latency"].level == "bad"
     assert rows["lost"].text == "7 exposures in 2 gaps"
     assert rows["accuracy"].text.startswith("50.0%, 95 % interval 36.6% to 63.4%")
     assert "0.03 per exposure" in rows["dark counts"].text
     assert not any("\x1b" in row.text or "\n" in row.text for row in rows.values())
-    assert class_rows(history)[0] == ("a\\x1b[2J", 30, 25, 20)
     assert latest_rows(history)[0]["level"] == "bad"
+    assert latest_rows(history)[0]["decision"] == "a\\x1b[2J"
     assert headline(history).startswith("50 of 100 decisions · accuracy 50.0% · 2.00 clicks each · p99")
     assert headline(history).endswith("late 3 · lost 7")
 
@@ -214,14 +213,14 @@ def test_the_alarm_comes_when_it_was_said_to_come(n_channels: int) -> None:
 class Watched(Monitor):
     """Takes a picture after every seventh decision and at the end, and draws nothing."""
 
-    def begin(self, bundle: Any, recorder: Any, facts: dict[str, Any], stop: Any) -> None:
+    def begin(self, facts: dict[str, Any], stop: Any) -> None:
         self._stop = stop
-        self.bundle, self.history, self.pictures = bundle, History(), list[dict[str, Any]]()
+        self.history, self.pictures = History(), list[dict[str, Any]]()
         self.history.take(json.loads(json.dumps(facts)))
 
-    def prepared(self, run: Any) -> None:
+    def prepared(self, run: Any, bundle: Any, host: Any) -> None:
         self.run = self._run = run
-        self.snapshots = Snapshots(run, self.bundle, None, self._latest)
+        self.snapshots = Snapshots(run, bundle, self._latest, host)
         self.snapshots.tell_words()
 
     def watch(self, run: Any, output: Any) -> None:
@@ -252,7 +251,6 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
     assert last["decisions"] == tally.decisions == 120
     assert last["right"] / last["known"] == tally.accuracy == tally.confusion.trace() / 120
     assert sum(history.latency.values()) == run.timing.total.total
-    assert last["class_right"] == tally.confusion.diagonal().tolist()
     assert [row[0] for row in last["latest"]] == list(range(108, 120))
     bundle, _ = load_bundle(SHIPPED / "fashion10.pans")
     word = last["word"]
@@ -328,7 +326,7 @@ def test_without_a_terminal_there_are_plain_lines(
     facts = {"kind": "begin", "title": "a bundle on an instrument", "simulated": True, "expected": 500}
     with shown:
         assert shown._child is None
-        shown.begin(None, None, facts, None)  # type: ignore[arg-type]
+        shown.begin(facts, None)  # type: ignore[arg-type]
         shown._snapshots = SimpleNamespace(take=pictures.popleft)  # type: ignore[assignment]
         give_up_s = time.monotonic() + 30
         while len(pictures) > 9_990 and time.monotonic() < give_up_s:
@@ -348,9 +346,8 @@ def test_a_panel_is_drawn_on_a_terminal_and_removed(tmp_path: Path) -> None:
         words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=theirs, text=True, env=environment
     )
     sums = {"decisions": 4, "known": 4, "right": 3, "objects": 4, "clicks": 8, "latest": [[3, 7, 0, 0.9, 2, 0, 0]]}
-    classes = {"class_decided": [3, 1], "class_truth": [2, 2], "class_right": [2, 1]}
     begin = {"kind": "begin", "title": "a bundle on a device", "classes": ["shoe", "bag"], "deadline_us": 100.0}
-    for message in (begin | {"expected": 10}, picture(3.0, **sums, **classes)):
+    for message in (begin | {"expected": 10}, picture(3.0, **sums)):
         child.stdin.write(json.dumps(message) + "\n")
     child.stdin.close()
     assert child.wait(20) == 0
