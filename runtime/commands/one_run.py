@@ -366,7 +366,7 @@ class _Run:
                 if not link.virtual and (missing := lacking()):
                     say(f"pans: {sys.platform} has no {', no '.join(missing)}; decisions that are late are counted")
                 seen.prepared(run)
-                monitor.prepared(run, self.bundle, lambda: seen.host)
+                monitor.prepared(run, self.bundle, seen.look)
                 if besides is not None and besides.prepared is not None:
                     besides.prepared(run)
                 if self.flow_run is not None:

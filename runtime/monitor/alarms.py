@@ -13,7 +13,7 @@ from .history import History
 KEPT = 200
 QUIET_S = 10.0  # without another late decision, lost exposure or contradiction: the alarm is over
 LASTING = ("state", "dark counts", "exposures", "disk")  # figures that are bad as long as they are
-GROWING = ("late", "lost", "contradictions")
+GROWING = {"late": "late", "lost": "lost_exposures", "contradictions": "contradictions"}
 # kinds of events without an end that is known: name, level
 INSTANT = {
     "note": ("note", "note"),
@@ -72,11 +72,11 @@ class Alarms:
         """Return level and cause of what is wrong now."""
         picture, rows = history.picture, {row.name: row for row in rows_of(history)}
         present = {name: row[1:] for name in LASTING if (row := rows.get(name)) and row.level in ("warn", "bad")}
-        trouble = f"; {one_line(picture['trouble'], 300)}" if picture["trouble"] else ""
-        for name in GROWING:
-            if picture[name] > self._counted[name]:
+        trouble = f"; {one_line(picture['last_error'], 300)}" if picture["last_error"] else ""
+        for name, key in GROWING.items():
+            if picture[key] > self._counted[name]:
                 self._grew_s[name] = now_s
-            self._counted[name] = picture[name]
+            self._counted[name] = picture[key]
             if now_s - self._grew_s[name] < QUIET_S:
                 present[name] = f"{rows[name].text} in the whole run{trouble}", "bad"
         return {name: (level, cause) for name, (cause, level) in present.items()}

@@ -44,7 +44,9 @@ def rows_of(history: History) -> list[Row]:
     made = f"{done:,}{f' of {expected:,}' if expected else ''}, {rate:,.1f} per second"
     if expected > done and rate > 0 and not picture["ended"]:
         made += f", {duration((expected - done) / rate)} left"
-    late, lost, wrong, drift = (picture[name] for name in ("late", "lost", "contradictions", "clock_drift_ppm"))
+    late, lost, wrong, drift = (
+        picture[name] for name in ("late", "lost_exposures", "contradictions", "clock_drift_ppm")
+    )
     clock = "drift not known yet" if drift is None else f"drift {drift:+.2f} ppm"
     gaps = f" in {picture['gaps']:,} gaps" if lost else ""
     rows = [
@@ -55,12 +57,14 @@ def rows_of(history: History) -> list[Row]:
         Row("late", f"{late:,} decisions", "bad" if late else "good"),
         Row("lost", f"{lost:,} exposures{gaps}", "bad" if lost else "good"),
         _dark(picture),
-        _exposures(picture.get("exposed"), begin.get("exposure_tolerance_us", 0.0)),
+        _exposures(picture, begin.get("exposure_tolerance_us", 0.0)),
         Row("clock", f"{clock}, uncertainty at most {picture['clock_uncertainty_us']:,.0f} us"),
         *([Row("contradictions", f"{wrong:,} messages", "bad")] if wrong else ()),
         *([_disk(picture)] if "disk_free_bytes" in picture else ()),
     ]
-    return [*rows, Row("latest trouble", one_line(picture["trouble"], 300), "warn")] if picture["trouble"] else rows
+    return (
+        [*rows, Row("latest trouble", one_line(trouble, 300), "warn")] if (trouble := picture["last_error"]) else rows
+    )
 
 
 def title_of(history: History) -> str:
@@ -79,7 +83,7 @@ def headline(history: History) -> str:
     return (
         f"{decisions}{f' of {expected}' if expected else ''} decisions{accuracy}"
         f" · {picture['clicks'] / max(decisions, 1):.2f} clicks each"
-        f" · p99 {p99 / 1000:.2f} ms · late {picture['late']} · lost {picture['lost']}"
+        f" · p99 {p99 / 1000:.2f} ms · late {picture['late']} · lost {picture['lost_exposures']}"
         + (f" · dark counts: {dark}" if level not in ("", "good") else "")
     )
 
@@ -115,17 +119,17 @@ def _latency(history: History) -> list[Row]:
     return [Row("latency", f"{text}; p99 takes {p99 / deadline:.0%} of {deadline:,.0f} us", level)]
 
 
-def _exposures(told: list[float] | None, allowed_us: float) -> Row:
-    """When exposures happened: how many were told of, and the farthest start and length."""
-    if not told or not told[0]:
-        return Row("exposures", "not told by the device" if told is None else "not told yet", "note")
-    _, start_us, length_us = told
+def _exposures(picture: dict[str, Any], allowed_us: float) -> Row:
+    """When exposures happened: the farthest start and length."""
+    if "exposure_start_us" not in picture:
+        return Row("exposures", "not told by the device", "note")
+    start_us, length_us = picture["exposure_start_us"], picture["exposure_length_us"]
     text = f"start {start_us:+.3g} us, length {length_us:+.3g} us at most, allowed {allowed_us:.3g} us"
     return Row("exposures", text, "bad" if max(abs(start_us), abs(length_us)) > allowed_us else "good")
 
 
 def _dark(picture: dict[str, Any]) -> Row:
-    clicks, exposures, expected = (picture.get(name) for name in ("dark_clicks", "dark_exposures", "dark_expected"))
+    clicks, exposures, expected = picture["dark_clicks"], picture["dark_exposures"], picture.get("dark_expected")
     if not exposures:
         return Row("dark counts", "no dark exposures yet", "note")
     low, high = wilson_interval(clicks, exposures)
@@ -196,7 +200,7 @@ def health(history: History) -> list[tuple[str, str, str]]:
     """Return machine, link and detector, each as its name, a level, and one sentence with one number."""
     picture, deadline = history.picture, float(history.begin.get("deadline_us", 0.0))
     sums, latency, _ = history.recent(RECENT_S)
-    p99, late, lost = quantile_us(latency, 0.99), int(sums["late"]), int(sums["lost"])
+    p99, late, lost = quantile_us(latency, 0.99), int(sums["late"]), int(sums["lost_exposures"])
     disk = _disk(picture) if "disk_left_s" in picture else Row("disk", "")
     if disk.level:
         machine = disk.level, f"The disk of the recording is full in {duration(picture['disk_left_s'])}."

@@ -8,6 +8,7 @@ draws in the terminal shall start at once and stay small.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,8 +17,8 @@ from pans.runtime.intervals import wilson_interval
 
 LEVELS = (1.0, 5.0, 30.0, 180.0, 1200.0, 7200.0)  # seconds of a bin
 BINS = 512  # of a level: 8 minutes, 42 minutes, 4 hours, 1 day, 1 week, 6 weeks
-SUMS: tuple[str, ...] = ("decisions", "known", "right", "abstained", "late", "lost", "exposures", "clicks", "photons")
-SUMS += ("photons_known", "dark_exposures", "dark_clicks")
+SUMS: tuple[str, ...] = ("decisions", "known", "right", "abstained", "late", "clicks", "photons")
+SUMS += ("photons_known", "lost_exposures", "dark_exposures", "dark_clicks")
 
 
 @dataclass(slots=True)
@@ -68,7 +69,7 @@ class History:
     def recent(self, seconds: float) -> tuple[dict[str, float], Counter[int], float]:
         """Return the sums and the latencies of the last `seconds`, in whole bins, and how long these are together."""
         some = [one for one in self.bins[LEVELS[0]] if one.end_s > self.picture["elapsed_s"] - seconds]
-        sums = dict(zip(SUMS, map(sum, zip(*(one.sums for one in some)))))
+        sums = dict(zip(SUMS, map(math.fsum, zip(*(one.sums for one in some)))))
         return sums, sum((one.latency for one in some), Counter()), some[-1].end_s - some[0].begin_s
 
     def when(self, name: str, count: float) -> float:

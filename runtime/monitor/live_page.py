@@ -77,7 +77,7 @@ def columns(history: History, level: float, least: float) -> dict[str, F64]:
     own = np.array([one.sums for one in bins], np.float64).reshape(n, len(SUMS))
     begin, sums = _points(own, "decisions", least)
     _, dark = _points(own, "dark_clicks", LEAST_DARK)
-    made, late, lost = (own[:, SUMS.index(name)] for name in ("decisions", "late", "lost"))
+    made, late, lost = (own[:, SUMS.index(name)] for name in ("decisions", "late", "lost_exposures"))
     found = [history.accuracy({"known": known, "right": right}) for known, right in zip(sums["known"], sums["right"])]
     accuracy = np.array([(np.nan,) * 3 if one is None else one for one in found]).reshape(n, 3).T * 100
     intervals = [wilson_interval(*one) for one in zip(dark["dark_clicks"], dark["dark_exposures"])]

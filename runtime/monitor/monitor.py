@@ -103,11 +103,11 @@ class Monitor:
             self._thread = threading.Thread(target=self._keep, args=(facts,), name="pans-monitor", daemon=True)
             self._thread.start()
 
-    def prepared(self, run: LiveRun, bundle: Bundle, host: Callable[[], dict[str, Any]]) -> None:
-        """Show `run` from here on; `host` returns what is known about the computer (HostWatch.facts)."""
+    def prepared(self, run: LiveRun, bundle: Bundle, look: Callable[[], dict[str, Any]]) -> None:
+        """Show `run` from here on, and what `look` returns of it (watch.state_file)."""
         from .snapshot import Snapshots
 
-        snapshots = Snapshots(run, bundle, self._latest, host)
+        snapshots = Snapshots(run, bundle, self._latest, look)
         if self.url:
             snapshots.tell_words()
         self._run, self._snapshots = run, snapshots

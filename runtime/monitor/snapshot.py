@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.automaton import walk_nodes
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.core.still import Core
-from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.decide.verdict import log_evidence
 from pans.runtime.instrument.channel_health import LEVELS
 from pans.runtime.live.journal import words_of
 from pans.runtime.timing.ledger import upper_edge
-from pans.runtime.watch.state_file import state_of
 
 from .alarms import INSTANT
 
@@ -43,12 +42,12 @@ BREATH_S = 0.0002  # between two readings, for the loop
 
 
 class Snapshots:
-    """Takes pictures of one run; `latest` are the decisions made last, `host` tells about the computer (HostWatch.facts)."""
+    """Takes pictures of one run: what `look` returns (watch.state_file) and more; `latest` are the decisions made last."""
 
     def __init__(
-        self, run: LiveRun, bundle: Bundle, latest: deque[Decision], host: Callable[[], dict[str, Any]]
+        self, run: LiveRun, bundle: Bundle, latest: deque[Decision], look: Callable[[], dict[str, Any]]
     ) -> None:
-        self._run, self._bundle, self._latest, self._host = run, bundle, latest, host
+        self._run, self._bundle, self._latest, self._look = run, bundle, latest, look
         self._began_s = time.monotonic()
         self._counts = np.zeros_like(run.timing.total.counts)
         self._told: set[int] = set()
@@ -66,27 +65,18 @@ class Snapshots:
 
     def take(self, breathe: Callable[[float], None] = time.sleep) -> dict[str, Any]:
         """Return the run's figures as they are now; `breathe` is called between the parts."""
-        picture: dict[str, Any] = {"kind": "picture", "elapsed_s": round(time.monotonic() - self._began_s, 3)}
         self._breathe = breathe
-        for part in (self._counters, self._latency, self._decisions, self._dark, self._clock, self._host):
-            picture |= part()
+        picture = self._look() | {"kind": "picture", "elapsed_s": round(time.monotonic() - self._began_s, 3)}
+        for part in (self._results, self._latency, self._decisions, self._dark, self._clock):
             breathe(BREATH_S)
+            picture |= part()
         return picture
 
-    def _counters(self) -> dict[str, Any]:
-        run, stream, core = self._run, self._run.core.tracker.counters, cast(Any, self._run.core)  # of any kind
-        return {
-            "state": state_of(run),
-            "ended": run.ended,
-            **{name: getattr(run.tally, name) for name in TALLIED},
-            "walk_light": None if self._light is None else float(core.windows.walks.shown @ self._light),
-            "exposures": stream.exposures,
-            "lost": stream.lost_exposures,
-            "gaps": stream.gaps,
-            "late": run.timing.late,
-            "reconnects": run.reconnects,
-            "contradictions": sum((run.contradictions + core.contradictions).values()) + stream.repeats_differing,
-        }
+    def _results(self) -> dict[str, Any]:
+        run, core = self._run, cast(Any, self._run.core)  # of any kind
+        wrong = sum((run.contradictions + core.contradictions).values()) + core.tracker.counters.repeats_differing
+        light = None if self._light is None else float(core.windows.walks.shown @ self._light)
+        return {name: getattr(run.tally, name) for name in TALLIED} | {"walk_light": light, "contradictions": wrong}
 
     def _latency(self) -> dict[str, Any]:
         """The histogram of latencies as it has grown since the last picture: [duration in ns, how many more]."""
@@ -94,7 +84,7 @@ class Snapshots:
         before, self._counts = self._counts, total.counts.copy()
         grown = self._counts - before
         some = [[upper_edge(bucket), int(grown[bucket])] for bucket in np.flatnonzero(grown).tolist()]
-        return {"latency": some, "latency_max_us": total.max_ns / 1000}
+        return {"latency": some}
 
     def _decisions(self) -> dict[str, Any]:
         """The latest decisions, the click word of one of them, and the pixels of patterns that are new.
@@ -120,12 +110,8 @@ class Snapshots:
         if automaton is None:
             shown = list(range(min(len(clicks), PIXELS_MAX)))
         else:
-            shown, node = [], 0
-            for outcome in (counts.reshape(-1, automaton.channels) << np.arange(automaton.channels)).sum(axis=1):
-                if node >= automaton.n_states:
-                    break
-                shown += automaton.rows[node].tolist()
-                node = int(automaton.successors[node, outcome])
+            nodes = walk_nodes(automaton, counts[None])[0]
+            shown = automaton.rows[nodes[nodes < automaton.n_states]].reshape(-1).tolist()
         new = [number for number in dict.fromkeys(shown) if number not in self._told]
         new = new[: max(0, PATTERNS_MAX - len(self._told))]
         self._told.update(new)
@@ -143,20 +129,19 @@ class Snapshots:
         return np.exp(log_evidence(decider.scores_batch(counts[None], core.shots), 1e-30)[0])
 
     def _pixels(self, number: int) -> dict[str, Any]:
-        values = pattern_pixels(self._bundle, number)
-        high = float(values.max()) or 1.0
-        grey = np.round(values * (255 / high)).astype(np.uint8)
+        """Pattern `number`, or row `number` of passive optics (its modulus), white where it is brightest."""
+        bundle = self._bundle
+        values = bundle.pattern_levels[number] if bundle.analyser is None else np.abs(bundle.analyser.matrix[number])
+        picture = values.reshape(bundle.image_shape)
+        step = -(-max(picture.shape) // PIXELS_MAX)
+        grey = np.round(picture[::step, ::step] * (255 / (float(values.max()) or 1.0))).astype(np.uint8)
         return {"shape": list(grey.shape), "grey": base64.b64encode(grey.tobytes()).decode()}
 
     def _dark(self) -> dict[str, Any]:
-        tallies, guard = self._run.core.tallies, getattr(self._run.core, "guard", None)
-        facts: dict[str, Any] = {
-            "dark_exposures": int(tallies[DARK_EXPOSURES]),
-            "dark_clicks": int(tallies[DARK_CLICKS]),
-        }
+        guard = getattr(self._run.core, "guard", None)
         if guard is None:
-            return facts
-        watch = guard.watch
+            return {}
+        watch, facts = guard.watch, dict[str, Any]()
         if watch.exposures:  # one detector in one exposure, as what is expected; a flow tells by its empty frames
             facts = {"dark_exposures": watch.exposures * watch.n_channels, "dark_clicks": int(watch.clicks.sum())}
         return facts | {
@@ -171,36 +156,16 @@ class Snapshots:
         }
 
     def _clock(self) -> dict[str, Any]:
-        clock, told, tick_us = self._run.connection.clock, self._run.core.exposed, self._run.plan.tick_us
-        tells = self._run.connection.session.tells_exposed
+        clock = self._run.connection.clock
         fit = None if clock is None else clock.fit
-        trouble = self._run.journal.trouble
         news = self._run.journal.events[self._told_events : self._told_events + EVENTS_MAX]
         self._told_events += len(news)
         return {
             "clock_drift_ppm": None if fit is None else round(fit.drift_ppm, 4),
-            "exposed": [told.exposures, told.start_error * tick_us, told.length_error * tick_us] if tells else None,
             "clock_uncertainty_us": self._run.timing.worst_uncertainty_ns / 1000,
-            "trouble": "" if trouble is None else _trouble_of(trouble),
             "events": [[e["kind"], words_of(e), e.get("since")] for e in news if e["kind"] in INSTANT],
         }
 
 
-def _trouble_of(event: dict[str, Any]) -> str:
-    kind = "cause of late or missing work" if event["kind"] == "blame" else str(event["kind"]).replace("_", " ")
-    return f"{kind}: {words_of(event)}"
-
-
 def _facts_of(row: Decision) -> list[Any]:
     return [row.number, row.object, row.label, round(row.probability, 4), row.clicks, row.truth, row.flags]
-
-
-def pattern_pixels(bundle: Bundle, number: int) -> NDArray[np.float64]:
-    """Return pattern `number`, or row `number` of passive optics (its modulus), float64 (height, width), at most PIXELS_MAX a side."""
-    if bundle.analyser is None:
-        values = bundle.pattern_levels[number].astype(np.float64)
-    else:
-        values = np.abs(bundle.analyser.matrix[number]).astype(np.float64)
-    picture = values.reshape(bundle.image_shape)
-    step = -(-max(picture.shape) // PIXELS_MAX)
-    return np.ascontiguousarray(picture[::step, ::step])

@@ -93,14 +93,10 @@ class Watchers:
         """State what came of the run: PASS or FAIL, and why."""
         self._outcome = {"verdict": verdict, "faults": [*faults][:MAX_FAULTS], "last_verdict": verdict}
 
-    @property
-    def host(self) -> dict[str, Any]:
-        """What is known about the computer (HostWatch.facts)."""
-        return {} if self._host is None else self._host.facts
-
     def look(self) -> dict[str, Any]:
         """Return the picture as it is now."""
-        return picture_of(self._run, self._recorder, self._started_s) | self.host | self._outcome
+        facts = {} if self._host is None else self._host.facts
+        return picture_of(self._run, self._recorder, self._started_s) | facts | self._outcome
 
     def note_news(self, run: LiveRun) -> None:
         """Note in the journal of `run` what was found about the computer; called by the loop."""

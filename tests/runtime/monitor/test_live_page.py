@@ -42,10 +42,10 @@ def messages(n: int = 30, step_s: float = 20.0, hot: range = range(0)) -> Iterat
         dark += 25 if k in hot else 1
         yield {
             **{"kind": "picture", "elapsed_s": step_s * k, "state": "running", "ended": "", "walk_light": 7e3 * k},
-            **dict.fromkeys(("lost", "gaps", "reconnects", "contradictions"), 0),
+            **dict.fromkeys(("lost_exposures", "gaps", "reconnects", "contradictions"), 0),
             **{name: 20 * k for name in ("decisions", "known", "objects", "photons_known")},
             **{"abstained": k, "right": 15 * k, "clicks": 90 * k, "photons": 160.0 * k, "exposures": 600 * k},
-            **{"late": k // 10, "trouble": NASTY, "events": [["note", NASTY, None]] if k == 5 else []},
+            **{"late": k // 10, "last_error": NASTY, "events": [["note", NASTY, None]] if k == 5 else []},
             **{"latency": [[300_000 + 10_000 * (k % 5), 18], [900_000, 2]], "latency_max_us": 1500.0},
             **{"dark_exposures": 50 * k, "dark_clicks": dark, "dark_expected": 0.015, "dark_low": 0.014},
             **{"dark_high": 0.02, "dark_states": [["alarm", 25.0, "hot", 50 * (hot[0] - 2)]] if k in hot else []},
