@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pans.runtime.safe_text import one_line
 
-from .figures import rows_of
+from .figures import dark_state, rows_of
 from .history import History
 
 KEPT = 200
@@ -59,24 +59,26 @@ class Alarms:
         present = {} if picture["ended"] else self._present(history, now_s)
         for name in self._open.keys() - present:
             self._open.pop(name).end_s = min(now_s, self._grew_s.get(name, now_s))
-        for name, (level, cause) in present.items():
+        for name, (level, cause, begin_s) in present.items():
             if name not in self._open:
-                begin_s, states = now_s, picture.get("dark_states")
-                if name == "dark counts" and states:
-                    begin_s = history.when("dark_exposures", min(since for *_, since in states))
                 self._open[name] = Alarm(name, level, begin_s, None, cause, now_s)
                 self.all.append(self._open[name])
             self._open[name].cause = cause
 
-    def _present(self, history: History, now_s: float) -> dict[str, tuple[str, str]]:
-        """Return level and cause of what is wrong now."""
+    def _present(self, history: History, now_s: float) -> dict[str, tuple[str, str, float]]:
+        """Return level, cause and beginning of what is wrong now."""
         picture, rows = history.picture, {row.name: row for row in rows_of(history)}
-        present = {name: row[1:] for name in LASTING if (row := rows.get(name)) and row.level in ("warn", "bad")}
+        lasting = (rows[name] for name in LASTING if name in rows)
+        present = {name: (level, text, now_s) for name, text, level in lasting if level in ("warn", "bad")}
+        if "dark counts" in present:
+            since = min(since for *_, since in picture["dark_states"])
+            _, words, level = dark_state(picture)
+            present["dark counts"] = level, words, history.when("dark_exposures", since)
         trouble = f"; {one_line(picture['last_error'], 300)}" if picture["last_error"] else ""
         for name, key in GROWING.items():
             if picture[key] > self._counted[name]:
                 self._grew_s[name] = now_s
             self._counted[name] = picture[key]
             if now_s - self._grew_s[name] < QUIET_S:
-                present[name] = f"{rows[name].text} in the whole run{trouble}", "bad"
-        return {name: (level, cause) for name, (cause, level) in present.items()}
+                present[name] = "bad", f"{rows[name].text} in the whole run{trouble}", now_s
+        return present

@@ -32,11 +32,13 @@ def main(words: Sequence[str]) -> int:
         if "--serve" in words:  # whoever has connected waits while Bokeh is loaded
             with suppress(OSError, AttributeError):
                 os.nice(NICE)
-            from .live_page import run_server
+            import asyncio
+            import socket
 
-            listening = int(words[words.index("--serve") + 1])
-            run_server(listening, history, draws, local="--local" in words, control="--control" in words)
-            return 0
+            from .live_page import serve
+
+            listening = socket.socket(fileno=int(words[words.index("--serve") + 1]))
+            asyncio.run(serve(listening, history, draws, local="--local" in words, control="--control" in words))
         for line in sys.stdin:
             history.take(json.loads(line))
             for draw in draws:

@@ -63,7 +63,9 @@ def rows_of(history: History) -> list[Row]:
         *([_disk(picture)] if "disk_free_bytes" in picture else ()),
     ]
     return (
-        [*rows, Row("latest trouble", one_line(trouble, 300), "warn")] if (trouble := picture["last_error"]) else rows
+        [*rows, Row("latest trouble", one_line(trouble.replace("_", " ", 1), 300), "warn")]
+        if (trouble := picture["last_error"])
+        else rows
     )
 
 
@@ -79,7 +81,7 @@ def headline(history: History) -> str:
     decisions = picture["decisions"]
     accuracy = f" · accuracy {picture['right'] / picture['known']:.1%}" if picture["known"] else ""
     p99 = quantile_us(history.latency, 0.99) or 0.0
-    dark, _, level = _dark_state(picture)
+    dark, _, level = dark_state(picture)
     return (
         f"{decisions}{f' of {expected}' if expected else ''} decisions{accuracy}"
         f" · {picture['clicks'] / max(decisions, 1):.2f} clicks each"
@@ -137,11 +139,11 @@ def _dark(picture: dict[str, Any]) -> Row:
     if expected is not None:
         top = picture["dark_high"]
         text += f"; expected {expected:.2g}" + (f", at most {top:.2g}" if top > expected * 1.0001 else "")
-    _, words, level = _dark_state(picture)
+    _, words, level = dark_state(picture)
     return Row("dark counts", f"{words}; {text}" if words else text, level)
 
 
-def _dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
+def dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
     """Return what the dark counts are, in a few words and in all, and its level; all "" where nothing is expected of them or none came.
 
     An alarm's words have the rate of the exposures that it was raised on. A rate whose interval excludes what is expected is not
@@ -217,7 +219,7 @@ def health(history: History) -> list[tuple[str, str, str]]:
         link = "bad", f"The run is: {picture['state']}, after {picture['elapsed_s']:,.0f} s."
     some = sums if sums["dark_exposures"] > 0 else picture
     dark, exposures = some["dark_clicks"], some["dark_exposures"]
-    words, _, level = _dark_state(picture)
+    words, _, level = dark_state(picture)
     rate = f"{dark / exposures:.2g} dark counts per exposure" if exposures else "No dark exposures yet"
     detector = level or "note", f"{rate}{f', {words}' if words else ''}."
     return [("machine", *machine), ("link", *link), ("detector", *detector)]

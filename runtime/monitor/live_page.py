@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import datetime, timedelta
 from importlib.resources import files
 from typing import Any
@@ -52,17 +52,15 @@ from .monitor import NOTE_CHARACTERS
 
 SESSIONS_MAX = 12
 REFRESH_MS, LAST_LOOK_S = 1000, 0.6
-SPANS = {"1 minute": 60, "10 minutes": 600, "1 hour": 3600, "6 hours": 21_600, "1 day": 86_400, "1 week": 604_800}
-SPANS |= {"6 weeks": 3_628_800}
-LEAST, LEAST_DARK = ("1", "30", "100", "300", "1000", "10000"), 10  # decisions of a point, and dark counts
+LEAST_DARK = 10  # dark counts of a point
 PATHS = re.compile(r"/|/ws|/static/[\w./-]+|/favicon\.ico")
-BLUE, ORANGE, GREEN, RED = "#3b82c4", "#d9670b", "#2e9a6f", "#d1495b"  # 3:1 on the white and the dark ground
-STYLES = ((BLUE, "solid"), (ORANGE, "dashed"))  # of the lines of a figure
-LEVEL_COLOURS = {"bad": RED, "warn": ORANGE, "note": GREEN}
 TEXTS = ("head", "health", "alarms", "word", "latest", "figures")
-POLICY = "default-src 'none'; script-src 'self' {}; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
-POLICY += "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-PLOTS: dict[str, Any] = tomllib.loads(files(__package__).joinpath("live.toml").read_text(encoding="utf-8"))
+POLICY = (
+    "default-src 'none'; script-src 'self' {}; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+LAYOUT: dict[str, Any] = tomllib.loads(files(__package__).joinpath("live.toml").read_text(encoding="utf-8"))
+PLOTS, COLOURS, SPANS = LAYOUT["plots"], LAYOUT["colours"], LAYOUT["spans"]
 F64 = NDArray[np.float64]
 
 
@@ -187,7 +185,7 @@ class Page:
         return {
             "begin": [self.milliseconds(one.begin_s) for one in some],
             "end": [self.milliseconds(now_s if one.end_s is None else one.end_s) for one in some],
-            "colour": [LEVEL_COLOURS[one.level] for one in some],
+            "colour": [COLOURS[one.level] for one in some],
         }
 
     def ask(self, **what: Any) -> None:
@@ -214,8 +212,8 @@ class _View:
         self._style: dict[str, Any] = {"stylesheets": [str(page.parts.style())]}
         self._wide = self._style | {"sizing_mode": "stretch_width"}
         self._divs = {name: Div(name=name, disable_math=True, **self._wide) for name in TEXTS}
-        self._span = self._choice("span", "Time shown", list(SPANS), "10 minutes")
-        self._least = self._choice("least", "A point takes at least (decisions)", list(LEAST), "100")
+        self._span = self._choice("span", "Time shown", SPANS, "10 minutes")
+        self._least = self._choice("least", "A point takes at least (decisions)", LAYOUT["least"], "100")
         self._range = Range1d(0, 1)
         now = Button(name="now", label="Follow the run", **self._wide)
         now.on_click(lambda: self._redraw(follows=True))
@@ -225,48 +223,40 @@ class _View:
                 document.add_root(root)
         document.template, document.title = page.template, figures.title_of(page.history)
 
-    def _choice(self, name: str, title: str, options: list[str], value: str) -> Any:
-        choice = Select(name=name, title=title, options=options, value=value, **self._wide)
+    def _choice(self, name: str, title: str, options: Iterable[str], value: str) -> Any:
+        choice = Select(name=name, title=title, options=list(options), value=value, **self._wide)
         choice.on_change("value", lambda attr, old, new: self._redraw(follows=self._follows or name == "span"))
         return choice
 
     def _figure(self, name: str, **plot: Any) -> Any:
         lines, limits, ends = plot["lines"], plot.get("limits", {}), plot.get("ends", ())
-        one = figure(
-            name=name,
-            height=260,
-            sizing_mode="stretch_width",
-            x_axis_type="datetime",
-            y_axis_type=plot.get("scale", "linear"),
-            x_range=self._range,
-            y_range=Range1d(*ends) if len(ends) == 2 else DataRange1d(**({"start": ends[0]} if ends else {})),
-            y_axis_label=plot["unit"],
-            tools="xpan,xbox_zoom,xwheel_zoom,reset,save",
-            toolbar_location="above",
-            background_fill_color=None,
-            border_fill_color=None,
-        )
-        one.toolbar.logo, one.xgrid.visible, one.min_border_right = None, False, 16
+        y_range = Range1d(*ends) if len(ends) == 2 else DataRange1d(**({"start": ends[0]} if ends else {}))
+        axes = {"x_range": self._range, "y_range": y_range, "y_axis_type": plot.get("scale", "linear")}
+        one = figure(name=name, y_axis_label=plot["unit"], **axes, **LAYOUT["figure"])
+        one.toolbar.logo, one.xgrid.visible = None, False
         one.vstrip(x0="begin", x1="end", source=self._marks, fill_color="colour", fill_alpha=0.15, line_color=None)
         one.vspan(x="begin", source=self._marks, line_color="colour", line_dash="dashed")
         source: dict[str, Any] = {"x": "x", "source": self._curves}
         tips = [("at", "@x{%F %T}"), *((legend, f"@{key}{{0.[0000]}}") for key, legend in (lines | limits).items())]
         for key, legend in plot.get("bands", {}).items():
-            between = {"y1": f"{key}_low", "y2": f"{key}_high", "fill_color": BLUE if key in lines else GREEN}
+            between = {
+                "y1": f"{key}_low",
+                "y2": f"{key}_high",
+                "fill_color": COLOURS["first" if key in lines else "note"],
+            }
             one.varea(**source, **between, fill_alpha=0.25, legend_label=legend)
             tips.append((legend, f"@{key}_low{{0.[00000]}} to @{key}_high{{0.[00000]}}"))
-        styles = [*STYLES[: len(lines)], *[(RED, "dotted")] * len(limits)]
+        styles = [("first", "solid"), ("second", "dashed")][: len(lines)] + [("limit", "dotted")] * len(limits)
         drawn = []
         for (key, legend), (colour, dash) in zip((lines | limits).items(), styles):
-            look = source | {"y": key, "color": colour}
+            look = source | {"y": key, "color": COLOURS[colour]}
             drawn.append(one.line(line_width=2, line_dash=dash, legend_label=legend, **look))
             if key in lines:
                 one.scatter(size=3, **look)
         tips.append(("over", "@over{0.[0]} s"))
         one.add_tools(HoverTool(renderers=drawn[:1], mode="vline", formatters={"@x": "datetime"}, tooltips=tips))
         one.add_layout(one.legend[0], "below")
-        one.legend[0].update(orientation="horizontal", ncols=2, border_line_color=None, background_fill_alpha=0)
-        one.legend[0].update(padding=0, margin=2, spacing=12, **self._style)
+        one.legend[0].update(**LAYOUT["legend"], **self._style)
         one.on_event(RangesUpdate, lambda event: self._redraw(follows=False))  # moved by hand, it stays
         one.on_event(Reset, lambda event: self._redraw(follows=True))
         return one
@@ -375,16 +365,10 @@ class _Headers(OutputTransform):
         return status_code, headers, chunk
 
 
-def run_server(
-    handle: int, history: History, draws: list[Callable[[History], None]], *, local: bool, control: bool
+async def serve(
+    listening: socket.socket, history: History, draws: list[Callable[[History], None]], *, local: bool, control: bool
 ) -> None:
-    """Serve the page at the listening socket `handle` until standard input ends; `draws` show `history` elsewhere, too."""
-    asyncio.run(_serve(socket.socket(fileno=handle), history, draws, local, control))
-
-
-async def _serve(
-    listening: socket.socket, history: History, draws: list[Callable[[History], None]], local: bool, control: bool
-) -> None:
+    """Serve the page at the socket `listening` until standard input ends; `draws` show `history` elsewhere, too."""
     listening.setblocking(False)
     for name in ("bokeh", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # nobody reads them beside a run
@@ -392,15 +376,10 @@ async def _serve(
     app = BokehTornado(
         {"/": Application(FunctionHandler(page.open))},
         extra_websocket_origins=["*"],  # the door has looked
-        unused_session_lifetime_milliseconds=10_000,
-        check_unused_sessions_milliseconds=3000,
-        websocket_max_message_size_bytes=1 << 16,
-        include_headers=[],
-        include_cookies=[],
+        **LAYOUT["server"],
     )
     app.transforms.append(_Headers)
-    limits = {"idle_connection_timeout": 20, "body_timeout": 5, "max_header_size": 1 << 14, "max_body_size": 1 << 12}
-    http = HTTPServer(_Door(app, local=local), **limits)
+    http = HTTPServer(_Door(app, local=local), **LAYOUT["http"])
     http.add_socket(listening)
     server = BaseServer(loop, app, http)
     server.start()

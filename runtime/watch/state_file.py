@@ -104,7 +104,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         **{key: ticks * run.plan.tick_us for key, ticks in exposed.items()},
         "reconnects": run.reconnects,
         "alarms": alarms_of(run),
-        "last_error": f"{trouble['kind'].replace('_', ' ')}: {words_of(trouble)}" if trouble else "",
+        "last_error": f"{trouble['kind']}: {words_of(trouble)}" if trouble else "",
     }
 
 
