@@ -102,11 +102,9 @@ def _results(history: History) -> list[Row]:
         Row("abstained", f"{abstained:,} ({abstained / done:.2%})", "note" if abstained else ""),
         Row("light per decision", ", ".join(each)),
     ]
-    if (found := history.accuracy(picture, picture["objects"])) is None:
-        return rows
-    share, low, high = found
+    share, low, high = history.accuracy(picture, picture["objects"])
     text = f"{share:.1%}, 95 % interval {low:.1%} to {high:.1%} ({picture['objects']:,} objects)"
-    return [Row("accuracy", text), *rows]
+    return [Row("accuracy", text), *rows] if picture["known"] else rows
 
 
 def _latency(history: History) -> list[Row]:

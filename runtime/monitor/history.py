@@ -83,12 +83,14 @@ class History:
                 later -= one.sums[at]
         return 0.0
 
-    def accuracy(self, sums: dict[str, Any], objects: int | None = None) -> tuple[float, float, float] | None:
-        """Return accuracy and its 95 % interval (Wilson), in which the trials of one visit and showings of one object count once."""
-        known = int(sums.get("known", 0))
-        if known <= 0:
-            return None
-        share = sums.get("right", 0) / known
+    def accuracy(self, sums: dict[str, Any], objects: int | None = None) -> tuple[float, float, float]:
+        """Return accuracy and its 95 % interval (Wilson), in which the trials of one visit and showings of one object count once.
+
+        NaN where no truth is known.
+        """
+        if (known := int(sums["known"])) <= 0:
+            return math.nan, math.nan, math.nan
+        share = sums["right"] / known
         n = max(1, min(known // max(1, int(self.begin.get("trials", 1))), known if objects is None else objects))
         low, high = wilson_interval(round(share * n), n)
         return share, min(low, share), max(high, share)

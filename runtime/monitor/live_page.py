@@ -77,7 +77,7 @@ def columns(history: History, level: float, least: float) -> dict[str, F64]:
     _, dark = _points(own, "dark_clicks", LEAST_DARK)
     made, late, lost = (own[:, SUMS.index(name)] for name in ("decisions", "late", "lost_exposures"))
     found = [history.accuracy({"known": known, "right": right}) for known, right in zip(sums["known"], sums["right"])]
-    accuracy = np.array([(np.nan,) * 3 if one is None else one for one in found]).reshape(n, 3).T * 100
+    accuracy = np.array(found).reshape(n, 3).T * 100
     intervals = [wilson_interval(*one) for one in zip(dark["dark_clicks"], dark["dark_exposures"])]
     low, high = np.array(intervals).reshape(n, 2).T
     drawn = low[low > 0].min(initial=picture.get("dark_low") or 1.0) / 3  # a logarithm has no place for 0
@@ -359,9 +359,7 @@ class _Headers(OutputTransform):
             headers["Cache-Control"] = "no-store"
         hashes = (f"'sha256-{base64.b64encode(hashlib.sha256(one).digest()).decode()}'" for one in inline)
         headers["Content-Security-Policy"] = POLICY.format(" ".join(hashes))
-        said = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Server": "pans"}
-        for name, value in said.items():
-            headers[name] = value
+        headers.update({"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Server": "pans"})
         return status_code, headers, chunk
 
 

@@ -182,11 +182,9 @@ class Monitor:
                     self._stop.request(INTERRUPTED)
 
     def _tell(self, message: dict[str, Any]) -> bool:
-        if self._child is None or self._child.stdin is None:
-            return False
-        try:
-            self._child.stdin.write(json.dumps(message) + "\n")
-            self._child.stdin.flush()
-        except (OSError, ValueError):  # it is gone: the run goes on without a view
-            return False
-        return True
+        with suppress(OSError, ValueError):  # it is gone: the run goes on without a view
+            if self._child is not None and self._child.stdin is not None:
+                self._child.stdin.write(json.dumps(message) + "\n")
+                self._child.stdin.flush()
+                return True
+        return False
