@@ -19,7 +19,7 @@ import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterable
-from datetime import datetime, timedelta
+from datetime import UTC, datetime
 from importlib.resources import files
 from typing import Any
 from urllib.parse import urlsplit
@@ -141,7 +141,7 @@ class Page:
         self.views: dict[Document, _View] = {}
         self._made: dict[Any, Any] = {}
         self._asked_s = 0.0
-        self._began = datetime.now().astimezone()
+        self._began_s = 0.0  # as the time of day here, which Bokeh takes for UTC
 
     def take(self, message: dict[str, Any]) -> None:
         """Take a message of the run."""
@@ -151,7 +151,8 @@ class Page:
         self.history.take(message)
         self._made.clear()
         if self.history.picture:
-            self._began = datetime.now().astimezone() - timedelta(seconds=float(self.history.picture["elapsed_s"]))
+            here_s = datetime.now().replace(tzinfo=UTC).timestamp()
+            self._began_s = here_s - float(self.history.picture["elapsed_s"])
             self.alarms.take(self.history)
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
@@ -161,18 +162,17 @@ class Page:
         return self._made[key]
 
     def milliseconds(self, s: Any) -> Any:
-        """Return seconds of the run as milliseconds of the time of day here, which Bokeh takes for UTC."""
-        return (self._began.timestamp() + (self._began.utcoffset() or timedelta()).total_seconds() + s) * 1000
+        """Return seconds of the run as milliseconds of the time of day here."""
+        return (self._began_s + s) * 1000
 
     def clock(self, s: float) -> str:
         """Return seconds of the run as the time of day here."""
-        return f"{self._began + timedelta(seconds=s):%d %b %H:%M:%S}"
+        return f"{datetime.fromtimestamp(self._began_s + s, UTC):%d %b %H:%M:%S}"
 
     def texts(self) -> dict[str, str]:
         """Return the parts of the page that are text, as HTML."""
-        if not self.history.picture:
-            return {"head": str(self.parts.waiting(self))}
-        return {name: str(getattr(self.parts, name)(self)) for name in TEXTS}
+        names = TEXTS if self.history.picture else TEXTS[:1]
+        return {name: str(getattr(self.parts, name)(self)) for name in names}
 
     def curves(self, level: float, least: float) -> dict[str, Any]:
         """Return the columns of the figures."""

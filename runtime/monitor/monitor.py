@@ -107,10 +107,8 @@ class Monitor:
         """Show `run` from here on, and what `look` returns of it (watch.state_file)."""
         from .snapshot import Snapshots
 
-        snapshots = Snapshots(run, bundle, self._latest, look)
-        if self.url:
-            snapshots.tell_words()
-        self._run, self._snapshots = run, snapshots
+        self._run = run
+        self._snapshots = Snapshots(run, bundle, self._latest, look, words=bool(self.url))
 
     def watch(self, run: LiveRun, output: Output) -> None:
         """Take the decisions of a block."""

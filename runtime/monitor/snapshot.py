@@ -42,10 +42,13 @@ BREATH_S = 0.0002  # between two readings, for the loop
 
 
 class Snapshots:
-    """Takes pictures of one run: what `look` returns (watch.state_file) and more; `latest` are the decisions made last."""
+    """Takes pictures of one run: what `look` returns (watch.state_file) and more; `latest` are the decisions made last.
+
+    With `words` click words are told, too; make it before arming, since what they need may have to be compiled.
+    """
 
     def __init__(
-        self, run: LiveRun, bundle: Bundle, latest: deque[Decision], look: Callable[[], dict[str, Any]]
+        self, run: LiveRun, bundle: Bundle, latest: deque[Decision], look: Callable[[], dict[str, Any]], *, words: bool
     ) -> None:
         self._run, self._bundle, self._latest, self._look = run, bundle, latest, look
         self._began_s = time.monotonic()
@@ -55,12 +58,8 @@ class Snapshots:
         automaton = run.plan.automaton
         self._light = None if automaton is None else bundle.light_of(automaton)  # of each state
         self._breathe: Callable[[float], None] = time.sleep
-        self._core: Core | None = None  # whose click words are told
-
-    def tell_words(self) -> None:
-        """Tell click words, too; called before arming, since what they need may have to be compiled."""
-        if isinstance(self._run.core, Core):
-            self._core = self._run.core
+        self._core = run.core if words and isinstance(run.core, Core) else None  # whose click words are told
+        if self._core is not None:
             self._posterior(self._core, self._core.windows.seen_now()[0] * 0)
 
     def take(self, breathe: Callable[[float], None] = time.sleep) -> dict[str, Any]:

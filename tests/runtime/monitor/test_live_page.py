@@ -178,6 +178,8 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
                 picture(driver, tmp_path / f"live-{width}-{dark}.png")
                 # what a figure draws is cut off at its frame
                 assert [one for one in clipped(driver) if "bk-GlyphRenderer" not in one] == []
+                beside = "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
+                assert driver.execute_script(beside) == 0
         for dark in (False, True):
             look(driver, 1400, dark=dark)
             assert serious(driver) == []

@@ -225,8 +225,7 @@ class Watched(Monitor):
 
     def prepared(self, run: Any, bundle: Any, look: Any) -> None:
         self.run = self._run = run
-        self.snapshots = Snapshots(run, bundle, self._latest, look)
-        self.snapshots.tell_words()
+        self.snapshots = Snapshots(run, bundle, self._latest, look, words=True)
 
     def watch(self, run: Any, output: Any) -> None:
         super().watch(run, output)
