@@ -5,6 +5,8 @@ All text that comes from files or devices is made inert here (safe_text).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from pans.runtime.intervals import wilson_interval
@@ -32,41 +34,78 @@ class Row(NamedTuple):
 
 def rows_of(history: History) -> list[Row]:
     """Return all figures of the present moment; none before the first picture."""
-    picture, begin = history.picture, history.begin
-    if not picture:
-        return []
-    done, expected = picture["decisions"], begin.get("expected", 0)
+    return [*_results(history), *_instrument(history.picture, history.begin)] if history.picture else []
+
+
+def _results(history: History) -> Iterator[Row]:
+    picture, begin, latency = history.picture, history.begin, history.latency
+    done, expected, abstained = picture["decisions"], begin.get("expected", 0), picture["abstained"]
+    late, lost, deadline = picture["late"], picture["lost_exposures"], float(begin.get("deadline_us", 0.0))
     sums, _, seconds = history.recent(RATE_OVER_S)
     rate = sums["decisions"] / max(seconds, 1e-3)
     state = f"{picture['state']} after {duration(picture['elapsed_s'])}"
     state += f": {one_line(picture['ended'], 200)}" if picture["ended"] else ""
     state += f"; the device was found again {picture['reconnects']} times" if picture["reconnects"] else ""
+    yield Row("state", state, STATES.get(picture["state"], "note"))
     made = f"{done:,}{f' of {expected:,}' if expected else ''}, {rate:,.1f} per second"
-    if expected > done and rate > 0 and not picture["ended"]:
-        made += f", {duration((expected - done) / rate)} left"
-    late, lost, wrong, drift = (
-        picture[name] for name in ("late", "lost_exposures", "contradictions", "clock_drift_ppm")
-    )
-    clock = "drift not known yet" if drift is None else f"drift {drift:+.2f} ppm"
+    goes_on = expected > done and rate > 0 and not picture["ended"]
+    yield Row("decisions", made + (f", {duration((expected - done) / rate)} left" if goes_on else ""))
+    if picture["known"]:
+        share, low, high = history.accuracy(picture, picture["objects"])
+        between = f"95 % interval {low:.1%} to {high:.1%} ({picture['objects']:,} objects)"
+        yield Row("accuracy", f"{share:.1%}, {between}")
+    if done:
+        yield Row("abstained", f"{abstained:,} ({abstained / done:.2%})", "note" if abstained else "")
+        known, walked = picture["photons_known"], picture.get("walk_light")
+        photons = f"{picture['photons'] / known:.2f} photons" if known else "photons unknown"
+        light = begin.get("illumination") if walked is None else walked / done
+        illumination = "" if light is None else f", illumination {light:.1f}"
+        yield Row("light per decision", f"{picture['clicks'] / done:.2f} clicks, {photons}{illumination}")
+    if (p99 := quantile_us(latency, 0.99)) is not None:
+        level = "bad" if p99 > deadline > 0 else "warn" if p99 > 0.8 * deadline > 0 else ""
+        part = f"; p99 takes {p99 / deadline:.0%} of {deadline:,.0f} us" if deadline else ""
+        text = f"p50 {quantile_us(latency, 0.5):,.0f} us, p99 {p99:,.0f} us"
+        yield Row("latency", f"{text}, longest {picture['latency_max_us']:,.0f} us{part}", level)
+    yield Row("late", f"{late:,} decisions", "bad" if late else "good")
     gaps = f" in {picture['gaps']:,} gaps" if lost else ""
-    rows = [
-        Row("state", state, STATES.get(picture["state"], "note")),
-        Row("decisions", made),
-        *(_results(history) if done else ()),
-        *_latency(history),
-        Row("late", f"{late:,} decisions", "bad" if late else "good"),
-        Row("lost", f"{lost:,} exposures{gaps}", "bad" if lost else "good"),
-        _dark(picture),
-        _exposures(picture, begin.get("exposure_tolerance_us", 0.0)),
-        Row("clock", f"{clock}, uncertainty at most {picture['clock_uncertainty_us']:,.0f} us"),
-        *([Row("contradictions", f"{wrong:,} messages", "bad")] if wrong else ()),
-        *([_disk(picture)] if "disk_free_bytes" in picture else ()),
-    ]
-    return (
-        [*rows, Row("latest trouble", one_line(trouble.replace("_", " ", 1), 300), "warn")]
-        if (trouble := picture["last_error"])
-        else rows
-    )
+    yield Row("lost", f"{lost:,} exposures{gaps}", "bad" if lost else "good")
+
+
+def _instrument(picture: dict[str, Any], begin: dict[str, Any]) -> Iterator[Row]:
+    clicks, exposures, expected = picture["dark_clicks"], picture["dark_exposures"], picture.get("dark_expected")
+    _, words, level = dark_state(picture)
+    if exposures:
+        low, high = wilson_interval(clicks, exposures)
+        text = f"in the whole run {clicks / exposures:.3g} per exposure, 95 % interval {low:.2g} to {high:.2g}"
+        if expected is not None:
+            top = picture["dark_high"]
+            text += f"; expected {expected:.2g}" + (f", at most {top:.2g}" if top > expected * 1.0001 else "")
+        yield Row("dark counts", f"{words}; {text}" if words else text, level)
+    else:
+        yield Row("dark counts", "no dark exposures yet", "note")
+    if "exposure_start_us" in picture:  # the farthest of all
+        start_us, length_us = picture["exposure_start_us"], picture["exposure_length_us"]
+        allowed_us = begin.get("exposure_tolerance_us", 0.0)
+        text = f"start {start_us:+.3g} us, length {length_us:+.3g} us at most, allowed {allowed_us:.3g} us"
+        yield Row("exposures", text, "bad" if max(abs(start_us), abs(length_us)) > allowed_us else "good")
+    else:
+        yield Row("exposures", "not told by the device", "note")
+    drift = "not known yet" if picture["clock_drift_ppm"] is None else f"{picture['clock_drift_ppm']:+.2f} ppm"
+    yield Row("clock", f"drift {drift}, uncertainty at most {picture['clock_uncertainty_us']:,.0f} us")
+    if picture["contradictions"]:
+        yield Row("contradictions", f"{picture['contradictions']:,} messages", "bad")
+    if "disk_free_bytes" in picture:
+        left_s = picture.get("disk_left_s", math.inf)
+        lasts = f", full in {duration(left_s)}" if left_s < math.inf else ""
+        text = f"{picture['disk_free_bytes'] / GIB:,.1f} GiB free{lasts}"
+        size = f"{picture.get('recording_bytes', 0) / MIB:,.1f} MiB"
+        yield Row("disk", f"{text}; the recording has {size}", _disk_level(left_s))
+    if trouble := picture["last_error"]:
+        yield Row("latest trouble", one_line(trouble.replace("_", " ", 1), 300), "warn")
+
+
+def _disk_level(left_s: float) -> str:
+    return "bad" if left_s < DISK_LOW_S else "warn" if left_s < DISK_SHORT_S else ""
 
 
 def title_of(history: History) -> str:
@@ -88,57 +127,6 @@ def headline(history: History) -> str:
         f" · p99 {p99 / 1000:.2f} ms · late {picture['late']} · lost {picture['lost_exposures']}"
         + (f" · dark counts: {dark}" if level not in ("", "good") else "")
     )
-
-
-def _results(history: History) -> list[Row]:
-    picture, light = history.picture, history.begin.get("illumination")
-    done, abstained, known = (picture[name] for name in ("decisions", "abstained", "photons_known"))
-    each = [f"{picture['clicks'] / done:.2f} clicks"]
-    each.append(f"{picture['photons'] / known:.2f} photons" if known else "photons unknown")
-    if picture.get("walk_light") is not None:
-        light = picture["walk_light"] / done
-    each += [] if light is None else [f"illumination {light:.1f}"]
-    rows = [
-        Row("abstained", f"{abstained:,} ({abstained / done:.2%})", "note" if abstained else ""),
-        Row("light per decision", ", ".join(each)),
-    ]
-    share, low, high = history.accuracy(picture, picture["objects"])
-    text = f"{share:.1%}, 95 % interval {low:.1%} to {high:.1%} ({picture['objects']:,} objects)"
-    return [Row("accuracy", text), *rows] if picture["known"] else rows
-
-
-def _latency(history: History) -> list[Row]:
-    deadline = float(history.begin.get("deadline_us", 0.0))
-    p50, p99 = (quantile_us(history.latency, q) for q in (0.5, 0.99))
-    if p50 is None or p99 is None:
-        return []
-    text = f"p50 {p50:,.0f} us, p99 {p99:,.0f} us, longest {history.picture['latency_max_us']:,.0f} us"
-    if not deadline:
-        return [Row("latency", text)]
-    level = "bad" if p99 > deadline else "warn" if p99 > 0.8 * deadline else ""
-    return [Row("latency", f"{text}; p99 takes {p99 / deadline:.0%} of {deadline:,.0f} us", level)]
-
-
-def _exposures(picture: dict[str, Any], allowed_us: float) -> Row:
-    """When exposures happened: the farthest start and length."""
-    if "exposure_start_us" not in picture:
-        return Row("exposures", "not told by the device", "note")
-    start_us, length_us = picture["exposure_start_us"], picture["exposure_length_us"]
-    text = f"start {start_us:+.3g} us, length {length_us:+.3g} us at most, allowed {allowed_us:.3g} us"
-    return Row("exposures", text, "bad" if max(abs(start_us), abs(length_us)) > allowed_us else "good")
-
-
-def _dark(picture: dict[str, Any]) -> Row:
-    clicks, exposures, expected = picture["dark_clicks"], picture["dark_exposures"], picture.get("dark_expected")
-    if not exposures:
-        return Row("dark counts", "no dark exposures yet", "note")
-    low, high = wilson_interval(clicks, exposures)
-    text = f"in the whole run {clicks / exposures:.3g} per exposure, 95 % interval {low:.2g} to {high:.2g}"
-    if expected is not None:
-        top = picture["dark_high"]
-        text += f"; expected {expected:.2g}" + (f", at most {top:.2g}" if top > expected * 1.0001 else "")
-    _, words, level = dark_state(picture)
-    return Row("dark counts", f"{words}; {text}" if words else text, level)
 
 
 def dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
@@ -164,14 +152,6 @@ def dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
     then = "no alarm at this rate" if after is None else f"alarm after about {after:,} more dark exposures at this rate"
     off = f"{'higher' if low > picture['dark_high'] else 'lower'} than expected, not yet sure"
     return off, f"{off} ({then})", "note"
-
-
-def _disk(picture: dict[str, Any]) -> Row:
-    left_s = picture.get("disk_left_s", float("inf"))
-    lasts = f", full in {duration(left_s)}" if left_s < 1e10 else ""
-    text = f"{picture['disk_free_bytes'] / GIB:,.1f} GiB free{lasts}"
-    text += f"; the recording has {picture.get('recording_bytes', 0) / MIB:,.1f} MiB"
-    return Row("disk", text, "bad" if left_s < DISK_LOW_S else "warn" if left_s < DISK_SHORT_S else "")
 
 
 def latest_rows(history: History) -> list[dict[str, Any]]:
@@ -201,9 +181,9 @@ def health(history: History) -> list[tuple[str, str, str]]:
     picture, deadline = history.picture, float(history.begin.get("deadline_us", 0.0))
     sums, latency, _ = history.recent(RECENT_S)
     p99, late, lost = quantile_us(latency, 0.99), int(sums["late"]), int(sums["lost_exposures"])
-    disk = _disk(picture) if "disk_left_s" in picture else Row("disk", "")
-    if disk.level:
-        machine = disk.level, f"The disk of the recording is full in {duration(picture['disk_left_s'])}."
+    full_s = picture.get("disk_left_s", math.inf)
+    if level := _disk_level(full_s):
+        machine = level, f"The disk of the recording is full in {duration(full_s)}."
     elif late:
         machine = "bad", f"{late:,} decisions were late in the last minute."
     elif p99 is None:
