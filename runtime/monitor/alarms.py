@@ -13,7 +13,11 @@ from .history import History
 KEPT = 200
 QUIET_S = 10.0  # without another late decision, lost exposure or contradiction: the alarm is over
 LASTING = ("state", "dark counts", "exposures", "disk")  # figures that are bad as long as they are
-GROWING = {"late": "late", "lost": "lost_exposures", "contradictions": "contradictions"}
+GROWING = {  # sums: their keys, what they count, and the kind of trouble that says why
+    "late": ("late", "decisions", "blame"),
+    "lost": ("lost_exposures", "exposures", "blame"),
+    "contradictions": ("contradictions", "messages", "contradiction"),
+}
 # kinds of events without an end that is known: name, level
 INSTANT = {
     "note": ("note", "note"),
@@ -47,8 +51,9 @@ class Alarms:
     def __init__(self) -> None:
         self.all: deque[Alarm] = deque(maxlen=KEPT)
         self._open: dict[str, Alarm] = {}
-        self._counted = dict.fromkeys(GROWING, 0)
-        self._grew_s = dict.fromkeys(GROWING, -QUIET_S)
+        self._counted, self._before = dict.fromkeys(GROWING, 0), dict.fromkeys(GROWING, 0)
+        self._trouble = ""
+        self._grew_s, self._why = dict.fromkeys(GROWING, -QUIET_S), dict.fromkeys(GROWING, "")
 
     def take(self, history: History) -> None:
         """Compare the latest picture with what was wrong before."""
@@ -74,11 +79,17 @@ class Alarms:
             since = min(since for *_, since in picture["dark_states"])
             _, words, level = dark_state(picture)
             present["dark counts"] = level, words, history.when("dark_exposures", since)
-        trouble = f"; {one_line(picture['last_error'], 300)}" if picture["last_error"] else ""
-        for name, key in GROWING.items():
-            if picture[key] > self._counted[name]:
+        news = "" if picture["last_error"] == self._trouble else picture["last_error"]
+        self._trouble = picture["last_error"]
+        trouble, _, why = news.partition(": ")
+        for name, (key, what, kind) in GROWING.items():
+            before, self._counted[name] = self._counted[name], picture[key]
+            if picture[key] > before:
+                if name not in self._open:
+                    self._before[name], self._why[name] = before, ""
                 self._grew_s[name] = now_s
-            self._counted[name] = picture[key]
+            if trouble == kind:
+                self._why[name] = f"; {one_line(why, 300)}"
             if now_s - self._grew_s[name] < QUIET_S:
-                present[name] = "bad", f"{rows[name].text} in the whole run{trouble}", now_s
+                present[name] = "bad", f"{picture[key] - self._before[name]:,} {what}{self._why[name]}", now_s
         return present

@@ -77,15 +77,17 @@ def test_an_alarm_has_a_beginning_an_end_and_a_cause() -> None:
     history, alarms = History(), Alarms()
     history.take({"kind": "begin", "deadline_us": 100.0})
     for k in range(1, 41):
-        facts = {"state": "device lost" if 5 <= k < 8 else "running", "late": min(max(k - 9, 0), 4)}
+        facts = {"state": "device lost" if 5 <= k < 8 else "running", "late": min(max(k - 9, 0), 4) + 2 * (k > 35)}
         facts |= {"dark_exposures": 10 * k, "dark_clicks": k, "decisions": 100 * k}
         facts |= {"dark_states": [["warning", 5.0, "dim", 290], ["alarm", 9.0, "hot", 255]]} if k >= 30 else {}
         facts |= {"events": [["note", "lamp \x1b[2J moved", None]]} if k == 20 else {}
         facts |= {"events": [["light_changed", "fell", 1850]]} if k == 22 else {}
-        history.take(picture(float(k), **facts, **({"last_error": "the host slept"} if k > 9 else {})))
+        history.take(picture(float(k), **facts, last_error="blame: host: it slept" if k > 9 else ""))
         alarms.take(history)
-    history.take(picture(41.0, ended="completed", late=4, last_error="", dark_exposures=400, decisions=4000))
+    history.take(picture(41.0, ended="completed", late=6, last_error="", dark_exposures=400, decisions=4000))
     alarms.take(history)
+    again = alarms.all.pop()
+    assert (again.begin_s, again.end_s, again.cause) == (36, 36, "2 decisions")
     found = {one.name: one for one in alarms.all}
     assert len(found) == len(alarms.all)
     spans = {name: (one.begin_s, one.noticed_s, one.end_s, one.level) for name, one in found.items()}
@@ -97,7 +99,7 @@ def test_an_alarm_has_a_beginning_an_end_and_a_cause() -> None:
         "dark counts": (25.5, 30, 41, "warn"),
     }
     assert found["dark counts"].cause == "dim; hot"
-    assert found["late"].cause == "4 decisions in the whole run; the host slept"
+    assert found["late"].cause == "4 decisions; host: it slept"
     assert found["note"].cause == "lamp \\x1b[2J moved"
 
 
