@@ -145,9 +145,10 @@ class Page:
 
     def take(self, message: dict[str, Any]) -> None:
         """Take a message of the run."""
-        for one in message.get("pixels", {}).values():
+        pixels = message.get("pixels", {})
+        for number, one in pixels.items():
             grey = np.frombuffer(base64.b64decode(one["grey"]), np.uint8).reshape(one["shape"])
-            one["src"] = f"data:image/png;base64,{base64.b64encode(grey_png(grey)).decode()}"
+            pixels[number] = f"data:image/png;base64,{base64.b64encode(grey_png(grey)).decode()}"
         self.history.take(message)
         self._made.clear()
         if self.history.picture:
