@@ -29,7 +29,6 @@ class Bin:
     end_s: float
     sums: list[float] = field(default_factory=lambda: [0] * len(SUMS))
     latency: Counter[int] = field(default_factory=Counter)
-    drift_ppm: float | None = None
 
 
 class History:
@@ -62,7 +61,6 @@ class History:
             here.end_s = now_s
             here.sums = [a + b for a, b in zip(here.sums, sums)]
             here.latency.update(grown)
-            here.drift_ppm = message.get("clock_drift_ppm", here.drift_ppm)
         self.latency.update(grown)
         self.picture = message
 

@@ -95,13 +95,11 @@ def columns(history: History, level: float, least: float) -> dict[str, F64]:
         **{"deadline": begun.get("deadline_us") or None, "stated": begun.get("clicks_stated")},
         **{"expected_low": picture.get("dark_low"), "expected_high": picture.get("dark_high")},
     }
-    seconds, own_s = at[:, 1] - at[begin, 0], at[:, 1] - at[:, 0]
+    own_s = at[:, 1] - at[:, 0]
     return {
         **{name: np.where(made > 0, curve, np.nan) for name, curve in curves.items()},
         **{name: np.full(n, np.nan if value is None else value, np.float64) for name, value in limits.items()},
-        **{"s": at.mean(axis=1), "over": seconds, "rate": sums["decisions"] / seconds},
-        **{"late": late / own_s, "lost": lost / own_s},
-        "drift": np.array([np.nan if one.drift_ppm is None else one.drift_ppm for one in bins]),
+        **{"s": at.mean(axis=1), "over": at[:, 1] - at[begin, 0], "late": late / own_s, "lost": lost / own_s},
     }
 
 

@@ -154,7 +154,7 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         served.tell(*messages(hot=range(12, 20)))
         look(driver, 1400)
         driver.get(served.url)
-        wait_for(driver, DEEP + "return deep(document, '.bk-canvas-events, .bk-events').length >= 7")
+        wait_for(driver, DEEP + "return deep(document, '.bk-canvas-events, .bk-events').length >= 5")
         assert driver.title == "running: SIMULATED · " + NASTY.replace("\x1b", "\\x1b") + " on a device"
         words = driver.execute_script(
             DEEP + "return deep(document, '.bk-clearfix').map(one => one.innerText).join(' ')"
