@@ -137,7 +137,7 @@ def dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
     """
     if states := picture.get("dark_states"):
         level, ratio, *_ = states[0]
-        return f"{ratio:.3g} times as expected", "; ".join(one_line(one[2], 300) for one in states), LEVELS[level]
+        return f"{ratio:.3g} times the expected rate", "; ".join(one_line(one[2], 300) for one in states), LEVELS[level]
     expected = picture.get("dark_expected")
     if expected is None or not picture["dark_exposures"]:
         return "", "", ""
