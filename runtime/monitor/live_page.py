@@ -228,8 +228,8 @@ class _View:
         return choice
 
     def _figure(self, name: str, **plot: Any) -> Any:
-        lines, limits, ends = plot["lines"], plot.get("limits", {}), plot.get("ends", ())
-        y_range = Range1d(*ends) if len(ends) == 2 else DataRange1d(**({"start": ends[0]} if ends else {}))
+        lines, limits, fixed = plot["lines"], plot.get("limits", {}), plot.get("ends", ())
+        y_range = Range1d(*fixed) if len(fixed) == 2 else DataRange1d(**dict(zip(("start",), fixed)))
         axes = {"x_range": self._range, "y_range": y_range, "y_axis_type": plot.get("scale", "linear")}
         one = figure(name=name, y_axis_label=plot["unit"], **axes, **LAYOUT["figure"])
         one.toolbar.logo, one.xgrid.visible = None, False
@@ -238,12 +238,8 @@ class _View:
         source: dict[str, Any] = {"x": "x", "source": self._curves}
         tips = [("at", "@x{%F %T}"), *((legend, f"@{key}{{0.[0000]}}") for key, legend in (lines | limits).items())]
         for key, legend in plot.get("bands", {}).items():
-            between = {
-                "y1": f"{key}_low",
-                "y2": f"{key}_high",
-                "fill_color": COLOURS["first" if key in lines else "note"],
-            }
-            one.varea(**source, **between, fill_alpha=0.25, legend_label=legend)
+            ends, colour = {"y1": f"{key}_low", "y2": f"{key}_high"}, COLOURS["first" if key in lines else "note"]
+            one.varea(**source, **ends, fill_color=colour, fill_alpha=0.25, legend_label=legend)
             tips.append((legend, f"@{key}_low{{0.[00000]}} to @{key}_high{{0.[00000]}}"))
         styles = [("first", "solid"), ("second", "dashed")][: len(lines)] + [("limit", "dotted")] * len(limits)
         drawn = []
