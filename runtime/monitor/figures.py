@@ -143,11 +143,11 @@ def dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
         return "", "", ""
     low, high = wilson_interval(picture["dark_clicks"], picture["dark_exposures"])
     if low <= picture["dark_high"] and high >= picture.get("dark_low", expected):
-        rise = f"no rise of the mean above {high / expected:.3g} times"
+        rise = f"a mean above {high / expected:.3g} times the expected rate is excluded"
         if high <= RISE_SEEN * expected:
             return "as expected", f"as expected, {rise}", "good"
-        more = f"{rise} is all that can be said (--dark-slots gives more dark exposures)"
-        return "too few to judge", f"too few to judge, {more}", ""
+        few = "too few to judge"
+        return few, f"{few}: only {rise} (--dark-slots gives more dark exposures)", ""
     after = picture.get("dark_alarm_after")
     then = "no alarm at this rate" if after is None else f"alarm after about {after:,} more dark exposures at this rate"
     off = f"{'higher' if low > picture['dark_high'] else 'lower'} than expected, not yet sure"
