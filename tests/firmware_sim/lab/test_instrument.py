@@ -37,7 +37,7 @@ BINARY = {
     "levels = 124": "levels = 2",
     "dwell_steps = 1": "dwell_steps = 4",
     "min_us = 3500.0": "min_us = 100.0",
-    "peak_photoelectrons_hz = 3000.0": "peak_photoelectrons_hz = 2000.0",
+    "peak_photoelectrons_hz = 3000.0": "peak_photoelectrons_hz = 200.0",  # half of the exposures click
 }
 PATIENT = {  # the machine may be busy
     "decision_deadline_us = 20_000.0": "decision_deadline_us = 1e6",
@@ -94,19 +94,19 @@ def test_the_shipped_bundle_passes_and_is_as_right_as_expected(
     of_word = np.where(bits, chance[:, None], 1 - chance[:, None]).prod(axis=2)
     right = (of_word * (bundle.table.argmax(axis=1) == labels[:, None])).sum(axis=1)
     error = np.sqrt((right * (1 - right)).sum()) / objects
-    assert abs(found["accuracy"] - right.mean()) < 3 * error
-    assert abs(found["clicks_mean"] - chance.sum(axis=1).mean()) < 3 * np.sqrt((chance * (1 - chance)).sum()) / objects
+    assert abs(found["accuracy"] - right.mean()) < 4 * error
+    assert abs(found["clicks_mean"] - chance.sum(axis=1).mean()) < 4 * np.sqrt((chance * (1 - chance)).sum()) / objects
 
 
 @pytest.mark.parametrize("drive", ["device", "host"])
 def test_an_automaton_walks_by_the_clicks_of_the_table(
     drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bundle, exposure_us = small_automaton_bundle(exposure_us=500.0), 2500.0
+    bundle, exposure_us = small_automaton_bundle(exposure_us=50.0), 2500.0
     objects = 80 if drive == "device" else 30
     write_bundle(bundle, tmp_path / "small.pans")
     profile = profile_with(tmp_path / "binary.toml", BINARY | PATIENT)
-    with serving("--profile", str(profile), pixels=2, peak_hz=2000.0) as (_, url):
+    with serving("--profile", str(profile), pixels=2, peak_hz=200.0) as (_, url):
         words = ("--device", url, "--profile", profile, "--decisions", objects, "--drive", drive)
         for attempt in range(3):  # on a busy computer the host names a state too late, and the run says so
             out = ("--out", tmp_path / f"run{attempt}", "--no-realtime")
@@ -117,7 +117,7 @@ def test_an_automaton_walks_by_the_clicks_of_the_table(
     walk, images = bundle.automaton, np.random.default_rng(2).random((200, 2, 2))[:objects]
     dwell = np.asarray(walk.dwell) / walk.dwell_steps
     levels = bundle.pattern_levels[walk.pattern] * 1.0
-    chance = table_light(levels * dwell[:, None], images, exposure_us, 2000.0)
+    chance = table_light(levels * dwell[:, None], images, exposure_us, 200.0)
     clicks, spread = 0.0, 0.0
     for of_object in chance:
         reached, mean, square = {(0, 0): 1.0}, 0.0, 0.0
@@ -134,7 +134,7 @@ def test_an_automaton_walks_by_the_clicks_of_the_table(
         for (_, seen), weight in reached.items():
             mean, square = mean + weight * seen, square + weight * seen**2
         clicks, spread = clicks + mean, spread + square - mean**2
-    assert abs(found["clicks_mean"] - clicks / objects) < 3 * np.sqrt(spread) / objects
+    assert abs(found["clicks_mean"] - clicks / objects) < 4 * np.sqrt(spread) / objects
 
 
 def run_on(link: socket.socket) -> None:
