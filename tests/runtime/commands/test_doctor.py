@@ -114,7 +114,7 @@ def test_a_run_writes_its_trace(tmp_path: Path, pans: Pans) -> None:
 
 
 MAC = """
-import os, resource, select, sys
+import ctypes.util, os, resource, select, sys
 import numba, onnxruntime, serial.tools.list_ports, usb.core  # which look at the system themselves
 import pans.runtime.kernel.receive
 sys.platform = "darwin"
