@@ -15,6 +15,15 @@ Z_95 = 1.959963984540054  # 0.975 quantile of the normal distribution: what a tw
 CHI2_95 = 3.841458820694124  # 0.95 quantile of chi-square with one degree of freedom
 
 
+def number(value: float) -> str:
+    """Return a number in three digits, thousands with commas.
+
+    >>> number(0.000012), number(1234.5), number(0.25)
+    ('1.2e-05', '1,234', '0.25')
+    """
+    return f"{value:,.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
 def beta_cdf(x: float, a: float, b: float) -> float:
     """Return I_x(a, b), the probability that a Beta(a, b) variable is at most x; relative error about 1e-12 where a + b is
     below 1e9.

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.intervals import binomial_tail, wilson_interval
+from pans.runtime.intervals import binomial_tail, number, wilson_interval
 
 from .cusum import ALL_CHANNELS, FLOOR_RATE, Alarm, ChannelWatch
 
@@ -57,6 +57,13 @@ MEAN_Z2_MAX, Z2_MAX = 1.6, 12.0
 RETURN_BLOCKS = 3  # with a click: the channel lives
 _NEVER = 1 << 62
 LEVELS = ("notice", "warning", "alarm")
+_CAUSES = {
+    "hot": "a hot or noisy channel",
+    "burst": "light from outside, or a detector that oscillates",
+    "drift": "a warmer detector, a shifted threshold, or stray light",
+    "quiet": "a threshold that has risen, a colder detector, or one that loses clicks",
+    "dead": "a dead or disconnected channel",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,9 +119,9 @@ class ChannelHealth:
         return [state.finding for state in list(self._states.values())]
 
     def rates(self) -> F64:
-        """Present click probability of a dark exposure, float64 (n,): expected, or estimated since a state began."""
+        """Present click probability of a dark exposure, float64 (n,): expected, or estimated since a state began; any thread may ask."""
         rates = self._watch.expected.copy()
-        for state in sorted(self._states.values(), key=lambda one: -len(one.finding.channels)):
+        for state in sorted(list(self._states.values()), key=lambda one: -len(one.finding.channels)):
             channels = list(state.finding.channels)
             rates[channels] = state.clicks / max(1, state.exposures * len(channels))
         return rates
@@ -198,7 +205,13 @@ class ChannelHealth:
         else:
             kind = "hot"
         level = "alarm" if ratio >= BURST_RATIO else "warning" if ratio >= WARNING_RATIO else "notice"
-        words = _words(kind, channels, ratio, rate, expected, alarm.exposure - alarm.since, watch.n_channels)
+        length = alarm.exposure - alarm.since
+        ends = wilson_interval(int(alarm.clicks[list(channels)].sum()), alarm.exposures * len(channels))
+        between = " to ".join(number(end / expected) for end in ends)
+        words = (
+            f"{_who(channels, watch.n_channels)} {number(ratio)} times as often as expected in the dark (95 % interval {between}; "
+            f"{rate:.3g} per exposure, expected {expected:.3g}) in the {length} dark exposures before it was noticed: {_CAUSES[kind]}"
+        )
         return Finding(kind, level, channels, alarm.exposure, alarm.since, rate, expected, words)
 
     def _concerned(self, alarm: Alarm) -> tuple[tuple[int, ...], float, float]:
@@ -236,22 +249,6 @@ def _who(channels: tuple[int, ...], n_channels: int) -> str:
     if len(channels) == n_channels:
         return "all channels click"
     return f"channel {', '.join(map(str, channels))} clicks"
-
-
-def _words(
-    kind: str, channels: tuple[int, ...], ratio: float, rate: float, expected: float, length: int, n_channels: int
-) -> str:
-    causes = {
-        "hot": "a hot or noisy channel",
-        "burst": "light from outside, or a detector that oscillates",
-        "drift": "a warmer detector, a shifted threshold, or stray light",
-        "quiet": "a threshold that has risen, a colder detector, or one that loses clicks",
-        "dead": "a dead or disconnected channel",
-    }
-    return (
-        f"{_who(channels, n_channels)} {ratio:.3g} times as often as expected in the dark ({rate:.3g} per exposure, "
-        f"expected {expected:.3g}) for about {length} dark exposures: {causes[kind]}"
-    )
 
 
 @dataclass(frozen=True, slots=True)

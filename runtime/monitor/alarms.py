@@ -63,7 +63,8 @@ class Alarms:
             self.all.append(Alarm(*INSTANT[kind], begin_s, now_s, one_line(words, 300), now_s))
         present = {} if picture["ended"] else self._present(history, now_s)
         for name in self._open.keys() - present:
-            self._open.pop(name).end_s = min(now_s, self._grew_s.get(name, now_s))
+            if name in GROWING or not picture["ended"]:  # what lasted when the run ended has no end
+                self._open.pop(name).end_s = min(now_s, self._grew_s.get(name, now_s))
         for name, (level, cause, begin_s) in present.items():
             if name not in self._open:
                 self._open[name] = Alarm(name, level, begin_s, None, cause, now_s)

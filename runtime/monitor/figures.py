@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from pans.runtime.intervals import wilson_interval
+from pans.runtime.intervals import number, wilson_interval
 from pans.runtime.safe_text import one_line
 
 from .history import History, quantile_us
@@ -119,12 +119,13 @@ def headline(history: History) -> str:
     picture, expected = history.picture, history.begin.get("expected", 0)
     decisions = picture["decisions"]
     accuracy = f" · accuracy {picture['right'] / picture['known']:.1%}" if picture["known"] else ""
-    p99 = quantile_us(history.latency, 0.99) or 0.0
+    p99 = quantile_us(history.latency, 0.99) or 0.0  # 0 in virtual time
     dark, _, level = dark_state(picture)
     return (
         f"{decisions}{f' of {expected}' if expected else ''} decisions{accuracy}"
         f" · {picture['clicks'] / max(decisions, 1):.2f} clicks each"
-        f" · p99 {p99 / 1000:.2f} ms · late {picture['late']} · lost {picture['lost_exposures']}"
+        + (f" · p99 {p99 / 1000:.2f} ms" if p99 else "")
+        + f" · late {picture['late']} · lost {picture['lost_exposures']}"
         + (f" · dark counts: {dark}" if level not in ("", "good") else "")
     )
 
@@ -137,7 +138,11 @@ def dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
     """
     if states := picture.get("dark_states"):
         level, ratio, *_ = states[0]
-        return f"{ratio:.3g} times the expected rate", "; ".join(one_line(one[2], 300) for one in states), LEVELS[level]
+        return (
+            f"{number(ratio)} times the expected rate",
+            "; ".join(one_line(one[2], 300) for one in states),
+            LEVELS[level],
+        )
     expected = picture.get("dark_expected")
     if expected is None or not picture["dark_exposures"]:
         return "", "", ""
@@ -191,7 +196,7 @@ def health(history: History) -> list[tuple[str, str, str]]:
     else:
         most = f"{p99 / deadline:.0%} of the time allowed" if deadline else f"{p99:,.0f} us"
         machine = "good", f"99 % of the last minute's decisions took at most {most}."
-    unsure = f"The device's clock is known to {picture['clock_uncertainty_us']:,.0f} us, and nothing was lost of late."
+    unsure = f"The device's clock is known to {picture['clock_uncertainty_us']:,.0f} us; nothing was lost in the last minute."
     link = ("bad", f"{lost:,} exposures were lost in the last minute.") if lost else ("good", unsure)
     if picture["state"] != "running" and not picture["ended"]:
         link = "bad", f"The run is: {picture['state']}, after {picture['elapsed_s']:,.0f} s."
@@ -199,6 +204,8 @@ def health(history: History) -> list[tuple[str, str, str]]:
     dark, exposures = some["dark_clicks"], some["dark_exposures"]
     words, _, level = dark_state(picture)
     rate = f"{dark / exposures:.2g} dark counts per exposure" if exposures else "No dark exposures yet"
+    if dark and picture.get("dark_states"):  # of the counts that stand here, like the rate
+        words = f"{number(dark / exposures / picture['dark_expected'])} times the expected rate"
     detector = level or "note", f"{rate}{f', {words}' if words else ''}."
     return [("machine", *machine), ("link", *link), ("detector", *detector)]
 

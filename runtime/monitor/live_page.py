@@ -140,6 +140,7 @@ class Page:
         self._made: dict[Any, Any] = {}
         self._asked_s = 0.0
         self._began_s = 0.0  # as the time of day here, which Bokeh takes for UTC
+        self.zone = f"{datetime.now().astimezone():%Z}"
 
     def take(self, message: dict[str, Any]) -> None:
         """Take a message of the run."""
@@ -212,7 +213,7 @@ class _View:
         self._wide = self._style | {"sizing_mode": "stretch_width"}
         self._divs = {name: Div(name=name, disable_math=True, **self._wide) for name in TEXTS}
         self._span = self._choice("span", "Time shown", SPANS, "10 minutes")
-        self._least = self._choice("least", "A point takes at least (decisions)", LAYOUT["least"], "100")
+        self._least = self._choice("least", "Decisions of a point, at least", LAYOUT["least"], "100")
         self._range = Range1d(0, 1)
         now = Button(name="now", label="Follow the run", **self._wide)
         now.on_click(lambda: self._redraw(follows=True))
@@ -292,6 +293,9 @@ class _View:
             if self._divs[name].text != text:
                 self._divs[name].text = text
         if page.history.picture:
+            self._document.config.notify_connection_status = not page.history.picture[
+                "ended"
+            ]  # else it is lost in order
             self._document.title = f"{page.history.picture['state']}: {figures.title_of(page.history)}"
             self._draw()
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.cli.finding import needed
+from pans.runtime.intervals import number
 from pans.runtime.safe_text import html, one_line
 
 WIDTH, HEIGHT = 440, 240  # pixels
@@ -41,15 +42,6 @@ def need_extra() -> None:
 
 
 # ---- numbers on axes ----
-
-
-def number(value: float) -> str:
-    """Return a number in three digits, thousands with commas.
-
-    >>> number(0.000012), number(1234.5), number(0.25)
-    ('1.2e-05', '1,234', '0.25')
-    """
-    return f"{value:,.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def percent(value: float) -> str:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from pans.runtime import safe_text
 from pans.runtime.cli.finding import needed
 from pans.runtime.images import grey_png
+from pans.runtime.intervals import number
 
-from .charts import Axis, Bars, Curve, Mark, chart, number, percent, seconds, span, whole
+from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, span, whole
 
 SIDE_MAX = 96  # pixels of a small picture
 
@@ -95,6 +96,4 @@ def sentence_of(event: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return number(value) if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)

@@ -275,7 +275,7 @@ def run_page(recording: Recording) -> bytes:
         summary=summary,
         bundle=bundle,
         header={key: value for key, value in recording.header.items() if key not in ("profile", "command")},
-        reasons=[(fault, advice_on(str(fault))) for fault in summary.get("faults", ())],
+        reasons=[(fault, advice_on(str(fault), simulated=recording.simulated)) for fault in summary.get("faults", ())],
         tiles=rows_of(summary, "figures", *["timed"] * timed) if "verdict" in summary else [],
         decisions=decisions,
         accuracy=decisions.accuracy() if len(classes) > 1 else None,
@@ -296,9 +296,10 @@ def run_page(recording: Recording) -> bytes:
     )
 
 
-def advice_on(fault: str) -> str:
-    """Return what to do about a fault, "" where nothing is known."""
-    return next((one["text"] for one in words()["advice"] if one["words"] in fault), "")
+def advice_on(fault: str, *, simulated: bool = False) -> str:
+    """Return what to do about a fault, of a `simulated` instrument or of another; "" where nothing is known."""
+    found = next((one for one in words()["advice"] if one["words"] in fault), {"text": ""})
+    return str(found.get("simulated", found["text"]) if simulated else found["text"])
 
 
 def mistakes(counts: NDArray[np.int64], bundle: Bundle | None) -> list[str]:

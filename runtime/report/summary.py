@@ -140,7 +140,13 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
     if result.reconnects:
         faults.append(f"the device was lost and found again {result.reconnects} times")
     if timing.late:
-        faults.append(f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms ({late_words(result)})")
+        half_us = timing.total.summary()["p50"]
+        short = (
+            f"; half of all decisions took more than {half_us:,.0f} us" if half_us * 1000 > timing.deadline_ns else ""
+        )
+        faults.append(
+            f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms ({late_words(result)}){short}"
+        )
     if stream["lost_exposures"]:
         faults.append(
             f"{stream['lost_exposures']} exposures lost in {stream['gaps']} gaps, "

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 EVERY_S = 5.0
 FILE_EVERY_S = 0.5  # whether the recording still has a name
-SLOPE_S, SLOPE_LEAST_S = 600.0, 30.0  # over which the present rate is taken
+SLOPE_S, SLOPE_LEAST_S = 600.0, 300.0  # over which the present rate is taken; an installation fills a disk for a minute
 SHORT_S, SHORT_RESERVES = 3600.0, 5  # a warning below that, or with less than so many reserves
 STEP_NS = 50_000_000  # a slewed clock moves 2.5 ms in EVERY_S: 500 ppm, the most that NTP uses (adjtimex(2))
 _UNSYNCHRONISED, _TIME_ERROR = 0x40, 5  # STA_UNSYNC and TIME_ERROR of adjtimex(2)

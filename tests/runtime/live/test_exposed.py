@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import random
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import fault_grid
+import numpy as np
 import pytest
 from commands import fixed_run, json_of, page_of, words_of
 
@@ -16,10 +18,12 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime.core.follower import exposure_timing
 from pans.runtime.live import RunOptions, RunResult, run_live
+from pans.runtime.pages.run import advice_on
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.replaying import replay
 from pans.runtime.report.summary import exposure_fault, find_faults
 from pans.runtime.report.words import exposure_words
+from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.messages import Exposed, encode_exposed
 from pans.runtime.wire.schema import EXPOSED_SCHEMA
 
@@ -111,6 +115,18 @@ def test_what_lies_beyond_the_plan_is_not_believed(tmp_path: Path) -> None:
     (contradict, none) = find_faults(result, 0)
     assert "exposed" in contradict
     assert "told of none" in none  # although it has announced it
+
+
+@pytest.mark.parametrize(("late", "said"), [(3, ""), (6, "; half of all decisions took more than 2,")])
+def test_a_deadline_below_the_usual_latency_is_said_to_be_one(tmp_path: Path, late: int, said: str) -> None:
+    result, *_ = ran(tmp_path)
+    timing = TimingLedger(1_000_000)
+    marks_ns = np.array([[0, 100, 200, took_ns, took_ns] for took_ns in (500_000, 2_000_000)])
+    timing.judge(marks_ns, np.zeros(2, np.int64), np.array([10 - late, late]))
+    fault = find_faults(replace(result, timing=timing), 0)[0]
+    assert fault.startswith(f"{late} decisions later than 1 ms (cause: ")
+    assert fault.partition(")")[2].startswith(said) if said else fault.endswith(")")
+    assert ("--deadline-us" in advice_on(fault)) is bool(said)
 
 
 def test_both_errors_are_judged_in_both_directions_and_up_to_the_tolerance() -> None:

@@ -97,7 +97,7 @@ def test_an_alarm_has_a_beginning_an_end_and_a_cause() -> None:
         "late": (10, 10, 13, "bad"),
         "note": (20, 20, 20, "note"),
         "light": (18.5, 22, 22, "warn"),
-        "dark counts": (25.5, 30, 41, "warn"),
+        "dark counts": (25.5, 30, None, "warn"),
     }
     assert found["dark counts"].cause == "dim; hot"
     assert found["late"].cause == "4 decisions; host: it slept"
@@ -111,6 +111,16 @@ def test_an_alarm_has_a_beginning_an_end_and_a_cause() -> None:
         ({"late": 3}, ["bad", "good", "note"], "3 decisions were late in the last minute"),
         ({"lost_exposures": 7, "gaps": 1}, ["good", "bad", "note"], "7 exposures were lost in the last minute"),
         ({"state": "device lost"}, ["good", "bad", "note"], "device lost"),
+        (
+            {
+                "dark_clicks": 8,
+                "dark_exposures": 400,
+                "dark_expected": 0.001,
+                "dark_states": [["alarm", 50.0, "hot", 9]],
+            },
+            ["good", "good", "bad"],
+            "0.02 dark counts per exposure, 20 times the expected rate",
+        ),
     ],
 )
 def test_health_is_a_sentence_with_a_number(facts: dict[str, Any], levels: list[str], words: str) -> None:
@@ -339,7 +349,7 @@ def test_without_a_terminal_there_are_plain_lines(
         while len(pictures) > 9_990 and time.monotonic() < give_up_s:
             time.sleep(0.01)
     lines = capfd.readouterr().err.splitlines()
-    figures = "1 of 500 decisions · 0.00 clicks each · p99 0.00 ms · late 0 · lost 0"
+    figures = "1 of 500 decisions · 0.00 clicks each · late 0 · lost 0"
     assert lines[0] == f"SIMULATED · a bundle on an instrument: {figures}"
     assert len(lines) > 5
 

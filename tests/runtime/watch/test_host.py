@@ -22,10 +22,10 @@ MIB = 1 << 20
 
 def test_time_left_at_the_present_rate() -> None:
     trend = DiskTrend()
-    for second in range(0, 30, 5):
+    for second in range(0, 300, 5):
         assert trend.left_s(second, 10**9 - 10**6 * second) is None  # too short to tell
-    assert trend.left_s(30.0, 10**9 - 30 * 10**6) == pytest.approx(970)
-    for second in range(35, 80, 5):  # something was deleted, and nobody writes
+    assert trend.left_s(300.0, 10**9 - 300 * 10**6) == pytest.approx(700)
+    for second in range(305, 350, 5):  # something was deleted, and nobody writes
         assert trend.left_s(second, 2 * 10**9) is None
 
 
