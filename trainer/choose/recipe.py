@@ -125,7 +125,7 @@ def choose_training(task: Task, variation: Variation, encoder: str, light: Light
         exposures, states = EXPOSURES, FEW_STATES
     batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
     reasons = [
-        f"{objects} training images from {n}: {variation}; these changes made left-out images more likely, or cost nothing"
+        f"{objects} training images from {n}: {variation}; with these changes left-out images were at least as likely as without"
     ]
     if variation == Variation():
         reasons = [f"{n} training images as they are: every change of them made left-out images less likely"]

@@ -240,5 +240,5 @@ def budget_off(options: AutomatonOptions, found: MeasuredWalks, dose: float) -> 
         if (wanted := getattr(options, name)) is not None
     )
     again = f"{flag_of(name)} {wanted / (1 + off):.4g}" if off > -1 else f"a larger {flag_of(name)}"
-    words = f"budget missed by {off:+.1%}: {name} {spent[name]:.3g} on all held-out objects, asked for {wanted:g}; "
-    return off, [f"{words}to come closer, train with {again}"] if abs(off) > BUDGET_TOLERANCE else []
+    words = f"{abs(off):.1%} {'above' if off > 0 else 'below'} the budget: {name} {spent[name]:.3g} of {wanted:g} on all held-out "
+    return off, [f"{words}objects; to come closer, train with {again}"] if abs(off) > BUDGET_TOLERANCE else []
