@@ -45,7 +45,7 @@ def _results(history: History) -> Iterator[Row]:
     rate = sums["decisions"] / max(seconds, 1e-3)
     state = f"{picture['state']} after {duration(picture['elapsed_s'])}"
     state += f": {one_line(picture['ended'], 200)}" if picture["ended"] else ""
-    state += f"; the device was found again {picture['reconnects']} times" if picture["reconnects"] else ""
+    state += f"; times that the device was found again: {picture['reconnects']}" if picture["reconnects"] else ""
     yield Row("state", state, STATES.get(picture["state"], "note"))
     made = f"{done:,}{f' of {expected:,}' if expected else ''}, {rate:,.1f} per second"
     goes_on = expected > done and rate > 0 and not picture["ended"]
