@@ -31,7 +31,7 @@ static struct {
     uint64_t high;
     uint32_t low;
     struct pans_exposure now;
-    uint64_t began, ended, exposures;
+    uint64_t began, ended, exposures, aim; /* aim: the counter at the edge for which the timer is set */
     uint64_t late_max, choice_max, edge_max, gate_late_max;
 } board;
 
@@ -112,6 +112,10 @@ void leave(void)
 static void schedule(void)
 {
     uint64_t edge = pans_edge_tick(device), now = tick(), wait = NEVER_MIND;
+    uint64_t aim = edge == PANS_NEVER ? edge : edge - line_offset;
+    if (aim == board.aim)
+        return; /* it runs, or has just run out: to set it anew costs an emulator microseconds */
+    board.aim = aim;
     TIMER_CTRL = 0;
     TIMER_CLEAR = 1;
     if (edge == PANS_NEVER)
@@ -125,6 +129,7 @@ static void schedule(void)
 void timer_interrupt(void)
 {
     uint64_t edge;
+    board.aim = 0; /* whatever it was, it is over */
     while ((edge = pans_edge_tick(device)) != PANS_NEVER && edge <= tick() + LEAD) {
         uint64_t from = tick();
         pans_edge(device);

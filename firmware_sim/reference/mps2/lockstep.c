@@ -80,7 +80,7 @@ void line_wait(uint64_t next)
     if (in_got != in_count)
         return;
     __asm volatile("cpsid i" ::: "memory");
-    uint64_t now = tick();
+    uint64_t now = tick(), offset = line_offset;
     if (now >= until || out_count != 0) {
         exchange(now);
         line_offset -= tick() - now;
@@ -88,7 +88,8 @@ void line_wait(uint64_t next)
     uint64_t wake = next < until ? next : until;
     if (in_got == in_count && wake > now + MARGIN)
         line_offset += wake - now - MARGIN;
-    timer_interrupt(); /* at once, or later: the timer has run on */
+    if (line_offset != offset)
+        timer_interrupt(); /* at once, or later: the timer has run on */
     __asm volatile("cpsie i" ::: "memory");
 }
 
