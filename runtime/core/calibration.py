@@ -41,6 +41,7 @@ TELLING = (1.0, 1.6, 2.2)  # of the second, around the most informative
 SEQUENTIAL_PATTERNS = 60
 PARALLEL_FRAMES = 900
 DARK_SHARE = 0.1
+BLOCK_US = 5_000.0  # of exposures that are told at once: nothing waits for them
 LEAST_SEQUENTIAL_US, LEAST_PARALLEL_US = 40.0, 50.0  # shorter exposures would only load the link
 SILENT = 20.0  # clicks; that none of so many comes has the chance 2e-9
 PATTERNS_DIFFER = 0.01  # p-value of the test that they do not, below which the level's interval holds their spread
@@ -138,6 +139,8 @@ def _one_after_another(n: int, channels: int) -> Automaton:
 
 
 def _plan(profile: Profile, bundle: Bundle, n: int, exposure_us: float) -> Plan:
+    deadline_us = max(4 * BLOCK_US, profile.timing.decision_deadline_us)
+    profile = replace(profile, timing=replace(profile.timing, decision_deadline_us=deadline_us))
     if bundle.automaton is not None:
         dark = max(1, round(DARK_SHARE * bundle.automaton.n_slots))
         return build_plan(profile, bundle, dark_slots_per_cycle=dark, drive="device")
