@@ -1,5 +1,6 @@
 """What all tests share: fixtures, markers, and what is skipped here and why."""
 
+import gc
 import os
 import signal
 import sys
@@ -27,6 +28,11 @@ hypothesis.settings.load_profile("pans")
 def pytest_configure(config: pytest.Config) -> None:
     # A shell that starts the tests in the background lets them ignore Ctrl-C, and so every process that they start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    # A run collects garbage before it is armed: let it look at what its test made, not at torch and 4000 tests.
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
