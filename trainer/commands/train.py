@@ -17,7 +17,7 @@ from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.images import Reading
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
-from pans.trainer.options import ENCODERS, SEED, AutomatonOptions, Options, add_unset_options, flag_of, option_names
+from pans.trainer.options import ENCODERS, SEED, AutomatonOptions, Options, add_unset_options, check_optics, flag_of, option_names
 
 from .arguments import (
     HISTORY_FILES,
@@ -156,6 +156,8 @@ def _refuse_foreign(args: argparse.Namespace, automaton: bool, own: bool) -> Non
     for one, other in (("alpha", "photons"), ("conserving", "unconstrained")):
         if _is_given(args, one) and _is_given(args, other):
             raise UsageError(f"{flag_of(one)} and {flag_of(other)} exclude each other", remedy="leave one of them out")
+    if args.optics is not None:
+        check_optics(args.optics)
 
 
 def _is_given(args: argparse.Namespace, name: str) -> bool:
