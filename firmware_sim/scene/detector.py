@@ -22,10 +22,12 @@ from .detector_model import (
     MIX_2,
     UPPER_CROSSTALK_STREAM,
     DetectorModel,
+    mix_int,
     stream_key,
 )
 
 KERNEL_EXPOSURES = 256  # from here on the compiled loop pays
+FEW = 8  # numbers, of which each takes Python less time than numpy takes to begin
 
 
 def uniform_numbers(
@@ -33,12 +35,21 @@ def uniform_numbers(
 ) -> NDArray[np.float64]:
     """Return float64 (n_exposures, n_channels) in [0, 1) of 53 bits, each a function of (seed, stream, exposure, channel)."""
     key = stream_key(seed, stream)
+    if n_exposures * n_channels <= FEW:
+        rows = range(first_exposure, first_exposure + n_exposures)
+        return np.array([_row(key, exposure, n_channels) for exposure in rows]).reshape(n_exposures, n_channels)
     exposures = np.arange(n_exposures, dtype=np.uint64) + np.uint64(first_exposure & MASK)
     state = _mix(exposures * np.uint64(GOLDEN) + np.uint64(key))
     steps = np.arange(1, n_channels + 1, dtype=np.uint64) * np.uint64(CHANNEL_STEP)
     words = _mix(state[:, None] + steps[None, :])
     words >>= np.uint64(11)
     return words.astype(np.float64) * 2.0**-53
+
+
+def _row(key: int, exposure: int, n_channels: int) -> list[float]:
+    """The numbers of one exposure."""
+    state = mix_int((exposure - 1) * GOLDEN + key)
+    return [(mix_int(state + n * CHANNEL_STEP - GOLDEN) >> 11) * 2.0**-53 for n in range(1, n_channels + 1)]
 
 
 def sample_clicks(

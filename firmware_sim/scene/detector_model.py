@@ -84,10 +84,11 @@ def first_click_probability(model: DetectorModel, photoelectrons: NDArray[np.flo
 @lru_cache(maxsize=64)
 def stream_key(seed: int, stream: int) -> int:
     """Return the 64-bit key of one stream of random numbers."""
-    return _mix_int(_mix_int(seed & MASK) ^ _mix_int(stream + 1))
+    return mix_int(mix_int(seed & MASK) ^ mix_int(stream + 1))
 
 
-def _mix_int(word: int) -> int:
+def mix_int(word: int) -> int:
+    """Return the next word of splitmix64 after `word`, of 64 bits."""
     word = (word + GOLDEN) & MASK
     word = ((word ^ (word >> 30)) * MIX_1) & MASK
     word = ((word ^ (word >> 27)) * MIX_2) & MASK

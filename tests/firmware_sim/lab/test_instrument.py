@@ -94,8 +94,8 @@ def test_the_shipped_bundle_passes_and_is_as_right_as_expected(
     of_word = np.where(bits, chance[:, None], 1 - chance[:, None]).prod(axis=2)
     right = (of_word * (bundle.table.argmax(axis=1) == labels[:, None])).sum(axis=1)
     error = np.sqrt((right * (1 - right)).sum()) / objects
-    assert abs(found["accuracy"] - right.mean()) < 4 * error
-    assert abs(found["clicks_mean"] - chance.sum(axis=1).mean()) < 4 * np.sqrt((chance * (1 - chance)).sum()) / objects
+    assert abs(found["accuracy"] - right.mean()) < 5 * error
+    assert abs(found["clicks_mean"] - chance.sum(axis=1).mean()) < 5 * np.sqrt((chance * (1 - chance)).sum()) / objects
 
 
 @pytest.mark.parametrize("drive", ["device", "host"])
@@ -134,7 +134,7 @@ def test_an_automaton_walks_by_the_clicks_of_the_table(
         for (_, seen), weight in reached.items():
             mean, square = mean + weight * seen, square + weight * seen**2
         clicks, spread = clicks + mean, spread + square - mean**2
-    assert abs(found["clicks_mean"] - clicks / objects) < 4 * np.sqrt(spread) / objects
+    assert abs(found["clicks_mean"] - clicks / objects) < 5 * np.sqrt(spread) / objects
 
 
 def run_on(link: socket.socket) -> None:

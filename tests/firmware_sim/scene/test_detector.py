@@ -25,10 +25,11 @@ def no_clicks(channels: int) -> np.ndarray:
 # -- random numbers ----------------------------------------------------------------------------------------------------
 
 
-def test_numbers_equal_the_oracle() -> None:
+@pytest.mark.parametrize(("exposures", "channels"), [(1, 1), (2, 3), (4, 3)])  # few numbers, and many
+def test_numbers_equal_the_oracle(exposures: int, channels: int) -> None:
     for seed, first, stream in [(0, 0, 0), (7, 2**40, 1), (2**64 - 1, 2**64 - 2, 2)]:
-        found = uniform_numbers(seed, first, 4, 3, stream)
-        expected = [[naive.number(seed, first + t, c, stream) for c in range(3)] for t in range(4)]
+        found = uniform_numbers(seed, first, exposures, channels, stream)
+        expected = [[naive.number(seed, first + t, c, stream) for c in range(channels)] for t in range(exposures)]
         assert found.tolist() == expected
 
 
