@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tree import ROOT
 
-# A comment above a block says what a test is to do with it: `not run: why`, `slow: how long`, `exit: code, or several`, `file: one to copy here`.
+# A comment above a block says what a test is to do with it: `not run: why`, `slow: how long`, `exit: codes`, `file: one to copy here`.
 _BLOCK = re.compile(r"((?:<!--[^\n]*-->\n)*)```(\w*)[^\n]*\n(.*?)\n```", re.DOTALL)
 _NOTE = re.compile(r"<!-- (not run|slow|exit|needs|file): (.*?) -->")
 _SPAN = re.compile(r"(?<!`)`(pans [^`]+)`(?!`)")

@@ -17,7 +17,16 @@ from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.images import Reading
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
-from pans.trainer.options import ENCODERS, SEED, AutomatonOptions, Options, add_unset_options, check_optics, flag_of, option_names
+from pans.trainer.options import (
+    ENCODERS,
+    SEED,
+    AutomatonOptions,
+    Options,
+    add_unset_options,
+    check_optics,
+    flag_of,
+    option_names,
+)
 
 from .arguments import (
     HISTORY_FILES,
