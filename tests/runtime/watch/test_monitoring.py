@@ -7,6 +7,7 @@ import subprocess
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pans.firmware_sim.testing import small_setup
@@ -75,7 +76,7 @@ def test_prometheus_reads_every_expression_of_the_dashboard(tmp_path: Path) -> N
 
 def test_promtool_accepts_configuration_and_rules() -> None:
     said = promtool("check", "config", str(SHIPPED / "prometheus.yml"))
-    assert "SUCCESS: 12 rules found" in said
+    assert "SUCCESS: 14 rules found" in said
     assert "prometheus.yml is valid" in said
 
 
@@ -101,23 +102,54 @@ def test_rules_fire_at_once_or_after_enough_history(tmp_path: Path) -> None:
         "pans_resident_memory_bytes": "0+1000000x990",
     }
     found = 'count by (alertname, alertstate) (ALERTS{alertname=~"PansAlarm|PansGone|PansRunFailed|PansMemoryGrows"})'
+    asked = [
+        (minute, found, [f'{{alertname="{name}", alertstate="{state}"}}' for name, state in wanted.items()])
+        for minute, wanted in states.items()
+    ]
+    check_rules(tmp_path, series, asked)
+
+
+def test_dark_counts_alarm_on_another_rate_and_not_on_few_clicks(tmp_path: Path) -> None:
+    """Six days at six constant Poisson rates, five of which have a day before; and rises and a fall after two days."""
+    hours, random, after = 144, np.random.default_rng(1), 48
+    constant = {"0.05": 0.05, "0.5": 0.5, "5": 5.0, "20": 20.0, "50": 50.0, "500": 500.0}
+    per_hour = {name: np.full(hours, rate) for name, rate in constant.items()}
+    per_hour |= {"0.5 to 100": np.repeat([0.5, 100.0], [after, hours - after])}
+    per_hour |= {"5 to 50": np.repeat([5.0, 50.0], [after, hours - after])}
+    per_hour |= {"100 to 10": np.repeat([100.0, 10.0], [after, hours - after])}
+    series = {}
+    for name, rates in per_hour.items():
+        clicks = np.cumsum(random.poisson(np.repeat(rates / 12, 12)))
+        series[f"pans_dark_clicks_total{{instance='{name}'}}"] = " ".join(map(str, clicks))
+        series[f"pans_dark_exposures_total{{instance='{name}'}}"] = f"0+1550x{12 * hours}"
+    firing = 'ALERTS{alertname="PansDarkCountsChanged", alertstate="firing"}'
+    changed = [f'{{instance="{name}"}}' for name in per_hour if name not in constant]
+    asked = [
+        (60 * hour, f"count by (instance) (count_over_time({firing}[{past}h]))", wanted)
+        for hour, past, wanted in ((after, after, []), (after + 2, 1, changed), (hours, hours, changed))
+    ]
+    check_rules(tmp_path, series, asked, minutes=5)
+
+
+def check_rules(
+    folder: Path, series: dict[str, str], asked: list[tuple[int, str, list[str]]], minutes: int = 1
+) -> None:
+    """`promtool test rules`, of `series` with a value every so many minutes: at a minute an expression is 1 for these labels, no others."""
     test = {
-        "interval": "1m",
+        "interval": f"{minutes}m",
         "input_series": [{"series": name, "values": values} for name, values in series.items()],
         "promql_expr_test": [
             {
                 "eval_time": f"{minute}m",
-                "expr": found,
-                "exp_samples": [
-                    {"labels": f'{{alertname="{name}", alertstate="{state}"}}', "value": 1}
-                    for name, state in wanted.items()
-                ],
+                "expr": expression,
+                "exp_samples": [{"labels": labels, "value": 1} for labels in wanted],
             }
-            for minute, wanted in states.items()
+            for minute, expression, wanted in asked
         ],
     }
-    (tmp_path / "test.json").write_text(json.dumps({"rule_files": [str(RULES)], "tests": [test]}))
-    promtool("test", "rules", str(tmp_path / "test.json"))
+    told = {"rule_files": [str(RULES)], "evaluation_interval": f"{minutes}m", "tests": [test]}
+    (folder / "test.json").write_text(json.dumps(told))
+    promtool("test", "rules", str(folder / "test.json"))
 
 
 def promtool(*words: str, text: str = "") -> str:
