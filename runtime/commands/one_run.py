@@ -403,6 +403,7 @@ class _Run:
             dark=self.dark.figures(result.dark),
             walks=walks,
             registration=None if self.registration is None else self.registration.facts(),
+            late_allowed=options.late_allowed,
         )
         if recorder is None or (kept := recorder.keep_deleted()) is None:
             return options, summary
@@ -541,6 +542,6 @@ def _exit_code(summary: Summary) -> int:
     if summary.link_lost or summary.ended.startswith(REFUSED):
         return EXIT_DEVICE
     off = summary.exposure_timing.get("within") is False
-    if summary.late or summary.lost or summary.stream["lost_messages"] or summary.contradictions or off:
+    if summary.too_late or summary.lost or summary.stream["lost_messages"] or summary.contradictions or off:
         return EXIT_TIMING
     return EXIT_FINE if summary.verdict == "PASS" else EXIT_ALERT

@@ -167,6 +167,13 @@ class RunOptions:
         metavar="N",
         group=DAYS,
     )
+    late_allowed: float = option(
+        0.0,
+        "share of decisions that may be late before the verdict is FAIL, such as 0.001 (default 0)",
+        range=Range(0.0, 1.0),
+        metavar="SHARE",
+        group=DAYS,
+    )
     state: Path | None = option(
         None, "write the run's state there as JSON, each second", type=Path, metavar="FILE", group=DAYS
     )

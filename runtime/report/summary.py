@@ -80,6 +80,12 @@ class Summary:
     calibration_warnings: list[str]
     light: dict[str, Any] | None
     registration: dict[str, Any] | None = None  # of the optical table, and what the correction of the patterns came to
+    late_allowed: float = 0.0  # share of the decisions
+
+    @property
+    def too_late(self) -> bool:
+        """Whether more decisions were late than the run allowed."""
+        return self.late > self.late_allowed * self.tally.decisions
 
     def as_json(self) -> dict[str, Any]:
         """Return the summary under the contract's keys, in their order."""
@@ -98,11 +104,12 @@ def summarise(
     dark: DarkFigures | None = None,
     walks: WalkFigures | None = None,
     registration: dict[str, Any] | None = None,
+    late_allowed: float = 0.0,
 ) -> Summary:
     """Return the summary of `result`; `illumination` is per decision, in photoelectrons per unit transmission."""
     timing = result.timing
     dark = DarkFigures(None, [], None, []) if dark is None else dark
-    faults = find_faults(result, expected_decisions, aborts_are_faults=flow is None)
+    faults = find_faults(result, expected_decisions, aborts_are_faults=flow is None, late_allowed=late_allowed)
     faults += ([] if flow is None else gate_faults(flow.gates)) + dark.faults
     made: dict[str, Any] = {
         "illumination": illumination,
@@ -124,13 +131,16 @@ def summarise(
         "calibration_warnings": dark.warnings,
         "light": dark.light,
         "registration": registration,
+        "late_allowed": late_allowed,
     }
     same = {field.name: getattr(result, field.name) for field in fields(Summary)[3:] if field.name not in made}
     return Summary(tally=result.tally.figures(), flow=flow, walks=walks, **made, **same)
 
 
-def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: bool = True) -> list[str]:
-    """Return one sentence for each way in which the run broke its promise; empty means PASS."""
+def find_faults(
+    result: RunResult, expected_decisions: int, aborts_are_faults: bool = True, late_allowed: float = 0.0
+) -> list[str]:
+    """Return one sentence for each way in which the run broke its promise; empty means PASS. `late_allowed`: share of late decisions."""
     tally, timing, stream = result.tally, result.timing, result.stream
     faults = []
     if result.link_lost and result.ended in (ASKED_TO_STOP, INTERRUPTED):
@@ -139,14 +149,14 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
         faults.append(result.ended)
     if result.reconnects:
         faults.append(f"the device was lost and found again {result.reconnects} times")
-    if timing.late:
+    if timing.late > late_allowed * tally.decisions:
         half_us = timing.total.summary()["p50"]
         short = (
             f"; half of all decisions took more than {half_us:,.0f} us" if half_us * 1000 > timing.deadline_ns else ""
         )
-        faults.append(
-            f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms ({late_words(result)}){short}"
-        )
+        of = f" of {tally.decisions:,}" if late_allowed else ""
+        limit = f"{timing.deadline_ns / 1e6:g} ms" + (f", allowed {late_allowed * 100:g} %" if late_allowed else "")
+        faults.append(f"{timing.late}{of} decisions later than {limit} ({late_words(result)}){short}")
     if stream["lost_exposures"]:
         faults.append(
             f"{stream['lost_exposures']} exposures lost in {stream['gaps']} gaps, "

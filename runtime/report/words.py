@@ -81,7 +81,7 @@ def _further(facts: Facts) -> dict[str, Any]:
     """What the words need besides the facts of a summary; a list of one is None where its fact is."""
     dark, stream = (facts.get(name) or {} for name in ("dark", "stream"))
     known = {"spread": facts.get("accuracy_std_trials"), "off": facts.get("expected_off_stderr")}
-    known["asked"] = facts.get("confidence") or None
+    known |= {"asked": facts.get("confidence") or None, "allowed": facts.get("late_allowed") or None}
     found: dict[str, Any] = {name: None if one is None else [one] for name, one in known.items()}
     found |= {"ends": accuracy_interval(facts), "light": facts.get("illumination_mean", facts.get("illumination"))}
     found["share"] = {name: _share(facts, name) for name in _SHARES if f"{name}_ci" in facts}

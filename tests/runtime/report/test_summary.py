@@ -11,6 +11,7 @@ import pytest
 from commands import fixed_run, json_of
 from mutated_sessions import Stage
 
+from pans.runtime.cli import main
 from pans.runtime.report.summary import Summary, late_words
 from pans.runtime.report.words import accuracy_interval, closing_words, write_markdown
 
@@ -41,6 +42,24 @@ def test_the_summary_has_the_contracts_keys_order_and_values(
             assert found[key] == wanted[key], key
             if isinstance(wanted[key], dict):
                 assert list(found[key]) == list(wanted[key]), key
+
+
+def test_late_decisions_are_a_fault_beyond_the_share_that_is_allowed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device = ("--device", "sim:oled-qcmos?seed=1&pace=fast&faults=late:60ms/300ms", "--decisions", "100")
+    found = {}
+    for allowed in ("0", "0.19", "0.2"):
+        words = ("run", "fashion10", *device, "--late-allowed", allowed, "--out", str(tmp_path / allowed), "--json")
+        code = main([*words])
+        found[allowed] = code, json.loads(capsys.readouterr().out)
+    assert {code: facts["late"] for code, facts in found.values()} == {4: 20, 0: 20}
+    code, facts = found["0.19"]
+    assert code == 4
+    assert facts["faults"][0].startswith("20 of 100 decisions later than 16.667 ms, allowed 19 % (")
+    code, facts = found["0.2"]
+    assert (code, facts["verdict"], facts["faults"], facts["late_allowed"]) == (0, "PASS", [], 0.2)
+    assert "20.000% of the decisions are allowed" in (tmp_path / "0.2" / "summary.md").read_text()
 
 
 @pytest.fixture(scope="module")
