@@ -49,9 +49,15 @@ FIGURES = {
     "parts": ("pans_recording_parts", True, "Parts of the recording that were begun"),
 }
 LABELLED = {  # picture key -> (metric, counts up, label, help)
-    "late_cause": ("pans_late_decisions_by_cause", True, "cause", "Late decisions by who is to blame"),
-    "lost_cause": ("pans_lost_exposures_by_cause", True, "cause", "Lost exposures by who is to blame"),
+    "late_cause": ("pans_late_decisions_by_cause", True, "cause", "Late decisions by cause"),
+    "lost_cause": ("pans_lost_exposures_by_cause", True, "cause", "Lost exposures by cause"),
     "alarms": ("pans_alarm", False, "kind", "1 while the detector in the dark, or the light, is not as it should be"),
+    "times_expected": (
+        "pans_alarm_times_expected",
+        False,
+        "kind",
+        "Dark rate over the expected one when an alarm began",
+    ),
 }
 
 
@@ -114,7 +120,9 @@ class Collector:
         yield GaugeMetricFamily("pans_running", words, value=float(running))
         if "last_verdict" in picture:
             words, failed = "1 if the latest run that ended did not PASS", picture["last_verdict"] != "PASS"
-            yield GaugeMetricFamily("pans_last_run_failed", words, value=float(failed))
+            family = GaugeMetricFamily("pans_last_run_failed", words, labels=["folder"])
+            family.add_metric([picture.get("last_folder", "")], float(failed))
+            yield family
 
 
 class _Handler(WSGIRequestHandler):

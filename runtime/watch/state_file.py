@@ -66,6 +66,13 @@ def alarms_of(run: LiveRun) -> dict[str, int]:
     return {kind: int(kind in present) for kind in ALARMS} | {"light": int(run.journal.counts["light_changed"] > 0)}
 
 
+def times_expected_of(run: LiveRun) -> dict[str, float]:
+    """Return the dark rate over the expected one, when it was found, of each kind of ALARMS that lasts; the highest of its channels."""
+    guard: DarkGuard | None = getattr(run.core, "guard", None)
+    found = [] if guard is None else [one for one in guard.serious if one.expected > 0]
+    return {one.kind: one.rate / one.expected for one in sorted(found, key=lambda one: one.rate / one.expected)}
+
+
 def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float) -> dict[str, Any]:
     """Return the run's figures as they are now, JSON-able, units in the keys; `started_s` is on time.monotonic's scale."""
     picture: dict[str, Any] = {
@@ -104,6 +111,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         **{key: ticks * run.plan.tick_us for key, ticks in exposed.items()},
         "reconnects": run.reconnects,
         "alarms": alarms_of(run),
+        "times_expected": times_expected_of(run),
         "last_error": f"{trouble['kind']}: {words_of(trouble)}" if trouble else "",
     }
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -57,7 +58,8 @@ class Watchers:
                 self._metrics.look = self.look
             if self._wanted.state is not None:
                 if (before := read_state(self._wanted.state)) is not None:  # one that was killed has no verdict
-                    self._outcome = {"last_verdict": before.get("verdict") or "cut"}
+                    folder = Path(str(before.get("recording", ""))).parent.name
+                    self._outcome = {"last_verdict": before.get("verdict") or "cut", "last_folder": folder}
                 self._state = StateFile(self._wanted.state, self.look)
                 opening.callback(self._state.close)
             self._notifier = Notifier.of_environment()
@@ -91,7 +93,9 @@ class Watchers:
 
     def conclude(self, verdict: str, faults: Sequence[str]) -> None:
         """State what came of the run: PASS or FAIL, and why."""
-        self._outcome = {"verdict": verdict, "faults": [*faults][:MAX_FAULTS], "last_verdict": verdict}
+        folder = "" if self._recorder is None else self._recorder.open_file.path.parent.name
+        self._outcome = {"verdict": verdict, "faults": [*faults][:MAX_FAULTS]}
+        self._outcome |= {"last_verdict": verdict, "last_folder": folder}
 
     def look(self) -> dict[str, Any]:
         """Return the picture as it is now."""

@@ -78,12 +78,16 @@ def test_a_run_knows_the_verdict_of_the_one_before(tmp_path: Path) -> None:
 def test_metrics_are_served() -> None:
     pytest.importorskip("prometheus_client")
     picture: dict[str, Any] = {"decisions": 7, "late_cause": {"link": 3}, "state": "running", "handles": 7}
-    picture |= {"alarms": {"hot": 1, "light": 0}, "last_verdict": "cut"}
+    picture |= {"alarms": {"hot": 1, "light": 0}, "last_verdict": "cut", "last_folder": "2026"}
     with closing(MetricsServer("0", lambda: picture)) as server:
         lines = urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics").read().decode().splitlines()
     causes = 'pans_late_decisions_by_cause_total{cause="link"} 3.0'
     assert {"pans_decisions_total 7.0", causes, "pans_running 1.0", "pans_open_handles 7.0"} <= set(lines)
-    assert {'pans_alarm{kind="hot"} 1.0', 'pans_alarm{kind="light"} 0.0', "pans_last_run_failed 1.0"} <= set(lines)
+    assert {
+        'pans_alarm{kind="hot"} 1.0',
+        'pans_alarm{kind="light"} 0.0',
+        'pans_last_run_failed{folder="2026"} 1.0',
+    } <= set(lines)
 
 
 def test_signals_become_words_while_somebody_looks() -> None:
@@ -159,7 +163,7 @@ def _running(bundle_file: Path, folder: Path, *more: str) -> Iterator[subprocess
     [
         ({"verdict": "PASS", "ended": ASKED_TO_STOP}, 0),
         ({"verdict": "FAIL", "ended": ASKED_TO_STOP}, 1),  # reconnections alone
-        ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "late": 1}, 4),
+        ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "too_late": True}, 4),
         ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "exposure_timing": {"within": False}}, 4),
         ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "link_lost": True}, 3),
         ({"verdict": "FAIL", "ended": RECORDING_DELETED}, 1),
@@ -169,7 +173,7 @@ def _running(bundle_file: Path, folder: Path, *more: str) -> Iterator[subprocess
 def test_exit_codes_of_a_run(facts: dict[str, Any], code: int) -> None:
     fine = {
         "link_lost": False,
-        "late": 0,
+        "too_late": False,
         "lost": 0,
         "stream": {"lost_messages": 0},
         "contradictions": {},
@@ -190,8 +194,11 @@ def test_the_state_names_only_what_is_written(tmp_path: Path) -> None:
         assert picture_of(run, recorder, 0.0)["decisions"] == 0
         recorder.flush()
         assert picture_of(run, recorder, 0.0)["decisions"] == 3
-        run.core.guard = SimpleNamespace(serious=[SimpleNamespace(kind="hot")])
-        assert [kind for kind, lasts in picture_of(run, recorder, 0.0)["alarms"].items() if lasts] == ["hot", "light"]
+        hot = [SimpleNamespace(kind="hot", rate=rate, expected=expected) for rate, expected in ((6, 2), (1, 0), (3, 2))]
+        run.core.guard = SimpleNamespace(serious=hot)
+        picture = picture_of(run, recorder, 0.0)
+        assert [kind for kind, lasts in picture["alarms"].items() if lasts] == ["hot", "light"]
+        assert picture["times_expected"] == {"hot": 3.0}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs files that are read without a name")

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from pans.runtime.watch.metrics import FIGURES, LABELLED, MetricsServer
 
 RULES, DASHBOARD = SHIPPED / "prometheus-alerts.yml", SHIPPED / "grafana-dashboard.json"
 METRIC = re.compile(r"\bpans_[a-z0-9_]+")
-LABELS = re.compile(r"\{\{ ?(?:\$labels\.)?([a-z]+) ?\}\}")
+LABELS = re.compile(r"\$labels\.([a-z]+)|\{\{([a-z]+)\}\}")
 
 
 def named(path: Path) -> set[str]:
@@ -43,8 +44,9 @@ def test_every_metric_that_is_named_is_served_by_a_run(tmp_path: Path, monkeypat
     )
     (text,) = answers
     served = {re.split("[{ ]", line)[0] for line in text.splitlines() if line[:1] != "#"}
-    # a run without trouble has no causes to tell
+    # a run without trouble has no causes to tell, and no alarm
     of_causes = {f"{name}_total" for name, _, label, _ in LABELLED.values() if label == "cause"}
+    of_causes.add("pans_alarm_times_expected")
     for path in (RULES, DASHBOARD):
         named = set(METRIC.findall(path.read_text()))
         assert named - served - of_causes == set(), path.name
@@ -62,8 +64,8 @@ def test_the_dashboard_is_one_that_grafana_reads_and_labels_exist() -> None:
         assert panel["targets"], panel["title"]
         for target in panel["targets"]:
             assert 'instance=~"$instance"' in target["expr"]
-    assert set(LABELS.findall(RULES.read_text())) <= {"instance", "kind"}
-    assert set(LABELS.findall(DASHBOARD.read_text())) <= {"instance", "cause", "kind"}
+    used = [{"".join(found) for found in LABELS.findall(path.read_text())} for path in (RULES, DASHBOARD)]
+    assert used == [{"instance", "kind", "folder"}, {"instance", "cause", "kind"}]
 
 
 def test_prometheus_reads_every_expression_of_the_dashboard(tmp_path: Path) -> None:
@@ -94,10 +96,11 @@ def test_rules_fire_at_once_or_after_enough_history(tmp_path: Path) -> None:
         960: {"PansMemoryGrows": "firing", "PansGone": "firing"},
     }
     series = {
-        "pans_alarm{kind='hot'}": "0x59 1x29 0x900",
-        "pans_alarm{kind='light'}": "0x990",
+        "pans_alarm{instance='lab',kind='hot'}": "0x59 1x29 0x900",
+        "pans_alarm_times_expected{instance='lab',kind='hot'}": "_x59 12.34x29 _x900",
+        "pans_alarm{instance='lab',kind='light'}": "0x990",
         "pans_running": "_ 1x940 _x50",
-        "pans_last_run_failed": "1x990",
+        "pans_last_run_failed{folder='run-1'}": "1x990",
         "pans_uptime_seconds": "0+60x990",
         "pans_resident_memory_bytes": "0+1000000x990",
     }
@@ -106,7 +109,10 @@ def test_rules_fire_at_once_or_after_enough_history(tmp_path: Path) -> None:
         (minute, found, [f'{{alertname="{name}", alertstate="{state}"}}' for name, state in wanted.items()])
         for minute, wanted in states.items()
     ]
-    check_rules(tmp_path, series, asked)
+    labels = {"instance": "lab", "kind": "hot", "severity": "critical"}
+    summary = "lab: the dark counts have changed (hot): 12.3 times the expected rate "
+    summary += "(docs/how-to/dark-counts.md tells what that means and what to do)"
+    check_rules(tmp_path, series, asked, (60, "PansAlarm", labels, summary))
 
 
 def test_dark_counts_alarm_on_another_rate_and_not_on_few_clicks(tmp_path: Path) -> None:
@@ -132,7 +138,11 @@ def test_dark_counts_alarm_on_another_rate_and_not_on_few_clicks(tmp_path: Path)
 
 
 def check_rules(
-    folder: Path, series: dict[str, str], asked: list[tuple[int, str, list[str]]], minutes: int = 1
+    folder: Path,
+    series: dict[str, str],
+    asked: list[tuple[int, str, list[str]]],
+    *alerts: tuple[int, str, Any, str],
+    minutes: int = 1,
 ) -> None:
     """`promtool test rules`, of `series` with a value every so many minutes: at a minute an expression is 1 for these labels, no others."""
     test = {
@@ -145,6 +155,14 @@ def check_rules(
                 "exp_samples": [{"labels": labels, "value": 1} for labels in wanted],
             }
             for minute, expression, wanted in asked
+        ],
+        "alert_rule_test": [
+            {
+                "eval_time": f"{minute}m",
+                "alertname": name,
+                "exp_alerts": [{"exp_labels": labels, "exp_annotations": {"summary": summary}}],
+            }
+            for minute, name, labels, summary in alerts
         ],
     }
     told = {"rule_files": [str(RULES)], "evaluation_interval": f"{minutes}m", "tests": [test]}
