@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime import SHIPPED
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, say, warn
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_TIMING, Command, add_force, emit, say, warn
 from pans.runtime.cli.command import parser_of
 from pans.runtime.cli.finding import find_commands, load_command
 from pans.runtime.container import read_file
@@ -38,6 +38,7 @@ from pans.runtime.timing.realtime import FIFO_PRIORITY
 
 from .runs import Run, runs_in
 
+PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # with PrivateTmp a service has its own
 MARK = "# Written by `pans service install`; change the file of options, not this one."
 SYSTEM_UNITS, USER_UNITS = Path("/etc/systemd/system"), Path("~/.config/systemd/user")
 UNIT_MAX_BYTES = 1 << 16
@@ -50,6 +51,11 @@ POLL_S = 0.05
 NOT_THE_SERVICES = ("INVOCATION_ID", "JOURNAL_STREAM", "MAINPID")
 WATCHDOG = Range(16, 3600)  # a run that looks for its lost device may be silent for 15 s
 START = Range(1, 86400)
+RAN = (
+    EXIT_FINE,
+    EXIT_ALERT,
+    EXIT_TIMING,
+)  # exit codes of a run with a verdict: a busy computer does not make an installation wrong
 ANALYZE_S = 60
 MONITORING = ("prometheus.yml", "prometheus-alerts.yml", "grafana-dashboard.json")
 OF_ACTION = {  # options that have an effect with each action, beside --name, --user and --unit-dir
@@ -237,7 +243,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.action == "monitoring":
         return _monitoring(args)
     remedies = {"config": "write the options to a file: pans run ... --write-config", "name": "name the service"}
-    needed = "config" if args.action in ("install", "show") else "name"
+    needed = "config" if args.action == "install" or (args.action == "show" and not args.name) else "name"
     if getattr(args, needed) is None:
         raise UsageError(f"`pans service {args.action}` needs --{needed}", remedy=remedies[needed])
     name = check_name(args.name or args.config.stem)
@@ -252,6 +258,11 @@ def _unit(args: argparse.Namespace, name: str) -> tuple[str, list[Path]]:
         raise UsageError(f"{folder} is not a folder", remedy="make it first")
     writes = sorted({*_written_folders(config, folder)})
     command = (sys.executable, "-m", "pans", "run", "--config", str(config))
+    needed = (folder, config, Path(sys.executable), *writes)
+    hidden = [path for path in needed if any(path.is_relative_to(private) for private in PRIVATE)]
+    if hidden and not args.user:
+        what = f"{hidden[0]}: a service of the system sees no files of others in /tmp and /var/tmp (PrivateTmp)"
+        raise UsageError(what, remedy="move it, for example to /srv, or install a unit of your own manager with --user")
     user = "" if args.user else args.run_as or os.environ.get("SUDO_USER") or getpass.getuser()
     return unit_text(name, command, folder, writes, args.watchdog_s or 20.0, user), writes
 
@@ -278,7 +289,7 @@ def _written_folders(config: Path, folder: Path) -> Iterator[Path]:
 
 
 def _show(args: argparse.Namespace, name: str, path: Path) -> int:
-    text, _ = _unit(args, name)
+    text = read_unit(path) if args.config is None else _unit(args, name)[0]
     emit(args, {"unit": str(path), "text": text}, text.rstrip("\n"))
     return EXIT_FINE
 
@@ -386,8 +397,13 @@ def _start_findings(run: ServiceRun, watchdog_s: float) -> Iterator[dict[str, An
     found = "said" if stops else "not said before the process ended"
     yield _finding("STOPPING", bool(stops), found, "look into its log")
     ended = f"exit code {run.exit_code}" if run.exit_code is not None else f"not within {STOP_S} s of SIGTERM"
-    alone = "" if run.asked_s is not None else ", by itself"
-    yield _finding("end", run.exit_code in (0, 1), f"{ended}{alone}: {last}"[:400], "look into its log")
+    ended += "" if run.asked_s is not None else ", by itself"
+    ran = run.exit_code in RAN
+    if not ran:
+        ended += f": {last}"
+    elif run.exit_code != EXIT_FINE:
+        ended += ": the service starts, runs and stops; the verdict of this run is FAIL"
+    yield _finding("end", ran, ended[:400], "look into its log")
 
 
 def _finding(check: str, ok: bool, found: str, remedy: str) -> dict[str, Any]:
