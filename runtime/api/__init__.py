@@ -15,6 +15,7 @@ rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.tra
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,14 +94,19 @@ def __getattr__(name: str) -> object:
     except ModuleNotFoundError as error:
         if not module.startswith("pans.trainer"):
             raise
-        extra = "sklearn" if name == "PansClassifier" else "train"
-        what = f"pans.{name} needs the package {error.name}, which is not installed"
-        raise UsageError(what, remedy=f"pip install 'pans-runtime[{extra}]'") from error
+        package, extra = (error.name or "").partition(".")[0], "sklearn" if name == "PansClassifier" else "train"
+        what = f"pans.{name} needs the package {package}, which is not installed"
+        remedy = f"in the checkout of pans: pip install -c constraints.txt '.[{extra}]'"
+        raise UsageError(what, remedy=remedy) from error
     return globals()[name]
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    """The names that can be loaded: `help(pans)` and `inspect` load each, and would end at one whose extra is not installed."""
+    lacks = {package for package in ("torch", "onnx", "sklearn") if find_spec(package) is None}
+    trained = {name for name, (module, _) in _HOMES.items() if module.startswith("pans.trainer")}
+    hidden = trained if lacks - {"sklearn"} else {"PansClassifier"} if lacks else set()
+    return sorted({*__all__} - hidden)
 
 
 def load_bundle(path: str | Path) -> Bundle:
