@@ -104,7 +104,7 @@ def in_python_words(keywords: Container[str] | None = None) -> Iterator[None]:
     def keyword(found: re.Match[str]) -> str:
         if found[1] is None:
             return found[0]
-        name, value = found[1].replace("-", "_"), found[2]
+        name, value = found[1].replace("-", "_"), "True" if found[1] == "force" else found[2]
         if value is not None and value[0].islower():
             value = f'"{value}"'
         if keywords is None or name in keywords:

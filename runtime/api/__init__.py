@@ -8,7 +8,7 @@ rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.tra
 >>> pans.decide(bundle, [0b0000000001, 0b1010000000]).labels.shape
 (2,)
 >>> done = pans.run(bundle, "sim:oled-qcmos?scene=fashion200&seed=1&pace=fast", decisions=20)
->>> done.summary.tally.decisions, done.recording
+>>> done.summary.decisions, done.recording
 (20, None)
 """
 

@@ -82,6 +82,12 @@ class Summary:
     registration: dict[str, Any] | None = None  # of the optical table, and what the correction of the patterns came to
     late_allowed: float = 0.0  # share of the decisions
 
+    def __getattr__(self, name: str) -> Any:
+        """Return what `as_json` has under this key beside the fields: `summary.accuracy` is `summary.tally.accuracy`."""
+        if not name.startswith("_") and name not in self.__slots__ and name in (facts := self.as_json()):
+            return facts[name]
+        raise AttributeError(f"a summary has no {name!r}; the keys of as_json() are there")
+
     @property
     def too_late(self) -> bool:
         """Whether more decisions were late than the run allowed."""

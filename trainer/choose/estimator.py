@@ -179,10 +179,24 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         assert isinstance(found, Measured | MeasuredWalks), "a classifier returns no pictures"
         return found
 
-    def save(self, path: str | Path, *, force: bool = False) -> str:
-        """Write the bundle to `path` (.pans) and return its SHA-256; UsageError if it exists, unless `force`."""
+    @in_python_words()
+    def save(
+        self, path: str | Path, X: ArrayLike | None = None, y: ArrayLike | None = None, *, force: bool = False
+    ) -> str:
+        """Write the bundle to `path` (.pans) and return its SHA-256; UsageError if it exists, unless `force`.
+
+        A run of an automaton compares its accuracy with what the bundle states: on images `X` of the classes `y` that `fit` has not seen,
+        without them on the training images, which is too high. UsageError with images for fixed patterns, which state nothing.
+        """
         check_is_fitted(self)
-        return write_bundle(self.bundle_, path, force=force)
+        bundle = self.bundle_
+        if X is not None:
+            found = self.measure(X, () if y is None else y)
+            names = ("accuracy", "clicks", "photons", "exposures")
+            told = {name: getattr(found, f"{name}_mean", 0.0) for name in names}
+            told |= {"illumination": found.illumination, "objects": found.objects, "split": "held-out images"}
+            bundle = with_expected(bundle, {**(bundle.expected or {}), **told})
+        return write_bundle(bundle, path, force=force)
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()

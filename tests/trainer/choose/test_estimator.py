@@ -10,7 +10,7 @@ import torch
 
 import pans
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import PlanError
+from pans.runtime.errors import PlanError, UsageError
 from pans.trainer.choose import estimator
 from pans.trainer.choose.estimator import PansClassifier
 
@@ -102,6 +102,35 @@ def test_a_bundle_decides_as_its_sensor_and_runs(sensor: PansClassifier, tmp_pat
     found, wanted = done.summary.as_json(), sensor.measure(IMAGES, NAMES)
     assert abs(found["accuracy"] - wanted.accuracy_mean) < 5 * np.sqrt(0.25 / len(grey))
     assert abs(found["clicks_mean"] - wanted.clicks_mean) < 5 * np.sqrt(wanted.clicks_mean / len(grey))
+
+
+def test_a_saved_bundle_states_what_it_achieves_on_images_that_were_held_out(
+    sensor: PansClassifier, tmp_path: Any
+) -> None:
+    path, held = tmp_path / "sensor.pans", (IMAGES[300:], NAMES[300:])
+    sensor.save(path)
+    with pytest.raises(UsageError) as refused:
+        sensor.save(path)
+    assert refused.value.remedy == "choose another name, or replace it with force=True"
+    if sensor.bundle_.automaton is None:
+        with pytest.raises(UsageError, match="expected figures belong to one"):
+            sensor.save(path, *held, force=True)
+        return
+    sensor.save(path, *held, force=True)
+    told, found = pans.load_bundle(path).expected, sensor.measure(*held)
+    assert told is not None
+    assert (told["split"], told["objects"], told["profile"]) == ("held-out images", len(held[0]), "ideal")
+    assert [told[name] for name in ("accuracy", "clicks", "photons", "illumination")] == pytest.approx(
+        [found.accuracy_mean, found.clicks_mean, found.photons_mean, found.illumination]
+    )
+    scene = tmp_path / "scene.npz"
+    grey = np.rint(held[0].reshape(-1, 8, 8) * (255 / 16)).astype(np.uint8)
+    np.savez(scene, images=grey, labels=np.searchsorted(sensor.classes_, held[1]), classes=sensor.classes_)
+    done = pans.run(path, f"sim:ideal?scene={scene}&pace=fast&seed=1", decisions=10 * len(grey), trials=10)
+    assert done.summary.accuracy == done.summary.as_json()["accuracy"]
+    assert abs(done.summary.expected_off_stderr) < 5
+    with pytest.raises(AttributeError, match="no 'accurracy'"):
+        _ = done.summary.accurracy
 
 
 def test_it_is_a_model_like_any_other() -> None:
