@@ -114,7 +114,7 @@ def parser_of(name: str, command: Command) -> CommandParser:
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return a question with the words that an unknown one may stand for, "" where none is near."""
-    near = get_close_matches(word, known, n=2)
+    near = get_close_matches(word, known, n=2, cutoff=0.75)  # --decisions is no --seconds
     return f"did you mean {' or '.join(near)}? " if near else ""
 
 
