@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import ctypes
 import glob
-import importlib
 import json
 import os
 import re
@@ -29,7 +28,7 @@ from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.cli.command import parser_of
-from pans.runtime.cli.finding import find_commands, load_command, missing_extra
+from pans.runtime.cli.finding import find_commands, load_command, needed
 from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import LinkError, UsageError, refusing
 from pans.runtime.outputs import check_outputs
@@ -43,7 +42,7 @@ ON_NAMES = ("reproduce", "train", "baseline")
 WORKERS = Range(1, 1024, whole=True)
 ITEMS_MAX, VALUES_MAX = 1_000_000, 100_000
 STDERR_CHARACTERS = 2000
-RETRIES, CONNECT_S = 2, 30  # of Dask
+RETRIES, CONNECT_S, OF_DASK = 2, 30, ("--dask", "dask")
 REPORT_EVERY_S = 5.0
 _DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl(2)
 
@@ -167,7 +166,7 @@ def workers(number: int, dask: str) -> Iterator[Executor]:
             pool.shutdown(cancel_futures=True)
         return
     try:
-        client = need_distributed().Client(dask, timeout=CONNECT_S)
+        client = needed("distributed", *OF_DASK).Client(dask, timeout=CONNECT_S)
     except (OSError, ValueError) as error:
         what = f"--dask {dask}: no scheduler answers: {error}"
         raise LinkError(what, remedy="start one with `dask scheduler`, or use --workers") from error
@@ -177,14 +176,6 @@ def workers(number: int, dask: str) -> Iterator[Executor]:
             yield pool
         finally:
             pool.shutdown(wait=False)
-
-
-def need_distributed() -> Any:
-    """Return dask.distributed; UsageError that names the extra."""
-    try:
-        return importlib.import_module("distributed")
-    except ImportError as error:
-        raise missing_extra("--dask", "distributed", "dask") from error
 
 
 # ---- the journal ----
@@ -300,7 +291,7 @@ def _journal(args: argparse.Namespace) -> Journal:
     if args.out.suffix == ".parquet":
         need_pyarrow()
     if args.dask:
-        need_distributed()
+        needed("distributed", *OF_DASK)
     path = args.out if args.out.suffix == ".jsonl" else args.out.with_name(f"{args.out.name}.jsonl")
     if not args.resume and path.exists() and not args.force:
         raise UsageError(

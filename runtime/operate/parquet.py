@@ -5,7 +5,6 @@ pyarrow is imported when a file is written. A file is written whole or not at al
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.cli.finding import missing_extra
+from pans.runtime.cli.finding import needed
 from pans.runtime.core.plan import Plan
 from pans.runtime.outputs import whole_file
 from pans.runtime.record import Recording
@@ -22,11 +21,8 @@ from pans.runtime.record.tables import DECISIONS, facts_of, iter_decisions
 
 def need_pyarrow() -> Any:
     """Return pyarrow; UsageError that names the extra."""
-    try:
-        importlib.import_module("pyarrow.parquet")
-        return importlib.import_module("pyarrow")
-    except ImportError as error:
-        raise missing_extra("Parquet", "pyarrow", "parquet") from error
+    needed("pyarrow.parquet", "Parquet", "parquet")
+    return needed("pyarrow")
 
 
 def write_decisions(path: Path, recording: Recording, plan: Plan, *, force: bool = False) -> None:

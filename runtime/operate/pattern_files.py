@@ -74,17 +74,15 @@ def head_with_facts(bundle: Bundle) -> bytes:
         return bundle.head_onnx
     means = f"photons per exposure, 0 to {bundle.largest}" if bundle.largest > 1 else "clicks per exposure, 0 to 1"
     picture = bundle.picture_shape
+    gives = (
+        "scores of the classes; their softmax is the posterior" if picture is None else f"pixels of {picture}, by rows"
+    )
     said = {
         "name": bundle.name,
         "task": bundle.task,
         "classes": json.dumps(bundle.classes),
         "input": f"float32 (decisions, {bundle.n_features}): mean {means}, of each pattern in the bundle's order",
-        "output": f"float32 (decisions, {bundle.n_outputs}): "
-        + (
-            "scores of the classes; their softmax is the posterior"
-            if picture is None
-            else f"pixels of {picture}, by rows"
-        ),
+        "output": f"float32 (decisions, {bundle.n_outputs}): {gives}",
         "data_licence": str(bundle.provenance.get("data_licence", "")),
         "data_sha256": str(bundle.provenance.get("data_sha256", "")),
         "pans_version": __version__,

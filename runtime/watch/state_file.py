@@ -59,18 +59,17 @@ def read_state(path: Path) -> dict[str, Any] | None:
     return found if isinstance(found, dict) and found.get("format") == FORMAT else None
 
 
-def alarms_of(run: LiveRun) -> dict[str, int]:
-    """Return for each of ALARMS whether it lasts, 1 or 0; a change of the light lasts to the end of the run."""
-    guard: DarkGuard | None = getattr(run.core, "guard", None)
-    present = {} if guard is None else {finding.kind for finding in guard.serious}
-    return {kind: int(kind in present) for kind in ALARMS} | {"light": int(run.journal.counts["light_changed"] > 0)}
+def alarms_of(run: LiveRun) -> dict[str, dict[str, float]]:
+    """Return `alarms`, for each of ALARMS whether it lasts, 1 or 0, and `times_expected`, the dark rate over the expected one of each kind.
 
-
-def times_expected_of(run: LiveRun) -> dict[str, float]:
-    """Return the dark rate over the expected one, when it was found, of each kind of ALARMS that lasts; the highest of its channels."""
+    A change of the light lasts to the end of the run. A rate is that at the finding, of several channels the highest.
+    """
     guard: DarkGuard | None = getattr(run.core, "guard", None)
-    found = [] if guard is None else [one for one in guard.serious if one.expected > 0]
-    return {one.kind: one.rate / one.expected for one in sorted(found, key=lambda one: one.rate / one.expected)}
+    found = [] if guard is None else guard.serious
+    alarms = dict.fromkeys(ALARMS, 0) | {one.kind: 1 for one in found}
+    times = sorted((one.rate / one.expected, one.kind) for one in found if one.expected > 0)
+    alarms["light"] = int(run.journal.counts["light_changed"] > 0)
+    return {"alarms": alarms, "times_expected": {kind: ratio for ratio, kind in times}}
 
 
 def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float) -> dict[str, Any]:
@@ -110,8 +109,7 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         "dark_clicks": int(tallies[DARK_CLICKS]),
         **{key: ticks * run.plan.tick_us for key, ticks in exposed.items()},
         "reconnects": run.reconnects,
-        "alarms": alarms_of(run),
-        "times_expected": times_expected_of(run),
+        **alarms_of(run),
         "last_error": f"{trouble['kind']}: {words_of(trouble)}" if trouble else "",
     }
 
