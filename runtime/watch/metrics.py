@@ -41,7 +41,7 @@ FIGURES = {
     "disk_left_s": (
         "pans_disk_left_seconds",
         False,
-        "Until that disk is full at the rate of the last ten minutes; +Inf while that is not known or the disk does not fill up",
+        "Until that is full at the present rate; +Inf: not known, or never",
     ),
     "recording_bytes": ("pans_recording_bytes", False, "Size of the recording, or of its open part"),
     "host_clock_steps": ("pans_host_clock_steps", True, "Times the computer's clock was set during the run"),
@@ -52,12 +52,7 @@ LABELLED = {  # picture key -> (metric, counts up, label, help)
     "late_cause": ("pans_late_decisions_by_cause", True, "cause", "Late decisions by cause"),
     "lost_cause": ("pans_lost_exposures_by_cause", True, "cause", "Lost exposures by cause"),
     "alarms": ("pans_alarm", False, "kind", "1 while the detector in the dark, or the light, is not as it should be"),
-    "times_expected": (
-        "pans_alarm_times_expected",
-        False,
-        "kind",
-        "Dark rate over the expected one when an alarm began",
-    ),
+    "times_expected": ("pans_alarm_times_expected", False, "kind", "Dark rate over the expected one at the finding"),
 }
 
 
@@ -72,8 +67,7 @@ def parse_address(text: str, option: str = "--metrics") -> tuple[str, int]:
 
 def check_address(text: str, *, public: bool, option: str = "--metrics") -> str:
     """Return `text`; UsageError if it is no address, or one that other machines can reach without `public`."""
-    host, _ = parse_address(text, option)
-    if not (public or is_loopback(host)):
+    if not (is_loopback(parse_address(text, option)[0]) or public):
         raise UsageError(
             f"{option} {text}: other machines could read the figures there, and there is no password",
             remedy=f"use 127.0.0.1, or say {option}-public if that is meant",

@@ -59,7 +59,7 @@ def read_state(path: Path) -> dict[str, Any] | None:
     return found if isinstance(found, dict) and found.get("format") == FORMAT else None
 
 
-def alarms_of(run: LiveRun) -> dict[str, dict[str, float]]:
+def alarms_of(run: LiveRun) -> dict[str, dict[str, Any]]:
     """Return `alarms`, for each of ALARMS whether it lasts, 1 or 0, and `times_expected`, the dark rate over the expected one of each kind.
 
     A change of the light lasts to the end of the run. A rate is that at the finding, of several channels the highest.
