@@ -151,6 +151,7 @@ def test_a_run_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(
     assert state["ended"] == "stopped by SIGTERM"
     assert main([*fixed_run(4)]) in (0, 1)  # another one in the folder of the service's runs
     last = service(pans, "verify", "--name", "lab", code=None)["last_run"]
+    assert state["last_folder"] == Path(last["folder"]).name
     assert (last["verdict"], last["faults"]) == (state["verdict"], state["faults"])
     assert last["decisions"] == state["decisions"] == found["last_run"]["decisions"]
     capsys.readouterr()

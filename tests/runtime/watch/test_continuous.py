@@ -73,6 +73,9 @@ def test_a_run_knows_the_verdict_of_the_one_before(tmp_path: Path) -> None:
     assert json.loads(path.read_text())["faults"] == ["the light has changed"]
     assert run(()) == ["FAIL", "FAIL"]  # it ends without a verdict, as one that was killed
     assert run(("PASS",)) == ["cut", "PASS"]
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"recording": "/data/run-7/run-0001.pansrec"}))
+    with Watchers(RunOptions(state=path), None, None, Stop(continuous=True), None) as seen:
+        assert seen.look()["last_folder"] == "run-7"
 
 
 def test_metrics_are_served() -> None:
