@@ -51,11 +51,8 @@ POLL_S = 0.05
 NOT_THE_SERVICES = ("INVOCATION_ID", "JOURNAL_STREAM", "MAINPID")
 WATCHDOG = Range(16, 3600)  # a run that looks for its lost device may be silent for 15 s
 START = Range(1, 86400)
-RAN = (
-    EXIT_FINE,
-    EXIT_ALERT,
-    EXIT_TIMING,
-)  # exit codes of a run with a verdict: a busy computer does not make an installation wrong
+# exit codes of a run with a verdict: a busy computer does not make an installation wrong
+RAN = (EXIT_FINE, EXIT_ALERT, EXIT_TIMING)
 ANALYZE_S = 60
 MONITORING = ("prometheus.yml", "prometheus-alerts.yml", "grafana-dashboard.json")
 OF_ACTION = {  # options that have an effect with each action, beside --name, --user and --unit-dir
