@@ -348,6 +348,7 @@ class _Run:
             simulated=link.simulated,
             expected=self.expected_decisions,
             deadline_us=options.deadline_us,
+            late_allowed=options.late_allowed,
             exposure_tolerance_us=self.profile.exposure_tolerance_us(self.plan.exposure_us),
             trials=options.trials,
             illumination=self.bundle.illumination() * self.frames,

@@ -66,7 +66,8 @@ def _results(history: History) -> Iterator[Row]:
         part = f"; p99 takes {p99 / deadline:.0%} of {deadline:,.0f} us" if deadline else ""
         text = f"p50 {quantile_us(latency, 0.5):,.0f} us, p99 {p99:,.0f} us"
         yield Row("latency", f"{text}, longest {picture['latency_max_us']:,.0f} us{part}", level)
-    yield Row("late", f"{late:,} decisions", "bad" if late else "good")
+    allowed = float(begin.get("late_allowed", 0.0)) * done
+    yield Row("late", f"{late:,} decisions", "bad" if late > allowed else "note" if late else "good")
     gaps = f" in {picture['gaps']:,} gaps" if lost else ""
     yield Row("lost", f"{lost:,} exposures{gaps}", "bad" if lost else "good")
 

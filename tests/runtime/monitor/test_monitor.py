@@ -160,6 +160,8 @@ def test_what_is_wrong_is_marked_and_in_words() -> None:
     rows = {row.name: row for row in rows_of(history)}
     assert rows["late"].level == rows["lost"].level == rows["disk"].level == rows["latency"].level == "bad"
     assert rows["lost"].text == "7 exposures in 2 gaps"
+    history.begin["late_allowed"] = 0.06
+    assert next(row.level for row in rows_of(history) if row.name == "late") == "note"
     assert rows["accuracy"].text.startswith("50.0%, 95 % interval 36.6% to 63.4%")
     assert "0.03 per exposure" in rows["dark counts"].text
     assert not any("\x1b" in row.text or "\n" in row.text for row in rows.values())
