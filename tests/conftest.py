@@ -5,7 +5,6 @@ import os
 import signal
 import sys
 from importlib.util import find_spec
-from itertools import count
 from pathlib import Path
 
 import hypothesis
@@ -16,7 +15,7 @@ from tree import ROOT
 # these packages need the extra `train`
 TRAINER = ("adaptive", "baselines", "choose", "commands", "export", "model", "reproduce", "train", "test_processor.py")
 collect_ignore = [] if find_spec("torch") else [f"trainer/{name}" for name in TRAINER]
-TESTS, UNFREEZE = count(), gc.unfreeze
+FREEZE, UNFREEZE = gc.freeze, gc.unfreeze
 UNCOMPILED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 # `python -m pytest` puts the checkout on the path, and then `import runtime` would make a second copy of every class.
 sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != ROOT]
@@ -30,20 +29,20 @@ hypothesis.settings.load_profile("pans")
 def pytest_configure(config: pytest.Config) -> None:
     # A shell that starts the tests in the background lets them ignore Ctrl-C, and so every process that they start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    pytest.MonkeyPatch().setattr(gc, "unfreeze", lambda: None)
+    for name in ("freeze", "unfreeze"):
+        pytest.MonkeyPatch().setattr(gc, name, lambda: None)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    # A run collects garbage before it is armed: let it look at what was made since the last one, not at torch and 4000 tests.
-    if not next(TESTS) % 200:
-        UNFREEZE()
-        gc.collect()
-    gc.freeze()
+    # A run collects garbage before it is armed: let it look at what its test made, not at torch and 4000 tests.
+    gc.collect()
+    FREEZE()
 
 
 @pytest.fixture
-def unfreezing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a run froze is unfrozen behind it, as in any other process."""
+def freezing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run freezes and unfreezes, as in any other process."""
+    monkeypatch.setattr(gc, "freeze", FREEZE)
     monkeypatch.setattr(gc, "unfreeze", UNFREEZE)
 
 

@@ -142,7 +142,7 @@ def test_real_time_is_asked_for_with_a_device_and_not_with_a_simulated_one(
         assert ("sched_fifo" in run.realtime, "mlockall" in run.realtime) == (asked, asked)
 
 
-@pytest.mark.usefixtures("unfreezing")
+@pytest.mark.usefixtures("freezing")
 @pytest.mark.parametrize("wanted", [False, True])
 def test_the_realtime_set_up_is_undone(wanted: bool) -> None:
     interval = sys.getswitchinterval()
