@@ -122,11 +122,12 @@ def chart(
     bars: Sequence[Bars] = (),
     marks: Sequence[Mark] = (),
     heat: NDArray[np.float64] | None = None,
+    shades: str = "",
     height: int = HEIGHT,
 ) -> Any:
     """Return a chart as markup; `label` says in words what there is to see.
 
-    `heat`, float64 (rows, columns), fills the axes from their low ends on, in shades from 0 to its highest number; NaN stays empty.
+    `heat`, float64 (rows, columns), fills the axes from their low ends on, in `shades` from 0 to its highest number; NaN stays empty.
     """
     with _figure(label, height) as (figure, drawn):
         axes = figure.add_subplot()
@@ -138,7 +139,7 @@ def chart(
             axis.set_minor_formatter(lambda value, _: "")
             (axis.get_major_locator().set_params)(**({"numticks": 6} if one.log else {"nbins": 5}))
         if heat is not None:
-            _heat(figure, axes, (x.low, x.high, y.low, y.high), heat)
+            _heat(figure, axes, (x.low, x.high, y.low, y.high), heat, one_line(shades))
         else:
             axes.grid(axis="y")
             axes.set_axisbelow(True)
@@ -149,7 +150,7 @@ def chart(
             shape = axes.bar(edges[:-1], bar.heights, np.diff(edges), base, align="edge", color=ink)
             named, base = [*named, (shape, bar.name)], base + np.asarray(bar.heights)
         named += [(_curve(axes, curve), curve.name) for curve in curves]
-        for mark, dashes in zip(marks, cycle(((4, 3), (1.5, 2)))):
+        for mark, dashes in zip(marks, cycle(((4, 3), (1.5, 2), (7, 2, 1.5, 2)))):
             line = axes.axvline if mark.upright else axes.axhline
             named.append((line(mark.at, color=_INKS["bad"], ls=(0, dashes), lw=1), mark.name))
         if (told := [(artist, one_line(name)) for artist, name in named if name]) and (marks or len(told) > 1):
@@ -172,12 +173,13 @@ def _curve(axes: Any, curve: Curve) -> Any:
     return axes.plot(x, y, ls=_DASHES[curve.kind], color=colour, lw=1.8)[0]
 
 
-def _heat(figure: Any, axes: Any, extent: tuple[float, ...], heat: NDArray[np.float64]) -> None:
+def _heat(figure: Any, axes: Any, extent: tuple[float, ...], heat: NDArray[np.float64], title: str) -> None:
     colours = needed("matplotlib.colors").LinearSegmentedColormap.from_list("blues", BLUES)
     top = float(np.nanmax(heat)) if np.isfinite(heat).any() else 1.0
     shades = {"cmap": colours, "vmin": 0.0, "vmax": top or 1.0, "interpolation": "none"}
     image = axes.imshow(heat, extent=extent, origin="lower", aspect="auto", **shades)
     bar = figure.colorbar(image, ax=axes, pad=0.02, fraction=0.06, format=lambda value, _: number(value))
+    bar.set_label(title)
     bar.outline.set_visible(False)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -68,8 +68,9 @@ class Rates:
     each pattern and true class, `class_clicks` and `class_exposures` (channels, classes). A clock that went back adds to the first stretch.
     """
 
-    def __init__(self, plan: Plan, n_classes: int = 0) -> None:
-        self._plan = plan
+    def __init__(self, plan: Plan, n_classes: int = 0, wanted: Iterable[int] = ()) -> None:
+        self._plan, self._dark, self._wanted = plan, 0, sorted({*wanted})
+        self.dark_ticks: dict[int, int] = {}  # begin of each `wanted` dark exposure, by its number in the recording
         self._first: int | None = None
         walks, self.parallel = plan.automaton is not None, plan.mode == "parallel"
         self.n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
@@ -95,6 +96,11 @@ class Rates:
         sums = self.over.sums
         sums["dark clicks"] += np.bincount(where[dark], clicks[dark].sum(axis=1), BINS)
         sums["dark exposures"] += np.bincount(where[dark], minlength=BINS) * (self.n if self.parallel else 1)
+        begins = item.start_tick[dark]
+        for number in self._wanted:
+            if 0 <= number - self._dark < len(begins):
+                self.dark_ticks[number] = int(begins[number - self._dark])
+        self._dark += len(begins)
         lit, at, truth = clicks[~dark], where[~dark], self._classes(item.object[~dark])
         if self.parallel:
             for channel in range(lit.shape[1]):
@@ -142,26 +148,31 @@ class Rates:
         return (clicks, exposures, *wilson_interval(clicks, exposures)) if exposures else None
 
     def dark_over(self) -> dict[str, Any]:
-        """Return the dark rate over time with its interval, and when the run ended."""
+        """Return the dark rate over time with its interval, NaN without a click, its least and largest figure, and when the run ended.
+
+        The last stretch is one with the one before where it has not half as many dark exposures.
+        """
         total = float(self.over.sums["dark exposures"].sum())
         over = self.over.merged(int(np.clip(total / DARK_PER_BIN, 1, DARK_BINS)))
-        some, edges = over.sums["dark exposures"] > 0, self._edges(over)
-        clicks, exposures = over.sums["dark clicks"][some], over.sums["dark exposures"][some]
+        exposures = over.sums["dark exposures"]
+        firsts = np.flatnonzero(exposures)
+        firsts = firsts[:-1] if len(firsts) > 1 and 2 * exposures[firsts[-1]] < exposures[firsts[-2]] else firsts
+        edges = np.append(self._edges(over)[firsts], self._edges(over)[-1])
+        clicks, exposures = (np.add.reduceat(over.sums[f"dark {what}"], firsts) for what in ("clicks", "exposures"))
         low, high = np.array([wilson_interval(int(c), int(n)) for c, n in zip(clicks, exposures)]).T
-        middle, rate = ((edges[1:] + edges[:-1]) / 2)[some], clicks / exposures
-        return {"seconds": middle, "rate": rate, "low": low, "high": high, "end_s": float(edges[-1])}
+        rate = np.where(clicks > 0, clicks / exposures, np.nan)
+        ends = {
+            "least": float(low[low > 0].min(initial=high.max())),
+            "most": float(high.max()),
+            "end_s": float(edges[-1]),
+        }
+        return {"seconds": (edges[1:] + edges[:-1]) / 2, "rate": rate, "low": low, "high": high, **ends}
 
-    def begin_of(self, event: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a state of the detector in dark exposures with `begun_s` and `noticed_s`, seconds since the first exposure, about.
-
-        They are None where the recording has too few dark exposures: frames without an object may have told instead.
-        """
-        counts = np.cumsum(np.append(0.0, self.over.sums["dark exposures"][: self.over.used]))
-        counts /= self.n if self.parallel else 1
-        numbers = int(event["since_dark_exposure"]), int(event["dark_exposure"])
-        begun, noticed = np.interp(numbers, counts, self._edges(self.over)).tolist()
-        known = numbers[1] <= counts[-1]
-        return {**event, "begun_s": begun if known else None, "noticed_s": noticed if known else None}
+    def seconds_at(self, number: int) -> float | None:
+        """Return when a `wanted` dark exposure began, seconds since the first exposure; None where the recording does not have it."""
+        if self._first is None or number not in self.dark_ticks:
+            return None
+        return max(0, self.dark_ticks[number] - self._first) * self._plan.tick_us * 1e-6
 
     def of_state(self, state: int) -> str:
         """Return which share of the walks came to a state of the automaton, and how often it clicked."""

@@ -40,6 +40,8 @@ NO_TIME_US = 0.05  # p99 of the host's own time
 CONFIDENCE_BINS = 10
 _NOT_WALKED = int(DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE)
 NEVER_NS = 1 << 62
+_OF_A_STATE = ("since_dark_exposure", "channels")  # what tells which state is over
+PHASES = ("before it began", "until it was noticed", "from then on", "after it was over")
 _MARKS = ("device_end_ns", "arrival_ns", "arrival_ns", "decided_ns", "recorded_ns")  # of the ledger's stages
 _CURVES = {"link": "on the link", "decide": "in the host, to the decision", "record": "to the recorder"}
 F64 = NDArray[np.float64]
@@ -135,7 +137,9 @@ class Events:
         self._decisions = decisions
         self.kinds: Counter[str] = Counter()
         self.shown: list[Mapping[str, Any]] = []
-        self.dark: list[Mapping[str, Any]] = []  # states of the detector that began
+        self.dark: list[
+            dict[str, Any]
+        ] = []  # states of the detector that began; `over`: the dark exposure at which one ended
         self.late, self.lost = Counter[str](), Counter[str]()
         self.first_case: dict[str, str] = {}
 
@@ -146,8 +150,8 @@ class Events:
             self.kinds[kind] += 1
             if len(self.shown) < SHOWN and self.kinds[kind] <= OF_A_KIND and kind != "session":
                 self.shown.append(event)
-                if kind == "dark_state" and event.get("state") != "over" and "since_dark_exposure" in event:
-                    self.dark.append(event)
+                if kind == "dark_state" and "since_dark_exposure" in event:
+                    self._dark_state(event)
             if kind == "blame":
                 cause = str(event.get("cause", "?"))
                 self.first_case.setdefault(cause, sentence_of(event))
@@ -160,10 +164,69 @@ class Events:
             elif kind in ("gate_refused", "gate_expired") and "decision" in event:
                 self._decisions.add(kind, [int(event["decision"])])
 
+    def _dark_state(self, event: Mapping[str, Any]) -> None:
+        if event.get("state") != "over":
+            self.dark.append({**event, "over": None})
+        for one in self.dark:
+            if event.get("state") == "over" and all(one.get(key) == event.get(key) for key in _OF_A_STATE):
+                one["over"] = event["dark_exposure"]
+
     def causes(self) -> list[tuple[str, int, int, str]]:
         """Return cause, late decisions, lost exposures and the first case of each, the most frequent first."""
         both = (self.late + self.lost).most_common()
         return [(cause, self.late[cause], self.lost[cause], self.first_case[cause]) for cause, _ in both]
+
+
+# ---- what the detector was like ----
+
+
+def dark_states(recording: Recording, rates: Rates, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return states of the detector with `begun_s`, `noticed_s`, `over_s`, seconds since the first exposure, None where not known.
+
+    `phases` are the decisions before, between and after these moments; none where the device's clock has begun anew.
+    """
+    states = []
+    for one in found:
+        numbers = one["since_dark_exposure"], one["dark_exposure"] - 1, one["over"]
+        edges = [rates.dark_ticks[number] for number in numbers if number in rates.dark_ticks]
+        names = ("begun_s", "noticed_s", "over_s")
+        times = {name: None if number is None else rates.seconds_at(number) for name, number in zip(names, numbers)}
+        known = len(edges) >= 2 and edges == sorted(edges)
+        states.append({**one, **times, "phases": decisions_between(recording, edges) if known else []})
+    return states
+
+
+def decisions_between(recording: Recording, edges: Sequence[int]) -> list[dict[str, Any]]:
+    """Return the decisions before, between and after device ticks: how many, labelled, of known truth, right, and clicks of one.
+
+    The 95 % interval of the accuracy of labelled ones is Wilson's by distinct objects, TOLD_APART at most.
+    """
+    sums = np.zeros((len(edges) + 1, 5), np.int64)  # all, labelled, of known truth, right, clicks
+    objects = np.zeros((len(sums), TOLD_APART), np.bool_)
+    distinct = int(
+        (recording.summary.get("device") or {}).get("objects") or TOLD_APART
+    )  # then the first is shown again
+    for rows in together(recording.iter_decisions()):
+        phase = np.searchsorted(edges, rows["tick"], side="right")
+        labelled = (rows["flags"] & int(DecisionFlag.ABSTAINED)) == 0
+        known = labelled & (rows["truth"] >= 0)
+        columns = np.ones(len(rows)), labelled, known, known & (rows["label"] == rows["truth"]), rows["clicks"]
+        np.add.at(sums, phase, np.array(columns, np.int64).T)
+        objects[phase[known], rows["object"][known] % distinct % TOLD_APART] = True
+    found = []
+    for name, (n, labelled, known, right, clicks), seen in zip(PHASES, sums.tolist(), objects.sum(axis=1).tolist()):
+        ends = wilson_interval(right / known * seen, seen) if known else None
+        facts = {
+            "name": name,
+            "n": n,
+            "labelled": labelled,
+            "known": known,
+            "right": right,
+            "ends": ends,
+            "objects": seen,
+        }
+        found.append({**facts, "clicks": clicks / n if n else None})
+    return found
 
 
 # ---- latencies ----
@@ -254,13 +317,16 @@ def run_page(recording: Recording) -> bytes:
     plan, summary, config = recorded_plan(recording), recording.summary, recording.header["config"]
     classes = () if bundle is None else bundle.classes
     decisions = Decisions(config, recording.n_decisions, classes, first_decision(recording))
-    events, rates, ledger = Events(decisions), Rates(plan, len(classes)), ledger_of(recording.iter_timings())
+    events, ledger = Events(decisions), ledger_of(recording.iter_timings())
+    events.take(recording.events())
+    whole = first_decision(recording) == 0  # dark exposures are numbered in the run, not in its parts
+    moments = ((one["since_dark_exposure"], one["dark_exposure"] - 1, one["over"] or 0) for one in events.dark * whole)
+    rates = Rates(plan, len(classes), [int(number) for three in moments for number in three])
     walks = Walks(plan.automaton) if plan.automaton is not None else None
     for rows in together(recording.iter_decisions()):
         decisions.take(rows)
         if walks is not None:
             walks.take(rows)
-    events.take(recording.events())
     for item in iter_exposures(recording, plan):
         rates.take(item)
     stages = {name: ledger.stages[name].summary() for name in _CURVES}
@@ -286,7 +352,8 @@ def run_page(recording: Recording) -> bytes:
         walks=walks.facts(bundle, rates) if walks is not None and bundle is not None else None,
         walked=rows_of(summary, "walks"),
         rates=rates,
-        states=[rates.begin_of(event) for event in events.dark],
+        states=dark_states(recording, rates, events.dark),
+        timed=timed,
         latency=stage_rows({**told, **summary}) if timed else [],
         curve=latency_facts(ledger, float(budget_us) if budget_us else None) if timed else None,
         causes=events.causes(),
