@@ -27,6 +27,7 @@ BLUES = ("#eef3fa", "#5e94cd", "#08265c")  # light to dark, so that more is dark
 # A colour that stands for a variable of page.css, and is replaced by it.
 _INKS = {name: f"#fe01{place}0" for place, name in enumerate(("a", "b", "c", "d", "bad", "soft", "line"))}
 _DASHES = {"a": "-", "b": (0, (5, 2)), "c": (0, (1.5, 2)), "d": (0, (7, 2, 2, 2))}
+_POINTS = {"a": "o", "b": "X", "c": "_", "d": "D"}
 _STYLE = {
     **{"font.size": 13, "svg.fonttype": "none", "text.parse_math": False, "axes.spines.top": False, "axes.spines.right": False},
     **{"axes.edgecolor": _INKS["line"], "axes.labelcolor": _INKS["soft"], "text.color": _INKS["soft"]},
@@ -88,7 +89,7 @@ class Curve:
     x: ArrayLike
     y: ArrayLike
     name: str = ""
-    kind: str = "a"  # a to d: its colour and its stroke
+    kind: str = "a"  # a to d: its colour, stroke and points
     low: ArrayLike | None = None
     high: ArrayLike | None = None
     dots: bool = False
@@ -169,7 +170,7 @@ def _curve(axes: Any, curve: Curve) -> Any:
         else:
             axes.fill_between(x, low, high, color=colour, alpha=0.22, lw=0)
     if curve.dots or one:
-        return axes.plot(x, y, "o", color=colour, ms=4)[0]
+        return axes.plot(x, y, _POINTS[curve.kind], color=colour, ms=8 if curve.kind == "c" else 5)[0]
     return axes.plot(x, y, ls=_DASHES[curve.kind], color=colour, lw=1.8)[0]
 
 

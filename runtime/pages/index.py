@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -31,14 +30,13 @@ Run = Any  # of operate/runs.py, a package that comes later
 def index_page(root: Path, runs: Sequence[Run], beside: Path) -> bytes:
     """Return the page of the runs in `root`, the newest first, with links from the folder `beside`."""
     rows = [(run, run.summary, accuracy_interval(run.summary), _link(run, beside), _spark(run)) for run in runs]
-    trends = {name: _trend(runs, name) for name in ("accuracy", "dark", "clicks", "late")}
+    trends = {name: _trend(runs, name) for name in ("accuracy", "dark", "clicks_mean", "late")}
     return render("index.html", root=root, rows=rows, trends=trends, simulated=any(run.simulated for run in runs))
 
 
 def _link(run: Run, beside: Path) -> str:
-    """The relative address of the run's page, of its summary, or of its recording."""
-    pages = sorted(run.folder.glob("*.html"))
-    best = [*pages, *(one for end in (".md", ".pansrec") for one in run.files if one.suffix == end)]
+    """The relative address of the run's page, of its summary, or of its folder."""
+    best = [*sorted(run.folder.glob("*.html")), *(one for one in run.files if one.suffix == ".md")]
     return quote(os.path.relpath(best[0] if best else run.folder, beside).replace(os.sep, "/"))
 
 
@@ -80,23 +78,35 @@ def _figures(one: Mapping[str, Any]) -> dict[str, tuple[float, float, float]]:
         found["accuracy"] = (one["accuracy"], *ends)
     if dark.get("exposures"):
         found["dark"] = (dark["clicks"] / dark["exposures"], dark["low"], dark["high"])
-    if one.get("clicks_mean") is not None:
-        found["clicks"] = (one["clicks_mean"],) * 3
-    if one.get("decisions"):
-        found["late"] = (one["late"] / one["decisions"],) * 3
+    for name in ("clicks_mean", "late"):
+        if one.get(name) is not None and one.get("decisions"):
+            found[name] = (one[name] / (one["decisions"] if name == "late" else 1),) * 3
     return found
 
 
 def _trend(runs: Sequence[Run], name: str) -> dict[str, Any] | None:
-    """One figure of all runs over time; None where fewer than two know it."""
-    found = [(run.started.timestamp(), *some[name]) for run in runs if name in (some := _figures(run.summary))]
-    if len(found) < 2:
+    """One figure of all runs over time; None where fewer than two know it.
+
+    `parts`: those that passed and those that failed; `expected` of the dark rate; `top` is the largest figure, `least` that above 0.
+    """
+    some = sorted((run for run in runs if name in _figures(run.summary)), key=lambda run: run.started)
+    if len(some) < 2:
         return None
-    when, value, low, high = np.array(sorted(found)).T
+    when, value, low, high = np.array([(run.started.timestamp(), *_figures(run.summary)[name]) for run in some]).T
     unit, unit_s = next(one for one in UNITS if when[-1] - when[0] >= 2 * one[1] or one is UNITS[-1])
-    first, top = (
-        datetime.fromtimestamp(when[0]).astimezone(),
-        max(value.max(), np.median(high)),
-    )  # one short run hides no other
-    since = (when - when[0]) / unit_s
-    return {"unit": unit, "since": since, "first": first, "value": value, "low": low, "high": high, "top": float(top)}
+    since, failed = (when - when[0]) / unit_s, np.array([run.verdict == "FAIL" for run in some])
+    parts = {
+        what: [column[which] for column in (since, value, low, high)]
+        for what, which in (("passed", ~failed), ("failed", failed))
+    }
+    expected = np.array([(run.summary.get("dark") or {}).get("expected") or np.nan for run in some])
+    figures = np.concatenate([value, low, high, *[expected] * (name == "dark")])
+    ends = {"top": float(np.nanmax(figures)), "least": float(np.nanmin(figures[figures > 0], initial=1.0))}
+    return {
+        "unit": unit,
+        "since": since,
+        "first": some[0].started.astimezone(),
+        "parts": parts,
+        "expected": expected,
+        **ends,
+    }

@@ -163,6 +163,9 @@ def test_a_rise_of_the_dark_counts_is_told_with_its_begin_and_its_own_rate(tmp_p
     low, high = wilson_interval(phases[PHASES[0]][1], phases[PHASES[0]][0])  # each object once
     assert f"({100 * low:.1f} to {100 * high:.1f} %, {phases[PHASES[0]][0]} objects)" in shown
     assert f"{phases[PHASES[1]][0]} decisions were made before it was noticed" in shown
+    pans("report", tmp_path, "-o", tmp_path / "runs.html")
+    listed = words_of((tmp_path / "runs.html").read_text())
+    assert all(words in listed for words in (*told["faults"], f"expected {told['dark']['expected']:.3g}"))
 
 
 def test_advice_fits_the_most_frequent_cause_of_late_decisions() -> None:
@@ -238,7 +241,11 @@ def test_a_folder_of_runs_has_a_line_and_a_picture_each(demo: Path, tmp_path: Pa
     words = words_of(page)
     assert words.count(f"{100 * summary['accuracy']:.2f} %") == 2
     assert ("cut" in words, page.count('<td class="spark"><svg')) == (True, 3)
-    assert 'href="run%20%3C2%3E/run.pansrec"' in page
+    (tmp_path / "run <2>" / "summary.md").write_text("")
+    assert pans("report", tmp_path, "-o", tmp_path / "all.html", "--force")["kind"] == "runs"
+    page = (tmp_path / "all.html").read_text()
+    links = re.findall(r'href="(run[^"]*)"', page)
+    assert sorted(links) == ["run%20%3C0%3E", "run%20%3C1%3E", "run%20%3C2%3E/summary.md"]
     assert "accuracy of 2 runs" in page
     low, high = wilson_interval(summary["accuracy"] * 200, 200)
     assert f"{100 * low:.1f} to {100 * high:.1f} %" in words
