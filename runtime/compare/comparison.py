@@ -7,6 +7,7 @@ P-values of one comparison are corrected for their number (Holm), and 0.05 is th
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
@@ -52,6 +53,11 @@ class Side:
     decisions: NDArray[np.void] | None
     timings: NDArray[np.void] | None
     complete: bool
+
+    @property
+    def name(self) -> str:
+        """The name of its folder, or of its file."""
+        return self.path.resolve().parent.name if self.path.suffix == ".pansrec" else self.path.name
 
     @property
     def simulated(self) -> bool:
@@ -180,6 +186,8 @@ def changes_of(first: Side, second: Side) -> list[Change]:
 
 def _facts(side: Side) -> dict[str, str]:
     told = {"device": side.summary.get("device", {}), "deadline_us": side.summary.get("deadline_us")}
+    if told["device"].get("name") == side.header.get("device_url"):
+        told["device"] = {**told["device"], "name": None}  # which leaves it out
     return {
         name: text
         for name, text in flat({**side.header, **told})
@@ -214,7 +222,7 @@ def _findings(first: Side, second: Side, paired: bool) -> Iterator[Finding]:
     if (accuracy := _accuracy(sides, paired)) is not None:
         yield accuracy
     yield from _abstained(sides)
-    yield _clicks(sides)
+    yield _clicks(sides, paired)
     yield _untested("photons_mean", "photons per decision", _told(sides, "photons_mean"))
     shown, light = _told(sides, "illumination_mean"), _told(sides, "illumination")  # of an automaton the states shown
     yield _untested("illumination", "illumination per decision", [a if b is None else b for a, b in zip(light, shown)])
@@ -277,12 +285,17 @@ def _two_shares(name: str, shares: list[float], sizes: list[int], method: str) -
     return Finding(name, "share", shares[0], shares[1], *between, False, p, how)
 
 
-def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Finding:
+def _pairs(first: dict[int, float], second: dict[int, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What both say of the objects that are in both."""
     common = sorted(first.keys() & second.keys())
-    one, two = (np.array([shares[number] for number in common]) for shares in (first, second))
+    return np.array([first[number] for number in common]), np.array([second[number] for number in common])
+
+
+def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Finding:
+    one, two = _pairs(first, second)
     better, worse = int((one > two).sum()), int((one < two).sum())
-    method = f"pairs of {len(common)} objects: {better} better in A, {worse} better in B, McNemar exact"
-    between, p = statistics.paired_difference(one, two), statistics.mcnemar_exact(better, worse)
+    method = f"pairs of {len(one)} objects: {better} better in A, {worse} better in B, McNemar exact"
+    between, p = statistics.paired_difference(one, two, 1.0), statistics.mcnemar_exact(better, worse)
     return Finding("accuracy", "share", float(one.mean()), float(two.mean()), *between, False, p, method)
 
 
@@ -295,15 +308,22 @@ def _abstained(sides: Sides) -> Iterator[Finding]:
         yield _two_shares("abstained", shares, sizes, "two shares, the trials of an object count once")
 
 
-def _clicks(sides: Sides) -> Finding:
+def _clicks(sides: Sides, paired: bool) -> Finding:
     unit, shares = "clicks per decision", _of_objects(sides, lambda rows: rows["clicks"])
-    means = [np.array([*one.values()]) for one in shares]
+    paired = paired and len(shares) == 2
+    means = _pairs(*shares) if paired else [np.array([*one.values()]) for one in shares]
     if min(map(len, means), default=0) < 2:
         return _untested("clicks_mean", unit, _told(sides, "clicks_mean"))
-    (one, two), apart = means, float(means[0].mean() - means[1].mean())
+    one, two = means
+    apart, method = (
+        float(one.mean() - two.mean()),
+        f"means of {len(one)} and {len(two)} objects; interval by their spread",
+    )
     half = Z_95 * float(np.sqrt(one.var(ddof=1) / len(one) + two.var(ddof=1) / len(two)))
-    method = f"means of {len(one)} and {len(two)} objects; interval by their spread"
-    between = (apart, apart - half, apart + half)
+    between = statistics.Interval(apart, apart - half, apart + half)
+    if paired:
+        between = statistics.paired_difference(one, two)
+        method = f"pairs of {len(one)} objects; interval by the spread of their differences"
     return Finding("clicks_mean", unit, float(one.mean()), float(two.mean()), *between, False, None, method)
 
 
@@ -326,6 +346,7 @@ def _latencies(sides: Sides) -> Iterator[Finding]:
 
 SAME = "Bundle, profile, options and device are the same."
 CUT = "cut, no summary"
+LONG, SHOWN = 40, 160  # characters of a value in the terminal
 
 
 def value_of(finding: Finding, value: float | None) -> str:
@@ -368,12 +389,16 @@ def verdict_of(finding: Finding) -> str:
 
 
 def conclusion(comparison: Comparison) -> str:
-    """Return one sentence on what differs by more than chance."""
+    """Return in a sentence or two whether the verdicts differ, and what differs by more than chance."""
+    verdicts = [str(side.summary.get("verdict", CUT)) for side in (comparison.first, comparison.second)]
+    unlike = "" if verdicts[0] == verdicts[1] else "The verdicts differ: A {}, B {}. ".format(*verdicts)
     if not any(one.significant is not None for one in comparison.findings):
-        return "Nothing could be tested."
+        return f"{unlike}Nothing could be tested."
     differing = ", ".join(_title(one) for one in comparison.findings if one.significant)
     how = f"(p-values below {ALPHA:g} after a correction for their number, or 95 % intervals)"
-    return f"Larger than chance {how}: {differing}." if differing else f"No difference is larger than chance {how}."
+    return unlike + (
+        f"Larger than chance {how}: {differing}." if differing else f"No figure differs by more than chance {how}."
+    )
 
 
 def _title(finding: Finding) -> str:
@@ -385,26 +410,42 @@ def _row(one: Finding) -> tuple[str, str, str, str, str]:
     return _title(one), value_of(one, one.first), value_of(one, one.second), difference_of(one), verdict_of(one)
 
 
+def apart(first: str, second: str) -> tuple[str, str]:
+    """Return two texts, of long ones the parts that the other does not have.
+
+    >>> apart("sim:oled-qcmos?scene=fashion200&pace=fast&seed=1", "sim:oled-qcmos?scene=fashion200&pace=fast&seed=2&optics=gain=-15%")
+    ('… seed=1', '… seed=2 optics=gain=-15%')
+    """
+    if max(len(first), len(second)) <= LONG:
+        return first or "-", second or "-"
+    one, two = (re.split(r"[?&]|, ", text) for text in (first, second))
+    kept = [[part for part in parts if part not in other] for parts, other in ((one, two), (two, one))]
+    return " ".join(["…"] * (kept[0] != one) + kept[0]), " ".join(["…"] * (kept[1] != two) + kept[1])
+
+
 def comparison_words(comparison: Comparison) -> str:
     """Return all of it as lines for a terminal: results first, then what was different about the runs."""
-    sides = {"A": comparison.first, "B": comparison.second}
-    lines = [
-        *(["SIMULATED"] if any(side.simulated for side in sides.values()) else []),
-        *(f"{a}  {one_line(side.path)}: {one_line(side.summary.get('verdict', CUT))}" for a, side in sides.items()),
-        *("", conclusion(comparison)),
-        *(f"Objects: {'paired' if comparison.paired else 'two samples'}; {one_line(comparison.why)}", ""),
-        *("  {:<26}A {}, B {}; {}; {}".format(*_row(one)) for one in comparison.findings),
-        *("", "What changed:" if comparison.changes else SAME),
-    ]
+    lines = ["SIMULATED"] if comparison.first.simulated or comparison.second.simulated else []
+    for name, side in _sides(comparison).items():
+        lines.append(f"{name}  {one_line(side.path)}: {one_line(side.summary.get('verdict', CUT))}")
+        lines += [f"     {one_line(fault)}" for fault in side.summary.get("faults", ())]
+    lines += ["", conclusion(comparison)]
+    lines += [f"Objects: {'paired' if comparison.paired else 'two samples'}; {one_line(comparison.why)}", ""]
+    lines += ["  {:<26}A {}, B {}; {}; {}".format(*_row(one)) for one in comparison.findings]
+    lines += ["", "What changed:" if comparison.changes else SAME]
     for change in comparison.changes:
-        texts = (one_line(text or "-", 60) for text in (change.first, change.second))
+        texts = (one_line(text, SHOWN) for text in apart(change.first, change.second))
         lines.append(f"  {one_line(change.name)}: {' -> '.join(texts)}")
     return "\n".join(lines)
 
 
+def _sides(comparison: Comparison) -> dict[str, Side]:
+    return {"A": comparison.first, "B": comparison.second}
+
+
 def comparison_page(comparison: Comparison) -> bytes:
     """Return the page: results and their differences, curves of both sides, what was different about the runs, hashes at the end."""
-    sides = {"A": comparison.first, "B": comparison.second}
+    sides = _sides(comparison)
     return render(
         "compare.html",
         simulated=any(side.simulated for side in sides.values()),
@@ -429,4 +470,4 @@ def _curves(side: Side) -> dict[str, Any]:
     numbers.take(rows)
     deadline_us = side.summary.get("deadline_us")
     latency = None if is_virtual(ledger) else latency_facts(ledger, float(deadline_us) if deadline_us else None)
-    return {"accuracy": numbers.accuracy(), "classes": max(int(rows["truth"].max()) + 1, 2), "latency": latency}
+    return {"accuracy": numbers.accuracy(), "latency": latency}

@@ -38,12 +38,12 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
     return min(1.0, 2 * binomial_tail(max(only_first, only_second), only_first + only_second, 0.5))
 
 
-def paired_difference(first: F64, second: F64) -> Interval:
-    """Return the mean of `first - second` over pairs, with its 95 % interval by the spread of the pairs' differences."""
+def paired_difference(first: F64, second: F64, limit: float = math.inf) -> Interval:
+    """Return the mean of `first - second` over pairs, +-`limit` at most, with its 95 % interval by the spread of their differences."""
     differences = first - second
     mean = float(differences.mean())
-    half = Z_95 * float(differences.std(ddof=1)) / math.sqrt(len(differences)) if len(differences) > 1 else 1.0
-    return Interval(mean, max(mean - half, -1.0), min(mean + half, 1.0))
+    half = Z_95 * float(differences.std(ddof=1)) / math.sqrt(len(differences)) if len(differences) > 1 else limit
+    return Interval(mean, max(mean - half, -limit), min(mean + half, limit))
 
 
 def fisher_exact(right_1: int, n_1: int, right_2: int, n_2: int) -> float:

@@ -35,6 +35,10 @@ def test_the_same_objects_are_paired_and_counted(runs: Path, pans: Pans) -> None
     assert rows["accuracy"]["p"] == mcnemar_exact(better, worse)
     assert rows["accuracy"]["difference"] == pytest.approx((better - worse) / 80)
     assert rows["clicks_mean"]["first"] == pytest.approx(first["clicks"].mean())
+    apart = first["clicks"].astype(float) - second["clicks"]  # each object once, in the same order
+    error = 1.959964 * apart.std(ddof=1) / 80**0.5
+    ends = [rows["clicks_mean"][end] for end in ("low", "high")]
+    assert ends == pytest.approx([apart.mean() - error, apart.mean() + error])
     least = min((row for row in found["findings"] if row["p"] is not None), key=lambda row: row["p"])
     tested = sum(row["p"] is not None for row in found["findings"])
     assert tested > 1
@@ -50,7 +54,7 @@ def test_a_run_beside_itself_differs_in_nothing(runs: Path, pans: Pans) -> None:
     assert main(["compare", str(runs / "a"), str(runs / "a")]) == 0
     words = pans.said().out
     assert "Bundle, profile, options and device are the same." in words
-    assert "No difference is larger than chance" in words
+    assert "No figure differs by more than chance" in words
     assert words.startswith("SIMULATED")
 
 
@@ -61,7 +65,7 @@ def test_samples_where_nothing_says_that_the_objects_are_the_same(runs: Path) ->
     told["profile"] = {**second.header["profile"], "toml": "# other words"}
     later = replace(second, header={**second.header, **told})
     names = {change.name for change in compare(first, later).changes}
-    assert names == {"device_url", "device.name", "device.seed", "device.serial"}  # no date, no hash of its own
+    assert names == {"device_url", "device.seed", "device.serial"}  # no date, no hash of its own
     assert "80 and 80 distinct objects" in compare(first, second, "different").findings[0].method
     unnamed = replace(first, header={**first.header, "device_url": "sim:oled-qcmos"})  # the device tells its default
     assert "both runs show the scene" in compare(unnamed, second).why
@@ -95,12 +99,17 @@ def test_a_difference_is_that_of_the_figures_beside_it(runs: Path, tmp_path: Pat
     summary = dict(read_recording(runs / "a" / "run.pansrec").summary)
     for name, accuracy, abstained in (("a", 0.788, 3), ("b", 0.7575, 0)):
         told = {"accuracy": accuracy, "objects": 200, "decisions": 1000, "trials": 5, "abstained": abstained}
+        told |= {"verdict": "FAIL", "faults": ["it was <dark>"]} if name == "b" else {}
         (tmp_path / f"{name}.json").write_text(json.dumps(summary | told))
     words = ["compare", str(tmp_path / "a.json"), str(tmp_path / "b.json")]
     for row in pans(*words)["findings"]:
         assert row["difference_is"] in ("a - b", "a / b")
         if row["difference_is"] == "a - b" and row["difference"] is not None:
             assert row["difference"] == pytest.approx(row["first"] - row["second"])
+    assert main([*words, "-o", str(tmp_path / "page.html")]) == 0
+    for said in (pans.said().out, words_of((tmp_path / "page.html").read_text())):
+        assert "The verdicts differ: A PASS, B FAIL." in said
+        assert "it was <dark>" in said
 
 
 def test_a_cut_recording_is_compared_as_far_as_it_goes(runs: Path, tmp_path: Path) -> None:

@@ -67,9 +67,10 @@ def test_the_ratio_of_rates_has_the_interval_of_clopper_and_pearson() -> None:
 
 def test_paired_differences() -> None:
     one, two = np.array([1.0, 1.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0, 0.0])
-    found = statistics.paired_difference(one, two)
+    found = statistics.paired_difference(one, two, 1.0)
     half = 1.959964 * math.sqrt(1 / 3) / 2  # of 0, 1, 0, 1 the standard deviation is sqrt(1/3)
     assert (found.value, found.low, found.high) == pytest.approx((0.5, 0.5 - half, 1.0))
+    assert statistics.paired_difference(one, two).high == pytest.approx(0.5 + half)
 
 
 def test_holm_s_correction() -> None:
