@@ -18,7 +18,8 @@ from typing import Any
 
 LINE_MAX = 2000  # characters of one line of foreign text
 FILE_NAME_MAX = 100
-_MARKDOWN = re.compile(r"([\\`*_{}\[\]<>#|~&!$^])")  # no parentheses: they begin nothing without a bracket before them
+# no parentheses: they begin nothing without a bracket before them; neither does "_" within a word, nor "&" without ";"
+_MARKDOWN = re.compile(r"([\\`*{}\[\]<>#|~!$^]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])|&(?=#?\w+;))")
 _FORMULA = tuple("=+-@\t\r＝＋－＠")  # what spreadsheets take for a formula; the wide forms too
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?([eE][+-]?\d+)?")
 _NO_FILE_NAME = re.compile(r"[^A-Za-z0-9._-]+")
@@ -44,7 +45,11 @@ def _visible(text: str, kept: str = "") -> str:
 def markdown(value: Any, most: int = LINE_MAX) -> str:
     """Return `value` as one line that Markdown shows as it is, in a paragraph, a list or a cell of a table."""
     text = _MARKDOWN.sub(r"\\\1", one_line(value, most))
-    return re.sub(r"^(\s*)([-+=:.]|\d+[.)])", r"\1\\\2", text) if re.match(r"\s*([-+=:]|\d+[.)]\s)", text) else text
+    return (
+        re.sub(r"^(\s*)([-+=:.]|\d+[.)])", r"\1\\\2", text)
+        if re.match(r"\s*([-+](?=[-+\s]|$)|[=:]|\d+[.)]\s)", text)
+        else text
+    )
 
 
 def html(value: Any, most: int = 100 * LINE_MAX) -> str:

@@ -17,6 +17,7 @@ from pans.runtime import safe_text
 from pans.runtime.cli.finding import needed
 from pans.runtime.images import grey_png
 from pans.runtime.intervals import number
+from pans.runtime.report.summary import singular
 
 from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, span, whole
 
@@ -42,7 +43,12 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters |= {"number": number, "percent": percent, "seconds": seconds, "flat": flat}
+    found.filters |= {
+        "number": lambda value: number(float(f"{value:.3g}")),
+        "percent": percent,
+        "seconds": seconds,
+        "flat": flat,
+    }
     drawing = (chart, Axis, Bars, Curve, Mark, number, percent, seconds, span, whole)
     found.globals |= {one.__name__: one for one in drawing}
     # our own text, with what stands between backticks as code
@@ -85,11 +91,11 @@ def sentence_of(event: Mapping[str, Any]) -> str:
     'The device was found again after 812 ms (2 attempts).'
     """
     kind = str(event.get("kind", "?"))
-    facts = {key: _plain(value) for key, value in event.items()}
-    facts["doubt"] = "" if event.get("sure", True) else ", not surely"
+    facts = {key: value if isinstance(value, Mapping) else _plain(value) for key, value in event.items()}
+    facts["doubt"] = "" if event.get("sure", True) else ", not certain"
     try:
         said = words()["sentences"][f"{kind} {event['what']}" if kind == "blame" else kind].format_map(facts)
-        return str(said).replace("..", ".").strip()
+        return singular(str(said).replace("..", ".").strip())
     except (KeyError, IndexError, ValueError):
         rest = ", ".join(f"{key} {_plain(value)}" for key, value in event.items() if key != "kind")
         return f"{kind.replace('_', ' ')}{': ' if rest else ''}{rest}"

@@ -170,9 +170,11 @@ class Rates:
 
     def seconds_at(self, number: int) -> float | None:
         """Return when a `wanted` dark exposure began, seconds since the first exposure; None where the recording does not have it."""
-        if self._first is None or number not in self.dark_ticks:
-            return None
-        return max(0, self.dark_ticks[number] - self._first) * self._plan.tick_us * 1e-6
+        return self.since_begin(self.dark_ticks[number]) if number in self.dark_ticks else None
+
+    def since_begin(self, tick: int) -> float | None:
+        """Return the seconds from the first exposure to `tick`; None before it, as of a clock that has begun anew."""
+        return None if self._first is None or tick < self._first else (tick - self._first) * self._plan.tick_us * 1e-6
 
     def of_state(self, state: int) -> str:
         """Return which share of the walks came to a state of the automaton, and how often it clicked."""

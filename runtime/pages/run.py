@@ -18,17 +18,16 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.flow.matching import abort_reason
 from pans.runtime.intervals import wilson_interval
-from pans.runtime.monitor.figures import RISE_SEEN
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import iter_exposures
 from pans.runtime.record.parts import first_decision
 from pans.runtime.record.recording import together
 from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.report.words import rows_of, stage_rows
+from pans.runtime.report.words import dark_words, rows_of, stage_rows
 from pans.runtime.timing.ledger import LatencyHistogram, TimingLedger, upper_edge
 
 from .bundle import first_states, optics
-from .charts import Bars, Curve
+from .charts import Bars, Curve, seconds
 from .page import render, sentence_of, words
 from .rates import BINS, TOLD_APART, Rates, Stretches
 
@@ -116,6 +115,13 @@ class Decisions:
         top = float(np.sum([n for _, n in largest], axis=0).max()) if bars else 0.0
         return {"bars": bars, "edges": edges, "top": top, "width": over.width} if bars else None
 
+    def when(self, number: int) -> float | None:
+        """Return when a decision was made, seconds since the first one, about; None where the recording does not have it."""
+        some, at = np.flatnonzero(self.over.sums["decisions"]), number - self._first
+        if not 0 <= at < self.n or not len(some):
+            return None
+        return float(np.interp(at, (some + 0.5) * self.over.width - 0.5, self._seconds(self.over)[some]))
+
     def _seconds(self, over: Stretches) -> F64:
         """The mean time of each stretch."""
         return over.sums["seconds"] / np.maximum(over.sums["decisions"], 1)
@@ -169,7 +175,7 @@ class Events:
             self.dark.append({**event, "over": None})
         for one in self.dark:
             if event.get("state") == "over" and all(one.get(key) == event.get(key) for key in _OF_A_STATE):
-                one["over"] = event["dark_exposure"]
+                one["over"] = event["dark_exposure"] - 1
 
     def causes(self) -> list[tuple[str, int, int, str]]:
         """Return cause, late decisions, lost exposures and the first case of each, the most frequent first."""
@@ -336,7 +342,7 @@ def run_page(recording: Recording) -> bytes:
     confusion = passing["confusion"] if passing else decisions.confusion
     return render(
         "run.html",
-        rise_seen=RISE_SEEN,
+        told_dark=dark_words(summary.get("dark") or {}, calibrated=bool(summary.get("calibration"))),
         recording=recording,
         summary=summary,
         bundle=bundle,
@@ -359,8 +365,28 @@ def run_page(recording: Recording) -> bytes:
         causes=events.causes(),
         late=decisions.stacked({f"late {cause}": cause for cause in events.late}),
         noted=events.kinds,
-        sentences=[sentence_of(event) for event in events.shown],
+        sentences=[moment_of(event, decisions, rates) + sentence_of(event) for event in events.shown],
     )
+
+
+def moment_of(event: Mapping[str, Any], decisions: Decisions, rates: Rates) -> str:
+    """Return the seconds of the run at which an event was, by its tick, its decision or its dark exposure; "" where it has none."""
+    tick, number, dark = (
+        event.get("tick"),
+        event.get("decision", event.get("first_decision")),
+        event.get("dark_exposure"),
+    )
+    if tick is not None:
+        at = rates.since_begin(int(tick))
+    else:
+        at = (
+            rates.seconds_at(int(dark) - 1)
+            if dark is not None
+            else None
+            if number is None
+            else decisions.when(int(number))
+        )
+    return "" if at is None else f"{seconds(at)}: "
 
 
 def advice_on(fault: str, *, simulated: bool = False) -> str:

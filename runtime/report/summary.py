@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 MAX_VERDICTS = 20  # of a summary; the recording has them all
 FIRST_NAMED = 3  # late decisions
+_ONE = r"(?<![\d.,])1 (attempt|click|decision|exposure|gap|message|object|part|pulse|slot|time)s\b"
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +190,18 @@ def find_faults(
     if result.dark.alarm:
         faults.append(result.dark.alarm)
     faults += [event["words"] for event in result.dark.findings if event["level"] == "alarm"]
-    return faults
+    return [singular(fault) for fault in faults]
+
+
+def singular(text: str) -> str:
+    """Return a text of ours with the nouns behind a 1 in the singular.
+
+    >>> singular("1 exposures lost in 1 gaps, 21 times"), singular("1 late from decision 66 on")
+    ('1 exposure lost in 1 gap, 21 times', '1 late: decision 66')
+    """
+    text = re.sub(r"(?<![\d.,])1 (late|missing) from (decision|exposure) (\d+) on", r"1 \1: \2 \3", text)
+    text = re.sub(_ONE, r"1 \1", text)
+    return text.replace("1 message contradict ", "1 message contradicts ")
 
 
 def late_words(result: RunResult) -> str:

@@ -11,19 +11,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Formatter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.intervals import wilson_interval
+from pans.runtime.monitor.figures import dark_state
 from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown, one_line
 from pans.runtime.timing.ledger import STAGES
 from pans.runtime.timing.realtime import fault_words, load_average
 
-if TYPE_CHECKING:
-    from .summary import Summary
+from .summary import Summary, singular
 
 BUSY = 0.05  # of the time: who waits longer for a processor shares it with other programs
 UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host takes
@@ -96,7 +96,12 @@ def _further(facts: Facts) -> dict[str, Any]:
             "exposures": exposure_words(facts.get("exposure_timing", {})),
             "realtime": granted or "virtual time: nothing asked for",
             "page_faults": fault_words(facts.get("page_faults", {})),
+            "dark": dark_words(dark, calibrated=bool(facts.get("calibration"))),
         }
+        if facts["abstained"] and facts.get("accuracy") is not None and "passages" not in facts:
+            found["text"]["counted"] = "abstained decisions with a known truth count as not right"
+        if facts["lost"]:
+            found["text"]["gaps"] = "a mean over all decisions, those with missing exposures too"
     if dark.get("exposures"):
         found["dark_rate"] = dark["clicks"] / dark["exposures"]
     if stream.get("repeated"):
@@ -107,6 +112,18 @@ def _further(facts: Facts) -> dict[str, Any]:
         ]
         found |= {"repeats": stream["repeated"], "differing": f" ({', '.join(unlike)})" if unlike else ""}
     return found
+
+
+def dark_words(dark: Facts, *, calibrated: bool) -> str:
+    """Return how the dark counts of a whole run stand to what is expected, as the live view says it; "" after an alarm.
+
+    A calibrated rate is an interval, which the summary does not have: then only a rate that may be the expected one is judged.
+    """
+    if not dark.get("exposures") or not dark.get("expected") or dark.get("alarm") or dark.get("present"):
+        return ""
+    counts = {f"dark_{name}": dark[name] for name in ("exposures", "clicks", "expected")}
+    off, words, level = dark_state(counts | {"dark_high": dark["expected"]})
+    return words if level != "note" else "" if calibrated else off
 
 
 def _is_virtual(facts: Facts) -> bool:
@@ -165,7 +182,8 @@ def exposure_words(timing: Facts) -> str:
     if not timing.get("exposures"):
         return f"{'none ' if timing.get('announced') else 'not '}told by the device"
     start, length = (f"{timing[key]:+.3g} us" for key in ("worst_start_us", "worst_length_us"))
-    return f"start {start}, length {length} at most, of {timing['exposures']}; allowed {timing['tolerance_us']:.3g} us"
+    farthest = f"at most {start} off in start and {length} in length"
+    return f"{farthest}, of {timing['exposures']:,} exposures; allowed {timing['tolerance_us']:.3g} us"
 
 
 def accuracy_interval(facts: Facts) -> tuple[float, float] | None:
@@ -204,9 +222,14 @@ def write_markdown(
     facts = summary.as_json()
     simulated = "\n> **SIMULATED**: the clicks come from a simulated instrument, not from light.\n" * facts["simulated"]
     causes = [
-        (rows_of(one, "causes")[0][1], one["cause"], "yes" if one["sure"] else "no", one["why"])
+        (singular(rows_of(one, "causes")[0][1]), one["cause"], "yes" if one["sure"] else "no", one["why"])
         for one in facts["blame"]
     ]
+    totals, cut = (facts["late"], facts["lost"]), ""
+    shown = tuple(sum(one.get(what, 0) for one in facts["blame"]) for what in ("decisions", "exposures"))
+    if causes and shown != totals:
+        of = f"{shown[0]:,} of {totals[0]:,} late decisions and {shown[1]:,} of {totals[1]:,} lost exposures"
+        cut = f"The first {len(causes)} causes, of {of}; the recording has them all (`pans report`)."
     lines = [
         f"# Run of {markdown(run.get('bundle', 'a bundle'))}{' (SIMULATED)' if simulated else ''}",
         simulated,
@@ -216,6 +239,7 @@ def write_markdown(
         *_table("Timing", ("microseconds", *QUANTILES), [] if _is_virtual(facts) else stage_rows(facts)),
         *(f"- {name}: {markdown('; '.join(filter(None, texts)))}" for name, *texts in rows_of(facts, "timing")),
         *(_table("Late and missing work", ("what", "cause", "sure", "why"), causes) if causes else ()),
+        cut,
     ]
     if confusion.any():
         cells = [(name, *(str(n) if n else "·" for n in row)) for name, row in zip(classes, confusion.tolist())]

@@ -328,10 +328,10 @@ def fault_words(counts: Mapping[str, int]) -> str:
     """Return the counts in words.
 
     >>> fault_words({"minor": 12, "major": 0, "involuntary_switches": 3})
-    '12 minor, 0 major; the core was taken away 3 times'
+    '12 minor, 0 major; the loop lost its core 3 times'
     """
     if not counts:
         return "not told by this system"
     switches = counts.get("involuntary_switches", 0)
-    waited = f", which was waited for {counts['waited_ms']} ms" if "waited_ms" in counts else ""
-    return f"{counts.get('minor', 0)} minor, {counts.get('major', 0)} major; the core was taken away {switches} times{waited}"
+    waited = f", and waited {counts['waited_ms']} ms for one" if "waited_ms" in counts else ""
+    return f"{counts.get('minor', 0)} minor, {counts.get('major', 0)} major; the loop lost its core {switches} times{waited}"

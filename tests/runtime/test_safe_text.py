@@ -31,7 +31,8 @@ def test_lines_markdown_cells_and_file_names_are_inert(text: str, tmp_path: Path
         assert line.isprintable()
         assert len(line) <= most
     assert shown == text or not text.isprintable() or len(text) > safe_text.LINE_MAX
-    assert not re.search(r"(?<!\\)(?:\\\\)*[|<>`*_\[\]!&#$~]", marked)  # an odd number of backslashes before each
+    assert not re.search(r"(?<!\\)(?:\\\\)*[|<>`*\[\]!#$~]", marked)  # an odd number of backslashes before each
+    assert not re.search(r"(?<![\\a-zA-Z0-9])_|(?<!\\)_(?![a-zA-Z0-9])|(?<!\\)&#?\w+;", marked)
     assert not re.match(r"\s*([-+=]|\d+[.)])(\s|$)", marked)
     out = io.StringIO()
     csv.writer(out).writerow([safe_text.csv_cell(text), safe_text.csv_cell(-3), safe_text.csv_cell("-3.5e2"), "end"])

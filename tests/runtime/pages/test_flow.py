@@ -60,7 +60,7 @@ def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> Non
         link, host = events.causes()
         assert (link[:3], host[:3]) == (("link", 2, 7), ("host", 3, 0))
         assert f"Late from decision {first} on (2 decisions): the cause is link: w" in link[3]
-        assert f"Late from decision {first + 9} on (3 decisions): the cause is host, not surely: v" in host[3]
+        assert f"Late from decision {first + 9} on (3 decisions): the cause is host, not certain: v" in host[3]
         over, place = decisions.over, first - int(part["index"][0])
         assert over.sums["late link"].tolist() == np.bincount([place // over.width], [2], BINS).tolist()
         assert over.sums["late host"].tolist() == np.bincount([(place + 9) // over.width], [3], BINS).tolist()

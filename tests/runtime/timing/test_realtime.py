@@ -264,4 +264,4 @@ def hash_for(seconds: float, data: bytes) -> None:
 def test_words_say_when_the_system_does_not_tell() -> None:
     assert fault_words({}) == "not told by this system"
     counts = {"minor": 1, "major": 0, "involuntary_switches": 3, "waited_ms": 7}
-    assert fault_words(counts).endswith("taken away 3 times, which was waited for 7 ms")
+    assert fault_words(counts).endswith("lost its core 3 times, and waited 7 ms for one")
