@@ -22,7 +22,7 @@ from pans.runtime.container import parse_json_object, read_file
 from pans.runtime.errors import UsageError
 from pans.runtime.intervals import Z_95
 from pans.runtime.pages.page import flat, render, words
-from pans.runtime.pages.run import Decisions, is_virtual, latency_facts, ledger_of
+from pans.runtime.pages.run import Decisions, is_virtual, latency_curves, ledger_of
 from pans.runtime.record.parts import open_recording
 from pans.runtime.safe_text import one_line
 from pans.runtime.wire.messages import NO_OBJECT
@@ -465,9 +465,8 @@ def _curves(side: Side) -> dict[str, Any]:
     """What is drawn of one side: accuracy over time, latency unless time was virtual."""
     if side.decisions is None or side.timings is None or not len(side.decisions):
         return {}
-    rows, ledger = side.decisions, ledger_of([side.timings])
-    numbers = Decisions(side.header["config"], len(rows), first=int(rows["index"][0]))
-    numbers.take(rows)
-    deadline_us = side.summary.get("deadline_us")
-    latency = None if is_virtual(ledger) else latency_facts(ledger, float(deadline_us) if deadline_us else None)
-    return {"accuracy": numbers.accuracy(), "latency": latency}
+    ledger = ledger_of([side.timings])
+    numbers = Decisions(side.header["config"], len(side.decisions), first=int(side.decisions["index"][0]))
+    numbers.take(side.decisions)
+    latency = {} if is_virtual(ledger) else {"ledger": ledger, "curves": latency_curves(ledger)}
+    return {"accuracy": numbers.accuracy(), "budget_us": side.summary.get("deadline_us"), **latency}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pans.runtime import safe_text
 from pans.runtime.cli.finding import needed
 from pans.runtime.images import grey_png
-from pans.runtime.intervals import number
+from pans.runtime.intervals import number, wilson_interval
 from pans.runtime.report.summary import singular
 
 from .charts import Axis, Bars, Curve, Mark, chart, percent, seconds, span, whole
@@ -49,7 +49,7 @@ def _environment() -> Any:
         "seconds": seconds,
         "flat": flat,
     }
-    drawing = (chart, Axis, Bars, Curve, Mark, number, percent, seconds, span, whole)
+    drawing = (chart, Axis, Bars, Curve, Mark, number, percent, seconds, span, whole, wilson_interval)
     found.globals |= {one.__name__: one for one in drawing}
     # our own text, with what stands between backticks as code
     found.filters["coded"] = lambda text: markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", safe_text.html(text)))

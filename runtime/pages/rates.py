@@ -68,9 +68,11 @@ class Rates:
     each pattern and true class, `class_clicks` and `class_exposures` (channels, classes). A clock that went back adds to the first stretch.
     """
 
-    def __init__(self, plan: Plan, n_classes: int = 0, wanted: Iterable[int] = ()) -> None:
-        self._plan, self._dark, self._wanted = plan, 0, sorted({*wanted})
-        self.dark_ticks: dict[int, int] = {}  # begin of each `wanted` dark exposure, by its number in the recording
+    def __init__(self, plan: Plan, n_classes: int = 0, wanted: Iterable[int] = (), left_out: int = 0) -> None:
+        self._plan, self._dark, self._wanted, self._left_out = plan, 0, sorted({*wanted}), left_out
+        # begin of each `wanted` dark exposure by its number, `left_out` exposures behind a click not counted (as by core/dark_guard.py)
+        self.dark_ticks: dict[int, int] = {}
+        self._next, self._clicked = 0, -1  # number of the next exposure, and of the last one with a click
         self._first: int | None = None
         walks, self.parallel = plan.automaton is not None, plan.mode == "parallel"
         self.n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
@@ -96,7 +98,7 @@ class Rates:
         sums = self.over.sums
         sums["dark clicks"] += np.bincount(where[dark], clicks[dark].sum(axis=1), BINS)
         sums["dark exposures"] += np.bincount(where[dark], minlength=BINS) * (self.n if self.parallel else 1)
-        begins = item.start_tick[dark]
+        begins = item.start_tick[dark & (self._silent_before(item) >= self._left_out)]
         for number in self._wanted:
             if 0 <= number - self._dark < len(begins):
                 self.dark_ticks[number] = int(begins[number - self._dark])
@@ -115,6 +117,15 @@ class Rates:
             self._add(at, np.minimum(shown, self.n - 1), lit[:, 0], truth)
         while len(self._truths) > OBJECTS_KEPT:
             del self._truths[next(iter(self._truths))]
+
+    def _silent_before(self, item: Exposures) -> I64:
+        """How many exposures without a click are known directly before each; 0 where some are missing."""
+        number, clicked = item.number, np.where(item.clicks.any(axis=1), item.number, -1)
+        gap = np.diff(number, prepend=self._next - 1) != 1
+        self._clicked = self._clicked if number[0] >= self._next else -1  # another stream
+        last = np.maximum.accumulate(np.maximum(np.where(gap, number - 1, -1), np.append(self._clicked, clicked[:-1])))
+        self._next, self._clicked = int(number[-1]) + 1, int(max(last[-1], clicked[-1]))
+        return np.asarray(number - 1 - last, np.int64)
 
     def _classes(self, objects: I64) -> I64:
         """The true class of each object, -1 where it is not known."""
@@ -168,7 +179,7 @@ class Rates:
         }
         return {"seconds": (edges[1:] + edges[:-1]) / 2, "rate": rate, "low": low, "high": high, **ends}
 
-    def seconds_at(self, number: int) -> float | None:
+    def seconds_at(self, number: int | None) -> float | None:
         """Return when a `wanted` dark exposure began, seconds since the first exposure; None where the recording does not have it."""
         return self.since_begin(self.dark_ticks[number]) if number in self.dark_ticks else None
 

@@ -104,16 +104,17 @@ class Decisions:
         sums = {"mean": self.right / self.known, "objects": (min(counts), max(counts))}
         return {"seconds": self._seconds(over)[some], "share": share, **band, **sums}
 
-    def stacked(self, names: Mapping[str, str]) -> dict[str, Any] | None:
-        """Return sums over time, one upon the other, the largest first; `names`: sum -> its name. None where there is nothing."""
+    def stacked(self, prefix: str) -> dict[str, Any] | None:
+        """Return the sums whose names begin with `prefix` over time, one upon the other, the largest first; None without any."""
         over = self.over.merged(ACCURACY_BINS)
-        rows = {name: over.sums[key] for key, name in names.items() if over.sums.get(key, np.zeros(1)).any()}
+        rows = [(key.removeprefix(prefix), n) for key, n in over.sums.items() if key.startswith(prefix) and n.any()]
+        if not rows:
+            return None
         edges = np.append(np.minimum.accumulate(self._seconds(over)[::-1])[::-1], 0.0)
         edges[-1] = 2 * edges[-2] - edges[-3] if len(edges) > 2 else edges[-2] + 1.0
-        largest = sorted(rows.items(), key=lambda row: -float(row[1].sum()))
-        bars = [Bars(edges, n, f"{name} ({int(n.sum())})", kind) for (name, n), kind in zip(largest, "abcd")]
-        top = float(np.sum([n for _, n in largest], axis=0).max()) if bars else 0.0
-        return {"bars": bars, "edges": edges, "top": top, "width": over.width} if bars else None
+        rows.sort(key=lambda row: -float(row[1].sum()))
+        bars = [Bars(edges, n, f"{name} ({int(n.sum())})", kind) for (name, n), kind in zip(rows, "abcd")]
+        return {"bars": bars, "edges": edges, "top": float(sum(n for _, n in rows).max()), "width": over.width}
 
     def when(self, number: int) -> float | None:
         """Return when a decision was made, seconds since the first one, about; None where the recording does not have it."""
@@ -128,11 +129,10 @@ class Decisions:
 
     def pulses(self) -> dict[str, int]:
         """Return how many pulses were asked for, made, refused and expired; one without a refusal counts as made."""
-        asked, refused, expired = (
-            self.over.sums.get(name, np.zeros(BINS)) for name in ("asked", "gate_refused", "gate_expired")
-        )
-        self.over.sums["made"] = np.maximum(asked - refused - expired, 0.0)
-        found = {"asked": asked, "done": self.over.sums["made"], "refused": refused, "expired": expired}
+        sums, none = self.over.sums, np.zeros(BINS)
+        asked, refused, expired = (sums.get(name, none) for name in ("asked", "pulses refused", "pulses expired"))
+        sums["pulses done"] = np.maximum(asked - refused - expired, 0.0)
+        found = {"asked": asked, "done": sums["pulses done"], "refused": refused, "expired": expired}
         return {name: int(one.sum()) for name, one in found.items()}
 
 
@@ -143,9 +143,8 @@ class Events:
         self._decisions = decisions
         self.kinds: Counter[str] = Counter()
         self.shown: list[Mapping[str, Any]] = []
-        self.dark: list[
-            dict[str, Any]
-        ] = []  # states of the detector that began; `over`: the dark exposure at which one ended
+        # states of the detector that began; `over`: the dark exposure at which one ended
+        self.dark: list[dict[str, Any]] = []
         self.late, self.lost = Counter[str](), Counter[str]()
         self.first_case: dict[str, str] = {}
 
@@ -168,7 +167,7 @@ class Events:
                 else:
                     self.lost[cause] += int(event.get("exposures", 1))
             elif kind in ("gate_refused", "gate_expired") and "decision" in event:
-                self._decisions.add(kind, [int(event["decision"])])
+                self._decisions.add(kind.replace("gate_", "pulses "), [int(event["decision"])])
 
     def _dark_state(self, event: Mapping[str, Any]) -> None:
         if event.get("state") != "over":
@@ -187,7 +186,7 @@ class Events:
 
 
 def dark_states(recording: Recording, rates: Rates, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return states of the detector with `begun_s`, `noticed_s`, `over_s`, seconds since the first exposure, None where not known.
+    """Return states of the detector with `times` of begin, notice and end, seconds since the first exposure, None where not known.
 
     `phases` are the decisions before, between and after these moments; none where the device's clock has begun anew.
     """
@@ -195,44 +194,27 @@ def dark_states(recording: Recording, rates: Rates, found: Sequence[Mapping[str,
     for one in found:
         numbers = one["since_dark_exposure"], one["dark_exposure"] - 1, one["over"]
         edges = [rates.dark_ticks[number] for number in numbers if number in rates.dark_ticks]
-        names = ("begun_s", "noticed_s", "over_s")
-        times = {name: None if number is None else rates.seconds_at(number) for name, number in zip(names, numbers)}
-        known = len(edges) >= 2 and edges == sorted(edges)
-        states.append({**one, **times, "phases": decisions_between(recording, edges) if known else []})
+        phases = decisions_between(recording, edges) if len(edges) >= 2 and edges == sorted(edges) else []
+        states.append({**one, "times": [rates.seconds_at(number) for number in numbers], "phases": phases})
     return states
 
 
-def decisions_between(recording: Recording, edges: Sequence[int]) -> list[dict[str, Any]]:
-    """Return the decisions before, between and after device ticks: how many, labelled, of known truth, right, and clicks of one.
+def decisions_between(recording: Recording, edges: Sequence[int]) -> list[tuple[Any, ...]]:
+    """Return the decisions before, between and after device ticks: name, how many, labelled, of known truth, right, clicks of all, objects.
 
-    The 95 % interval of the accuracy of labelled ones is Wilson's by distinct objects, TOLD_APART at most.
+    `right` are labelled; `objects` those that differ among the labelled ones of known truth, TOLD_APART at most.
     """
-    sums = np.zeros((len(edges) + 1, 5), np.int64)  # all, labelled, of known truth, right, clicks
+    sums = np.zeros((len(edges) + 1, 5), np.int64)
     objects = np.zeros((len(sums), TOLD_APART), np.bool_)
-    distinct = int(
-        (recording.summary.get("device") or {}).get("objects") or TOLD_APART
-    )  # then the first is shown again
+    again = (recording.summary.get("device") or {}).get("objects") or TOLD_APART  # after these the first is shown again
     for rows in together(recording.iter_decisions()):
         phase = np.searchsorted(edges, rows["tick"], side="right")
         labelled = (rows["flags"] & int(DecisionFlag.ABSTAINED)) == 0
         known = labelled & (rows["truth"] >= 0)
         columns = np.ones(len(rows)), labelled, known, known & (rows["label"] == rows["truth"]), rows["clicks"]
         np.add.at(sums, phase, np.array(columns, np.int64).T)
-        objects[phase[known], rows["object"][known] % distinct % TOLD_APART] = True
-    found = []
-    for name, (n, labelled, known, right, clicks), seen in zip(PHASES, sums.tolist(), objects.sum(axis=1).tolist()):
-        ends = wilson_interval(right / known * seen, seen) if known else None
-        facts = {
-            "name": name,
-            "n": n,
-            "labelled": labelled,
-            "known": known,
-            "right": right,
-            "ends": ends,
-            "objects": seen,
-        }
-        found.append({**facts, "clicks": clicks / n if n else None})
-    return found
+        objects[phase[known], rows["object"][known] % again % TOLD_APART] = True
+    return [(name, *row, seen) for name, row, seen in zip(PHASES, sums.tolist(), objects.sum(axis=1).tolist())]
 
 
 # ---- latencies ----
@@ -252,13 +234,13 @@ def is_virtual(ledger: TimingLedger) -> bool:
     return ledger.stages["decide"].summary()["p99"] < NO_TIME_US
 
 
-def latency_facts(ledger: TimingLedger, deadline_us: float | None) -> dict[str, Any]:
-    """Return the shares of decisions above each time, in microseconds, with the deadline, and where the axes end."""
-    shown = {"end of exposure to decision": ledger.total, **{name: ledger.stages[name] for name in _CURVES}}
-    curves = [Curve(*survival(one), _CURVES.get(name, name), kind) for (name, one), kind in zip(shown.items(), "abcd")]
-    top = max([one.max_ns / 1000 for one in shown.values()] + [deadline_us or 0.0, 10.0]) * 1.3
-    least = 0.7 / max(ledger.total.total, 1)
-    return {"curves": curves, "deadline_us": deadline_us, "left": LEAST_US, "right": top, "least": least}
+def latency_curves(ledger: TimingLedger) -> list[Curve]:
+    """Return the shares of decisions above each time, in microseconds, of the whole latency and of its stages."""
+    shown = {
+        "end of exposure to decision": ledger.total,
+        **{text: ledger.stages[name] for name, text in _CURVES.items()},
+    }
+    return [Curve(*survival(one), name, kind) for (name, one), kind in zip(shown.items(), "abcd")]
 
 
 def survival(histogram: LatencyHistogram) -> tuple[F64, F64]:
@@ -274,7 +256,7 @@ class Walks:
     """How many whole walks had each number of exposures and of clicks, and what they said of themselves."""
 
     def __init__(self, automaton: Automaton) -> None:
-        self._automaton = automaton
+        self.automaton = automaton
         self.exposures, self.clicks = Counter[int](), Counter[int]()
         self.probability = 0.0  # their sum
         self.bins = np.zeros((3, CONFIDENCE_BINS))  # of those with label and truth: how many, probabilities, right ones
@@ -295,23 +277,12 @@ class Walks:
         n = self.bins[0].sum()
         return [(said / count, right / count, count / n) for count, said, right in self.bins.T.tolist() if count]
 
-    def facts(self, bundle: Bundle, rates: Rates) -> dict[str, Any]:
-        """Return what the page says of the walks; {} without any."""
-        n, bins, known = self.exposures.total(), self.reliability(), float(self.bins[0].sum())
-        if not n:
-            return {}
-        return {
-            "n": n,
-            "automaton": self._automaton,
-            "pictures": first_states(bundle, self._automaton, rates),
-            "lengths": self.exposures,
-            "clicks": self.clicks,
-            "probability": self.probability / n,
-            "bins": np.array(bins).T,
-            "error": sum(share * abs(right - said) for said, right, share in bins),
-            # if every stated probability were right: of a share of m decisions sqrt(2 p (1 - p) / (pi m))
-            "chance": sum(share * float(np.sqrt(2 * p * (1 - p) / (np.pi * share * known))) for p, _, share in bins),
-        }
+    def miscalibration(self) -> tuple[float, float]:
+        """Return by how much stated probabilities and shares of right ones differ, weighted by decisions, and how much by chance."""
+        bins, known = self.reliability(), float(self.bins[0].sum())
+        # if every stated probability were right: of a share of m decisions sqrt(2 p (1 - p) / (pi m))
+        chance = sum(share * float(np.sqrt(2 * p * (1 - p) / (np.pi * share * known))) for p, _, share in bins)
+        return sum(share * abs(right - said) for said, right, share in bins), chance
 
 
 # ---- the page ----
@@ -321,13 +292,14 @@ def run_page(recording: Recording) -> bytes:
     """Return the page of `recording`; a cut one is shown as far as it goes."""
     bundle = recording.bundle() if recording.bundle_place else None
     plan, summary, config = recorded_plan(recording), recording.summary, recording.header["config"]
-    classes = () if bundle is None else bundle.classes
-    decisions = Decisions(config, recording.n_decisions, classes, first_decision(recording))
+    classes, first = () if bundle is None else bundle.classes, first_decision(recording)
+    decisions = Decisions(config, recording.n_decisions, classes, first)
     events, ledger = Events(decisions), ledger_of(recording.iter_timings())
     events.take(recording.events())
-    whole = first_decision(recording) == 0  # dark exposures are numbered in the run, not in its parts
-    moments = ((one["since_dark_exposure"], one["dark_exposure"] - 1, one["over"] or 0) for one in events.dark * whole)
-    rates = Rates(plan, len(classes), [int(number) for three in moments for number in three])
+    states = events.dark if first == 0 else []  # dark exposures are numbered in the run, not in its parts
+    moments = [(one["since_dark_exposure"], one["dark_exposure"] - 1, one["over"] or 0) for one in states]
+    left_out = int(((config.get("dark") or {}).get("guard") or {}).get("afterpulses", 0))
+    rates = Rates(plan, len(classes), [int(number) for three in moments for number in three], left_out)
     walks = Walks(plan.automaton) if plan.automaton is not None else None
     for rows in together(recording.iter_decisions()):
         decisions.take(rows)
@@ -337,9 +309,8 @@ def run_page(recording: Recording) -> bytes:
         rates.take(item)
     stages = {name: ledger.stages[name].summary() for name in _CURVES}
     told = {"latency_us": ledger.total.summary(), "stage_latency_us": stages, "clock": {"worst_uncertainty_us": 0.0}}
-    budget_us, timed = summary.get("deadline_us") or config.get("deadline_us"), not is_virtual(ledger)
-    passing = _passing(recording, bundle, decisions)
-    confusion = passing["confusion"] if passing else decisions.confusion
+    timed, passing = not is_virtual(ledger), _passing(recording, bundle, decisions)
+    confusion = passing[1] if passing else decisions.confusion
     return render(
         "run.html",
         told_dark=dark_words(summary.get("dark") or {}, calibrated=bool(summary.get("calibration"))),
@@ -355,37 +326,26 @@ def run_page(recording: Recording) -> bytes:
         mistakes=mistakes(confusion, bundle),
         passing=passing,
         optics=optics(bundle, rates) if bundle is not None and plan.automaton is None else None,
-        walks=walks.facts(bundle, rates) if walks is not None and bundle is not None else None,
+        walks=walks if bundle is not None else None,
+        states_shown=first_states(bundle, walks.automaton, rates) if walks is not None and bundle is not None else [],
         walked=rows_of(summary, "walks"),
         rates=rates,
         states=dark_states(recording, rates, events.dark),
         timed=timed,
         latency=stage_rows({**told, **summary}) if timed else [],
-        curve=latency_facts(ledger, float(budget_us) if budget_us else None) if timed else None,
-        causes=events.causes(),
-        late=decisions.stacked({f"late {cause}": cause for cause in events.late}),
-        noted=events.kinds,
+        ledger=ledger,
+        curves_of=latency_curves,
+        budget_us=summary.get("deadline_us") or config.get("deadline_us"),
+        events=events,
         sentences=[moment_of(event, decisions, rates) + sentence_of(event) for event in events.shown],
     )
 
 
 def moment_of(event: Mapping[str, Any], decisions: Decisions, rates: Rates) -> str:
     """Return the seconds of the run at which an event was, by its tick, its decision or its dark exposure; "" where it has none."""
-    tick, number, dark = (
-        event.get("tick"),
-        event.get("decision", event.get("first_decision")),
-        event.get("dark_exposure"),
-    )
-    if tick is not None:
-        at = rates.since_begin(int(tick))
-    else:
-        at = (
-            rates.seconds_at(int(dark) - 1)
-            if dark is not None
-            else None
-            if number is None
-            else decisions.when(int(number))
-        )
+    found = {"tick": rates.since_begin, "decision": decisions.when, "first_decision": decisions.when}
+    found["dark_exposure"] = lambda number: rates.seconds_at(number - 1)
+    at = next((find(int(event[key])) for key, find in found.items() if key in event), None)
     return "" if at is None else f"{seconds(at)}: "
 
 
@@ -407,17 +367,11 @@ def mistakes(counts: NDArray[np.int64], bundle: Bundle | None) -> list[str]:
     return found
 
 
-def _passing(recording: Recording, bundle: Bundle | None, decisions: Decisions) -> dict[str, Any] | None:
-    """Of objects that passed by: what their decisions were worth, by a replay, as a cut recording or a part has no such figures."""
+def _passing(recording: Recording, bundle: Bundle | None, decisions: Decisions) -> tuple[Any, NDArray[np.int64]] | None:
+    """Of objects that passed by: rows and confusion of their decisions, by a replay, as a cut recording or a part has no such figures."""
     if "flow" not in recording.header["config"] or bundle is None:
         return None
     from pans.runtime.record.replaying import replayed_flow
 
     figures, confusion = replayed_flow(recording, bundle)
-    pulses, names = decisions.pulses(), [name for name in decisions.over.sums if name.startswith("outcome ")]
-    return {
-        "rows": rows_of(figures.as_json() | {"gates": pulses}, "flow"),
-        "confusion": confusion,
-        "outcomes": decisions.stacked({name: name.removeprefix("outcome ") for name in names}),
-        "pulses": decisions.stacked({"made": "done", "gate_refused": "refused", "gate_expired": "expired"}),
-    }
+    return rows_of(figures.as_json() | {"gates": decisions.pulses()}, "flow"), confusion

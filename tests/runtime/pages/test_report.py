@@ -106,6 +106,8 @@ def test_accuracy_over_time_counts_objects_once() -> None:
     over = found.accuracy()
     assert over is not None
     assert over["mean"] == pytest.approx(134 / 270)
+    assert [found.when(number) for number in (-1, 300)] == [None, None]
+    assert found.when(100) == pytest.approx(10.0, abs=0.2)  # 10 ticks of 10 ms each
     assert 0 < over["objects"][0] <= over["objects"][1] <= 43  # of 128 decisions in a stretch at most
     assert accuracy_over([]) == []
 
@@ -191,6 +193,8 @@ def test_events_become_sentences_and_foreign_ones_stay_whole() -> None:
     assert late.startswith("Decision 7 ")
     assert "23,456 us" in late
     assert sentence_of({"kind": "strange_thing", "x": "{y}"}) == "strange thing: x {y}"
+    part = {"kind": "part", "number": 7, "first_decision": 12, "deleted": {"parts": 3}, "place": {"heard": "AAAA"}}
+    assert sentence_of(part) == "Part 7 begins with decision 12; parts deleted by then: 3."
     blame = {"kind": "blame", "what": "missing", "exposures": 40, "cause": "device", "sure": False, "why": "a drop"}
     found = sentence_of(blame | {"first_exposure": 77})
     assert all(word in found for word in ("40", "77", "device, not certain", "a drop"))

@@ -50,9 +50,12 @@ def test_the_first_states_tell_what_was_shown_and_what_clicked(recording: Record
     plan, bundle = recorded_plan(recording), recording.bundle()
     states = shown_states(recording)
     times, clicks = Counter(state for state, _ in states), Counter(state for state, bit in states if bit)
-    rates = Rates(plan)
+    guard, watched = recording.header["config"]["dark"]["guard"], recording.summary["dark"]["channels"][0]["exposures"]
+    assert guard["afterpulses"] == 1  # an exposure behind a click is left out
+    rates = Rates(plan, wanted=(watched - 1, watched), left_out=guard["afterpulses"])
     for item in iter_exposures(recording, plan):
         rates.take(item)
+    assert [*rates.dark_ticks] == [watched - 1] != [recording.summary["dark"]["exposures"] - 1]
     pictures = first_states(bundle, plan.automaton, rates)
     assert len(pictures) == min(24, plan.automaton.n_states)
     for state, (name, _, lines) in enumerate(pictures):

@@ -13,7 +13,7 @@ from mutated_sessions import Stage
 
 from pans.runtime.cli import main
 from pans.runtime.report.summary import Summary, late_words
-from pans.runtime.report.words import accuracy_interval, closing_words, write_markdown
+from pans.runtime.report.words import accuracy_interval, closing_words, dark_words, write_markdown
 
 MEASURED = ("armed_after_s", "realtime", "page_faults", "recording", "report")  # of this machine and this run
 
@@ -147,7 +147,42 @@ def test_late_decisions_say_how_sure_the_cause_is_and_where_they_began(summary: 
     result.events[2]["sure"] = True
     assert "host 6, not always surely; link 2" in late_words(result)
     write_markdown(tmp_path / "s.md", replace(summary, blame=events), {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
-    assert "| 2 late from decision 7 on | host | no | it waited |" in (tmp_path / "s.md").read_text()
+    page = (tmp_path / "s.md").read_text()
+    assert "| 2 late from decision 7 on | host | no | it waited |" in page
+    assert "The first 4 causes, of 8 of 0 late decisions and 0 of 0 lost exposures;" in page
+    whole = replace(summary, blame=events[:1], late=2)
+    write_markdown(tmp_path / "t.md", whole, {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
+    assert "The first" not in (tmp_path / "t.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("clicks", "exposures", "expected", "words"),
+    [
+        (56, 2000, 0.015, "higher than expected, not yet sure"),
+        (0, 1801, 2.75e-5, "too few to judge: only a mean above 77.4 times"),  # Wilson 1927: 3.84 / (1801 + 3.84)
+        (30, 2000, 0.015, "as expected, a mean above 1.42 times"),
+        (0, 0, 0.015, ""),
+        (0, 1801, 0.0, ""),
+    ],
+)
+def test_dark_counts_of_a_run_are_judged_as_in_the_live_view(
+    summary: Summary, clicks: int, exposures: int, expected: float, words: str
+) -> None:
+    dark = {"clicks": clicks, "exposures": exposures, "expected": expected, "alarm": "", "present": ()}
+    found = dark_words(dark, calibrated=False)
+    assert found.startswith(words)
+    assert bool(found) == bool(words)
+    assert dark_words(dark | {"alarm": "look"}, calibrated=False) == ""
+    assert dark_words(dark, calibrated=True) == ("" if words.startswith("higher") else found)
+    said = closing_words(replace(summary, dark=replace(summary.dark, **dark)), "r", "s")
+    assert (f"dark counts   {words}" in said) == bool(words)
+
+
+def test_what_counts_as_not_right_and_what_is_incomplete_is_said(summary: Summary) -> None:
+    tally = replace(summary.tally, abstained=7, accuracy=0.5, objects=20)
+    said = closing_words(replace(summary, tally=tally, lost=3), "r", "s")
+    assert "abstained decisions with a known truth count as not right" in said
+    assert "abstained decisions" not in closing_words(replace(summary, tally=replace(tally, abstained=0)), "r", "s")
 
 
 def test_an_accuracy_has_an_interval_also_where_all_were_right() -> None:
