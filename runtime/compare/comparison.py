@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import parse_qs
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.container import parse_json_object, read_file
 from pans.runtime.errors import UsageError
-from pans.runtime.intervals import Z_95
+from pans.runtime.intervals import number
 from pans.runtime.pages.page import flat, render, words
 from pans.runtime.pages.run import Decisions, is_virtual, latency_curves, ledger_of
 from pans.runtime.record.parts import open_recording
@@ -97,8 +97,7 @@ def read_side(path: str | Path) -> Side:
 # ---- what is found ----
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(NamedTuple):
     """A fact that differs: its dotted name and what both sides say, "" where one says nothing."""
 
     name: str
@@ -160,7 +159,7 @@ class Comparison:
             "b": str(self.second.path),
             "paired": self.paired,
             "why": self.why,
-            "changes": [asdict(change) for change in self.changes],
+            "changes": [change._asdict() for change in self.changes],
             "findings": [finding.as_json() for finding in self.findings],
             "significant": [finding.name for finding in self.findings if finding.significant],
             "simulated": self.first.simulated or self.second.simulated,
@@ -315,15 +314,11 @@ def _clicks(sides: Sides, paired: bool) -> Finding:
     if min(map(len, means), default=0) < 2:
         return _untested("clicks_mean", unit, _told(sides, "clicks_mean"))
     one, two = means
-    apart, method = (
-        float(one.mean() - two.mean()),
-        f"means of {len(one)} and {len(two)} objects; interval by their spread",
-    )
-    half = Z_95 * float(np.sqrt(one.var(ddof=1) / len(one) + two.var(ddof=1) / len(two)))
-    between = statistics.Interval(apart, apart - half, apart + half)
     if paired:
-        between = statistics.paired_difference(one, two)
-        method = f"pairs of {len(one)} objects; interval by the spread of their differences"
+        between, method = statistics.paired_difference(one, two), f"pairs of {len(one)} objects"
+    else:
+        between, method = statistics.mean_difference(one, two), f"means of {len(one)} and {len(two)} objects"
+    method += "; interval by the spread of their differences" if paired else "; interval by their spread"
     return Finding("clicks_mean", unit, float(one.mean()), float(two.mean()), *between, False, None, method)
 
 
@@ -360,24 +355,19 @@ def value_of(finding: Finding, value: float | None) -> str:
 
 def difference_of(finding: Finding) -> str:
     """Return how far the sides are apart, with the 95 % interval where it is known."""
-    if finding.difference is None:
+    apart, low, high = finding.difference, finding.low, finding.high
+    if apart is None:
         return ""
-    if finding.is_ratio:
-        return _ratio(finding.difference, finding.low, finding.high)
-    scale, form, unit = (100, "+.2f", " points") if finding.unit == "share" else (1, "+.3g", "")
-    head = f"A − B = {scale * finding.difference:{form}}{unit}"
-    if finding.low is None or finding.high is None:
-        return head
-    return f"{head} ({scale * finding.low:{form}} to {scale * finding.high:{form}})"
-
-
-def _ratio(ratio: float, low: float | None, high: float | None) -> str:
-    if math.isnan(ratio):
+    if not finding.is_ratio:
+        scale, form, unit = (100, "+.2f", " points") if finding.unit == "share" else (1, "+.3g", "")
+        head = f"A − B = {scale * apart:{form}}{unit}"
+        return head if low is None or high is None else f"{head} ({scale * low:{form}} to {scale * high:{form}})"
+    if math.isnan(apart):
         return "none in either run"
-    head = "B has none" if math.isinf(ratio) else f"A is {ratio:.3g} times B"
+    head = "B has none" if math.isinf(apart) else f"A is {number(apart)} times B"
     if low is None or high is None:
         return head
-    return f"{head} ({f'at least {low:.3g} times' if math.isinf(high) else f'{low:.3g} to {high:.3g}'})"
+    return f"{head} ({f'at least {number(low)} times' if math.isinf(high) else f'{number(low)} to {number(high)}'})"
 
 
 def verdict_of(finding: Finding) -> str:
@@ -395,10 +385,9 @@ def conclusion(comparison: Comparison) -> str:
     if not any(one.significant is not None for one in comparison.findings):
         return f"{unlike}Nothing could be tested."
     differing = ", ".join(_title(one) for one in comparison.findings if one.significant)
+    head = "Larger than chance" if differing else "No figure differs by more than chance"
     how = f"(p-values below {ALPHA:g} after a correction for their number, or 95 % intervals)"
-    return unlike + (
-        f"Larger than chance {how}: {differing}." if differing else f"No figure differs by more than chance {how}."
-    )
+    return f"{unlike}{head} {how}{': ' if differing else ''}{differing}."
 
 
 def _title(finding: Finding) -> str:
@@ -426,7 +415,7 @@ def apart(first: str, second: str) -> tuple[str, str]:
 def comparison_words(comparison: Comparison) -> str:
     """Return all of it as lines for a terminal: results first, then what was different about the runs."""
     lines = ["SIMULATED"] if comparison.first.simulated or comparison.second.simulated else []
-    for name, side in _sides(comparison).items():
+    for name, side in zip("AB", (comparison.first, comparison.second)):
         lines.append(f"{name}  {one_line(side.path)}: {one_line(side.summary.get('verdict', CUT))}")
         lines += [f"     {one_line(fault)}" for fault in side.summary.get("faults", ())]
     lines += ["", conclusion(comparison)]
@@ -439,26 +428,12 @@ def comparison_words(comparison: Comparison) -> str:
     return "\n".join(lines)
 
 
-def _sides(comparison: Comparison) -> dict[str, Side]:
-    return {"A": comparison.first, "B": comparison.second}
-
-
 def comparison_page(comparison: Comparison) -> bytes:
     """Return the page: results and their differences, curves of both sides, what was different about the runs, hashes at the end."""
-    sides = _sides(comparison)
-    return render(
-        "compare.html",
-        simulated=any(side.simulated for side in sides.values()),
-        sides=sides,
-        comparison=comparison,
-        conclusion=conclusion(comparison),
-        rows=[_row(one) for one in comparison.findings],
-        methods=[f"{_title(one)}: {one.method}." for one in comparison.findings],
-        curves={name: _curves(side) for name, side in sides.items()},
-        changes=[(one.name, one.first or "-", one.second or "-") for one in comparison.changes],
-        same=SAME,
-        cut=CUT,
-    )
+    sides = {"A": comparison.first, "B": comparison.second}
+    rows, methods = zip(*((_row(one), f"{_title(one)}: {one.method}.") for one in comparison.findings))
+    facts = {"conclusion": conclusion(comparison), "rows": rows, "methods": methods, "same": SAME, "cut": CUT}
+    return render("compare.html", comparison=comparison, sides=sides, curves_of=_curves, **facts)
 
 
 def _curves(side: Side) -> dict[str, Any]:

@@ -46,6 +46,13 @@ def paired_difference(first: F64, second: F64, limit: float = math.inf) -> Inter
     return Interval(mean, max(mean - half, -limit), min(mean + half, limit))
 
 
+def mean_difference(first: F64, second: F64) -> Interval:
+    """Return the difference of the means of two samples, with its 95 % interval by their spreads."""
+    apart = float(first.mean() - second.mean())
+    half = Z_95 * math.sqrt(float(first.var(ddof=1)) / len(first) + float(second.var(ddof=1)) / len(second))
+    return Interval(apart, apart - half, apart + half)
+
+
 def fisher_exact(right_1: int, n_1: int, right_2: int, n_2: int) -> float:
     """Return the p-value of `right_1` of `n_1` against `right_2` of `n_2`."""
     total, n = right_1 + right_2, n_1 + n_2

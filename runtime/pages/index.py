@@ -85,28 +85,23 @@ def _figures(one: Mapping[str, Any]) -> dict[str, tuple[float, float, float]]:
 
 
 def _trend(runs: Sequence[Run], name: str) -> dict[str, Any] | None:
-    """One figure of all runs over time; None where fewer than two know it.
+    """One figure of all runs over time, as arrays (runs,); None where fewer than two know it.
 
-    `parts`: those that passed and those that failed; `expected` of the dark rate; `top` is the largest figure, `least` that above 0.
+    `expected` is that of the dark rate; `top` is the largest figure, `least` the least one above 0.
     """
     some = sorted((run for run in runs if name in _figures(run.summary)), key=lambda run: run.started)
     if len(some) < 2:
         return None
-    when, value, low, high = np.array([(run.started.timestamp(), *_figures(run.summary)[name]) for run in some]).T
+    when, *figures = np.array([(run.started.timestamp(), *_figures(run.summary)[name]) for run in some]).T
     unit, unit_s = next(one for one in UNITS if when[-1] - when[0] >= 2 * one[1] or one is UNITS[-1])
-    since, failed = (when - when[0]) / unit_s, np.array([run.verdict == "FAIL" for run in some])
-    parts = {
-        what: [column[which] for column in (since, value, low, high)]
-        for what, which in (("passed", ~failed), ("failed", failed))
-    }
-    expected = np.array([(run.summary.get("dark") or {}).get("expected") or np.nan for run in some])
-    figures = np.concatenate([value, low, high, *[expected] * (name == "dark")])
-    ends = {"top": float(np.nanmax(figures)), "least": float(np.nanmin(figures[figures > 0], initial=1.0))}
-    return {
+    dark = ((run.summary.get("dark") or {}).get("expected") if name == "dark" else None for run in some)
+    expected, failed = np.array([one or np.nan for one in dark]), np.array([run.verdict == "FAIL" for run in some])
+    every = np.array([*figures, expected])
+    ends = {"top": float(np.nanmax(every)), "least": float(np.nanmin(every[every > 0], initial=1.0))}
+    facts = {
         "unit": unit,
-        "since": since,
+        "since": (when - when[0]) / unit_s,
         "first": some[0].started.astimezone(),
-        "parts": parts,
         "expected": expected,
-        **ends,
     }
+    return facts | ends | {"figures": figures, "passed": ~failed, "failed": failed}

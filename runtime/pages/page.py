@@ -44,7 +44,7 @@ def _environment() -> Any:
         lstrip_blocks=True,
     )
     found.filters |= {
-        "number": lambda value: number(float(f"{value:.3g}")),
+        "number": number,
         "percent": percent,
         "seconds": seconds,
         "flat": flat,

@@ -323,7 +323,6 @@ def run_page(recording: Recording) -> bytes:
         decisions=decisions,
         accuracy=decisions.accuracy() if len(classes) > 1 else None,
         confusion=confusion if confusion.any() else None,
-        mistakes=mistakes(confusion, bundle),
         passing=passing,
         optics=optics(bundle, rates) if bundle is not None and plan.automaton is None else None,
         walks=walks if bundle is not None else None,
@@ -353,18 +352,6 @@ def advice_on(fault: str, *, simulated: bool = False) -> str:
     """Return what to do about a fault, of a `simulated` instrument or of another; "" where nothing is known."""
     found = next((one for one in words()["advice"] if one["words"] in fault), {"text": ""})
     return str(found.get("simulated", found["text"]) if simulated else found["text"])
-
-
-def mistakes(counts: NDArray[np.int64], bundle: Bundle | None) -> list[str]:
-    """Return the three most frequent confusions in words."""
-    wrong = counts.copy()
-    np.fill_diagonal(wrong, 0)
-    found = []
-    for truth, label in (divmod(int(pair), len(counts)) for pair in np.argsort(wrong, axis=None)[::-1][:3]):
-        if bundle is not None and wrong[truth, label]:
-            name, share = bundle.classes[truth], wrong[truth, label] / max(counts[truth].sum(), 1)
-            found.append(f"{name} taken for {bundle.classes[label]} ({share:.0%} of {name})")
-    return found
 
 
 def _passing(recording: Recording, bundle: Bundle | None, decisions: Decisions) -> tuple[Any, NDArray[np.int64]] | None:
