@@ -135,9 +135,8 @@ class Finding:
 
     def as_json(self) -> dict[str, Any]:
         """Return it JSON-able; what is not finite becomes None."""
-        facts = {
-            key: one if not isinstance(one, float) or math.isfinite(one) else None for key, one in asdict(self).items()
-        }
+        endless = [key for key, one in asdict(self).items() if isinstance(one, float) and not math.isfinite(one)]
+        facts = asdict(self) | dict.fromkeys(endless)
         return facts | {"difference_is": "a / b" if self.is_ratio else "a - b", "significant": self.significant}
 
 
@@ -185,13 +184,10 @@ def changes_of(first: Side, second: Side) -> list[Change]:
 
 def _facts(side: Side) -> dict[str, str]:
     told = {"device": side.summary.get("device", {}), "deadline_us": side.summary.get("deadline_us")}
-    if told["device"].get("name") == side.header.get("device_url"):
-        told["device"] = {**told["device"], "name": None}  # which leaves it out
-    return {
-        name: text
-        for name, text in flat({**side.header, **told})
-        if not {*name.split(".")} & {*_ALWAYS_DIFFERENT} and not name.startswith(_DERIVED)
-    }
+    facts = {name: text for name, text in flat({**side.header, **told}) if not name.startswith(_DERIVED)}
+    if facts.get("device.name") == facts.get("device_url"):
+        facts.pop("device.name", None)
+    return {name: text for name, text in facts.items() if not {*name.split(".")} & {*_ALWAYS_DIFFERENT}}
 
 
 def _pairing(first: Side, second: Side, pairing: str) -> tuple[bool, str]:

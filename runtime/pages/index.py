@@ -98,10 +98,5 @@ def _trend(runs: Sequence[Run], name: str) -> dict[str, Any] | None:
     expected, failed = np.array([one or np.nan for one in dark]), np.array([run.verdict == "FAIL" for run in some])
     every = np.array([*figures, expected])
     ends = {"top": float(np.nanmax(every)), "least": float(np.nanmin(every[every > 0], initial=1.0))}
-    facts = {
-        "unit": unit,
-        "since": (when - when[0]) / unit_s,
-        "first": some[0].started.astimezone(),
-        "expected": expected,
-    }
-    return facts | ends | {"figures": figures, "passed": ~failed, "failed": failed}
+    times = {"unit": unit, "since": (when - when[0]) / unit_s, "first": some[0].started.astimezone()}
+    return times | ends | {"figures": figures, "expected": expected, "passed": ~failed, "failed": failed}

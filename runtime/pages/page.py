@@ -43,12 +43,7 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters |= {
-        "number": number,
-        "percent": percent,
-        "seconds": seconds,
-        "flat": flat,
-    }
+    found.filters |= {one.__name__: one for one in (number, percent, seconds, flat)}
     drawing = (chart, Axis, Bars, Curve, Mark, number, percent, seconds, span, whole, wilson_interval)
     found.globals |= {one.__name__: one for one in drawing}
     # our own text, with what stands between backticks as code

@@ -172,12 +172,8 @@ class Rates:
         clicks, exposures = (np.add.reduceat(over.sums[f"dark {what}"], firsts) for what in ("clicks", "exposures"))
         low, high = np.array([wilson_interval(int(c), int(n)) for c, n in zip(clicks, exposures)]).T
         rate = np.where(clicks > 0, clicks / exposures, np.nan)
-        ends = {
-            "least": float(low[low > 0].min(initial=high.max())),
-            "most": float(high.max()),
-            "end_s": float(edges[-1]),
-        }
-        return {"seconds": (edges[1:] + edges[:-1]) / 2, "rate": rate, "low": low, "high": high, **ends}
+        found = {"seconds": (edges[1:] + edges[:-1]) / 2, "rate": rate, "low": low, "high": high, "end_s": edges[-1]}
+        return found | {"least": low[low > 0].min(initial=high.max()), "most": high.max()}
 
     def seconds_at(self, number: int | None) -> float | None:
         """Return when a `wanted` dark exposure began, seconds since the first exposure; None where the recording does not have it."""

@@ -114,7 +114,12 @@ class Decisions:
         edges[-1] = 2 * edges[-2] - edges[-3] if len(edges) > 2 else edges[-2] + 1.0
         rows.sort(key=lambda row: -float(row[1].sum()))
         bars = [Bars(edges, n, f"{name} ({int(n.sum())})", kind) for (name, n), kind in zip(rows, "abcd")]
-        return {"bars": bars, "edges": edges, "top": float(sum(n for _, n in rows).max()), "width": over.width}
+        return {
+            "bars": bars,
+            "edges": edges,
+            "top": float(np.sum([n for _, n in rows], axis=0).max()),
+            "width": over.width,
+        }
 
     def when(self, number: int) -> float | None:
         """Return when a decision was made, seconds since the first one, about; None where the recording does not have it."""
@@ -236,11 +241,11 @@ def is_virtual(ledger: TimingLedger) -> bool:
 
 def latency_curves(ledger: TimingLedger) -> list[Curve]:
     """Return the shares of decisions above each time, in microseconds, of the whole latency and of its stages."""
-    shown = {
-        "end of exposure to decision": ledger.total,
-        **{text: ledger.stages[name] for name, text in _CURVES.items()},
-    }
-    return [Curve(*survival(one), name, kind) for (name, one), kind in zip(shown.items(), "abcd")]
+    shown = [
+        (ledger.total, "end of exposure to decision"),
+        *((ledger.stages[key], text) for key, text in _CURVES.items()),
+    ]
+    return [Curve(*survival(one), name, kind) for (one, name), kind in zip(shown, "abcd")]
 
 
 def survival(histogram: LatencyHistogram) -> tuple[F64, F64]:
@@ -317,7 +322,6 @@ def run_page(recording: Recording) -> bytes:
         recording=recording,
         summary=summary,
         bundle=bundle,
-        header={key: value for key, value in recording.header.items() if key not in ("profile", "command")},
         reasons=[(fault, advice_on(str(fault), simulated=recording.simulated)) for fault in summary.get("faults", ())],
         tiles=rows_of(summary, "figures", *["timed"] * timed) if "verdict" in summary else [],
         decisions=decisions,

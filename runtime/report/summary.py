@@ -158,18 +158,13 @@ def find_faults(
     if result.reconnects:
         faults.append(f"the device was lost and found again {result.reconnects} times")
     if timing.late > late_allowed * tally.decisions:
-        half_us = timing.total.summary()["p50"]
-        short = (
-            f"; half of all decisions took more than {half_us:,.0f} us" if half_us * 1000 > timing.deadline_ns else ""
-        )
-        of = f" of {tally.decisions:,}" if late_allowed else ""
-        limit = f"{timing.deadline_ns / 1e6:g} ms" + (f", allowed {late_allowed * 100:g} %" if late_allowed else "")
-        faults.append(f"{timing.late}{of} decisions later than {limit} ({late_words(result)}){short}")
+        half_us, limit_ms = timing.total.summary()["p50"], timing.deadline_ns / 1e6
+        short = f"; half of all decisions took more than {half_us:,.0f} us" if half_us > 1000 * limit_ms else ""
+        of, allowed = (f" of {tally.decisions:,}", f", allowed {late_allowed * 100:g} %") if late_allowed else ("", "")
+        faults.append(f"{timing.late}{of} decisions later than {limit_ms:g} ms{allowed} ({late_words(result)}){short}")
     if stream["lost_exposures"]:
-        faults.append(
-            f"{stream['lost_exposures']} exposures lost in {stream['gaps']} gaps, "
-            f"{stream['device_drops']} of them dropped by the device"
-        )
+        dropped = f"{stream['device_drops']} of them dropped by the device"
+        faults.append(f"{stream['lost_exposures']} exposures lost in {stream['gaps']} gaps, {dropped}")
     if stream["lost_messages"] and not stream["lost_exposures"]:
         faults.append(f"{stream['lost_messages']} messages lost, which held no exposures: marks of objects")
     if contradictions := contradictions_of(result):
@@ -217,20 +212,15 @@ def late_words(result: RunResult) -> str:
 def exposure_fault(timing: Mapping[str, Any], received: int = 0) -> str:
     """Return what is wrong with when the `received` exposures happened, as the device told; "" if nothing is, or it need not tell."""
     if timing.get("announced") and received and not timing["exposures"]:
-        return (
-            f"the device announces EXPOSED, and told of none of {received} exposures: pans conform --rule 15.1 tries it"
-        )
+        told = f"the device announces EXPOSED, and told of none of {received} exposures"
+        return f"{told}: pans conform --rule 15.1 tries it"
     if timing.get("within") is not False:
         return ""
     allowed_us = timing["tolerance_us"]
-    off = " and ".join(
-        f"the {what} of exposure {timing[f'worst_{what}_exposure']} was {timing[f'worst_{what}_us']:+.3g} us off"
-        for what in ("start", "length")
-        if abs(timing[f"worst_{what}_us"]) > allowed_us
-    )
-    return (
-        f"{off}, allowed {allowed_us:.3g} us (timing.exposure_tolerance_us): pans conform --rule 15.2 tries the device"
-    )
+    worst = ((what, timing[f"worst_{what}_exposure"], timing[f"worst_{what}_us"]) for what in ("start", "length"))
+    farther = (f"the {what} of exposure {n} was {us:+.3g} us off" for what, n, us in worst if abs(us) > allowed_us)
+    allowed = f"allowed {allowed_us:.3g} us (timing.exposure_tolerance_us)"
+    return f"{' and '.join(farther)}, {allowed}: pans conform --rule 15.2 tries the device"
 
 
 def contradictions_of(result: RunResult) -> dict[str, int]:

@@ -36,10 +36,7 @@ Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 def closing_words(summary: Summary, recording: str, report: str) -> str:
     """The lines that the command ends with."""
     facts = summary.as_json()
-    last = [
-        *(("fault", fault, "") for fault in facts["faults"]),
-        *(("busy", words, "") for words in _busy_words(facts)),
-    ]
+    last = [("fault", fault, "") for fault in facts["faults"]] + [("busy", words, "") for words in _busy_words(facts)]
     last += [("recording", recording, ""), ("report", report, "")]
     simulated = "SIMULATED · " * facts["simulated"]
     head = f"{simulated}{facts['verdict']}: {facts['decisions']} decisions ({objects_words(facts)})"
@@ -105,12 +102,9 @@ def _further(facts: Facts) -> dict[str, Any]:
     if dark.get("exposures"):
         found["dark_rate"] = dark["clicks"] / dark["exposures"]
     if stream.get("repeated"):
-        unlike = [
-            f"{stream[f'repeats_{what}']} {what}"
-            for what in ("differing", "unchecked")
-            if stream.get(f"repeats_{what}")
-        ]
-        found |= {"repeats": stream["repeated"], "differing": f" ({', '.join(unlike)})" if unlike else ""}
+        counts = ((stream.get(f"repeats_{what}"), what) for what in ("differing", "unchecked"))
+        unlike = ", ".join(f"{n} {what}" for n, what in counts if n)
+        found |= {"repeats": stream["repeated"], "differing": f" ({unlike})" if unlike else ""}
     return found
 
 
@@ -221,12 +215,10 @@ def write_markdown(
     """Write the summary as Markdown; UsageError if it exists, unless `force`. `run`: name -> text about what was run."""
     facts = summary.as_json()
     simulated = "\n> **SIMULATED**: the clicks come from a simulated instrument, not from light.\n" * facts["simulated"]
-    causes = [
-        (singular(rows_of(one, "causes")[0][1]), one["cause"], "yes" if one["sure"] else "no", one["why"])
-        for one in facts["blame"]
-    ]
-    totals, cut = (facts["late"], facts["lost"]), ""
-    shown = tuple(sum(one.get(what, 0) for one in facts["blame"]) for what in ("decisions", "exposures"))
+    blame, totals, cut = facts["blame"], (facts["late"], facts["lost"]), ""
+    what = (singular(rows_of(one, "causes")[0][1]) for one in blame)
+    causes = [(text, one["cause"], "yes" if one["sure"] else "no", one["why"]) for text, one in zip(what, blame)]
+    shown = tuple(sum(one.get(what, 0) for one in blame) for what in ("decisions", "exposures"))
     if causes and shown != totals:
         of = f"{shown[0]:,} of {totals[0]:,} late decisions and {shown[1]:,} of {totals[1]:,} lost exposures"
         cut = f"The first {len(causes)} causes, of {of}; the recording has them all (`pans report`)."
