@@ -115,8 +115,9 @@ def dark_words(dark: Facts, *, calibrated: bool) -> str:
     """
     if not dark.get("exposures") or not dark.get("expected") or dark.get("alarm") or dark.get("present"):
         return ""
-    counts = {f"dark_{name}": dark[name] for name in ("exposures", "clicks", "expected")}
-    off, words, level = dark_state(counts | {"dark_high": dark["expected"]})
+    watched = dark.get("channels") or (dark,)  # which leaves out afterpulses
+    counts = {f"dark_{name}": sum(row[name] for row in watched) for name in ("exposures", "clicks")}
+    off, words, level = dark_state(counts | dict.fromkeys(("dark_expected", "dark_high"), dark["expected"]))
     return words if level != "note" else "" if calibrated else off
 
 

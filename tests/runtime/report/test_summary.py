@@ -171,6 +171,8 @@ def test_dark_counts_of_a_run_are_judged_as_in_the_live_view(
     dark = {"clicks": clicks, "exposures": exposures, "expected": expected, "alarm": "", "present": ()}
     found = dark_words(dark, calibrated=False)
     assert found.startswith(words)
+    more = {"exposures": 2 * exposures, "clicks": 9 * clicks, "channels": [dark]}  # with what is behind a click, too
+    assert dark_words(dark | more, calibrated=False) == found
     assert bool(found) == bool(words)
     assert dark_words(dark | {"alarm": "look"}, calibrated=False) == ""
     assert dark_words(dark, calibrated=True) == ("" if words.startswith("higher") else found)
