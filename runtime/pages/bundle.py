@@ -45,13 +45,9 @@ def optics(bundle: Bundle, rates: Rates | None = None) -> dict[str, Any]:
     values = bundle.patterns() if bundle.analyser is None else np.abs(bundle.analyser.matrix).astype(np.float64)
     if bundle.analyser is not None:
         what, unit = "row", "modulus of W"
-    pictures = []
-    for number, value in enumerate(values.reshape(-1, *bundle.image_shape)[:PATTERNS_MAX]):
-        lines = [] if rates is None else rates.meaning(number, bundle.classes)
-        if bundle.analyser is None:
-            lines.append(f"light {value.sum():.4g}, brightest pixel {value.max():.3g}")
-        pictures.append((f"{what} {number}", picture(value), lines))
-    return {"pictures": pictures, "n": len(values), "unit": unit, "bundle": bundle, "measured": rates is not None}
+    found = values.reshape(-1, *bundle.image_shape)[:PATTERNS_MAX]
+    pictures = [(f"{what} {number}", picture(value), value) for number, value in enumerate(found)]
+    return {"pictures": pictures, "n": len(values), "unit": unit, "bundle": bundle, "rates": rates}
 
 
 def first_states(bundle: Bundle, automaton: Automaton, rates: Rates | None = None) -> list[tuple[str, str, list[str]]]:

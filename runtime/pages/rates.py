@@ -15,8 +15,6 @@ from pans.runtime.record.exposures import Exposures, is_dark
 HEAT_BINS, EXPOSURES_PER_BIN = 120, 25  # of each pattern: a rate from fewer is noise
 DARK_BINS, DARK_PER_BIN = 40, 200
 OBJECTS_KEPT = 1 << 14  # whose true class is remembered: the exposures of an object come soon after its mark
-CLASSES_NAMED = 2
-LEAST_EXPOSURES = 20  # of a class, before anything is said about it
 BINS = 128
 TOLD_APART = 4096  # objects of a stretch that follow one another in number: an interval counts no more of them
 F64 = NDArray[np.float64]
@@ -188,20 +186,3 @@ class Rates:
         exposures, clicks = float(self.state_exposures[state]), float(self.state_clicks[state])
         share = f"{100 * exposures / max(float(self.state_exposures[0]), 1.0):.0f} % of the walks"
         return f"{share}, clicked in {100 * clicks / exposures:.0f} %" if exposures else "never shown"
-
-    def meaning(self, number: int, classes: tuple[str, ...]) -> list[str]:
-        """Return how often pattern `number` clicked, and with which classes most and least often: counted, not modelled."""
-        exposures, clicks = (int(self.over.sums[name][:, number].sum()) for name in ("exposures", "clicks"))
-        if not exposures:
-            return ["never shown"]
-        low, high = wilson_interval(clicks, exposures)
-        lines = [f"clicked in {100 * clicks / exposures:.1f} % of exposures ({100 * low:.1f} to {100 * high:.1f} %)"]
-        if number >= len(self.class_exposures) or self.class_exposures.shape[1] != len(classes):
-            return lines
-        seen = self.class_exposures[number]
-        known = np.flatnonzero(seen >= LEAST_EXPOSURES)
-        if len(known) < 2:
-            return lines
-        share = self.class_clicks[number] / np.maximum(seen, 1)
-        named = [f"{classes[one]} {100 * share[one]:.0f} %" for one in known[np.argsort(-share[known])]]
-        return [*lines, f"most with {', '.join(named[:CLASSES_NAMED])}", f"least with {named[-1]}"]
