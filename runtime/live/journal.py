@@ -33,7 +33,7 @@ def words_of(event: dict[str, Any]) -> str:
         return found
     first = event.get("first_decision")
     where = "" if first is None else f" (from decision {first})"
-    return f"{event['cause']}{'' if event['sure'] else ', not surely'}: {found}{where}"
+    return f"{event['cause']}{'' if event['sure'] else ', not certain'}: {found}{where}"
 
 
 class Journal:

@@ -203,7 +203,7 @@ def late_words(result: RunResult) -> str:
     """Return the causes of late decisions, the most frequent first, how far the evidence shows them, and the first late decisions."""
     found = [event for event in result.events if event["kind"] == "blame" and event["what"] == "late"]
     sure = {cause: [bool(event["sure"]) for event in found if event["cause"] == cause] for cause in result.late_cause}
-    doubts = {c: ", not surely" if not any(one) else ", not always surely" for c, one in sure.items() if not all(one)}
+    doubts = {c: ", not certain" if not any(one) else ", not always certain" for c, one in sure.items() if not all(one)}
     causes = (f"{cause} {n}{doubts.get(cause, '')}" for cause, n in Counter(result.late_cause).most_common())
     first = ", ".join(str(event["first_decision"]) for event in found[:FIRST_NAMED])
     return f"cause: {'; '.join(causes)}{f'; first at decision {first}' if found else ''}"

@@ -172,7 +172,7 @@ def test_a_rise_of_the_dark_counts_is_told_with_its_begin_and_its_own_rate(tmp_p
 
 def test_advice_fits_the_most_frequent_cause_of_late_decisions() -> None:
     for cause, words in {"host": "--core", "disk": "another disk", "link": "cable"}.items():
-        assert words in advice_on(f"7 decisions later than 16 ms (cause: {cause} 6, not surely; decode 1)")
+        assert words in advice_on(f"7 decisions later than 16 ms (cause: {cause} 6, not certain; decode 1)")
 
 
 def test_latencies_of_very_many_are_those_of_all() -> None:

@@ -143,9 +143,9 @@ def test_late_decisions_say_how_sure_the_cause_is_and_where_they_began(summary: 
 
     events = [late("host", False, 7), late("link", True, 40), late("host", False, 90), late("host", False, 900)]
     result: Any = SimpleNamespace(events=events, late_cause={"link": 2, "host": 6})
-    assert late_words(result) == "cause: host 6, not surely; link 2; first at decision 7, 40, 90"
+    assert late_words(result) == "cause: host 6, not certain; link 2; first at decision 7, 40, 90"
     result.events[2]["sure"] = True
-    assert "host 6, not always surely; link 2" in late_words(result)
+    assert "host 6, not always certain; link 2" in late_words(result)
     write_markdown(tmp_path / "s.md", replace(summary, blame=events), {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
     page = (tmp_path / "s.md").read_text()
     assert "| 2 late from decision 7 on | host | no | it waited |" in page
