@@ -177,8 +177,8 @@ def exposure_words(timing: Facts) -> str:
     if not timing.get("exposures"):
         return f"{'none ' if timing.get('announced') else 'not '}told by the device"
     start, length = (f"{timing[key]:+.3g} us" for key in ("worst_start_us", "worst_length_us"))
-    farthest = f"at most {start} off in start and {length} in length"
-    return f"{farthest}, of {timing['exposures']:,} exposures; allowed {timing['tolerance_us']:.3g} us"
+    allowed = f"largest of {timing['exposures']:,} exposures, allowed {timing['tolerance_us']:.3g} us"
+    return f"start {start}, length {length} off the plan ({allowed})"
 
 
 def accuracy_interval(facts: Facts) -> tuple[float, float] | None:
