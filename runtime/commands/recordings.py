@@ -23,7 +23,7 @@ from pans.runtime.operate.runs import runs_in
 from pans.runtime.outputs import check_outputs, make_folder, write_file
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
-from pans.runtime.record.parts import is_of_parts, open_recording, parts_in
+from pans.runtime.record.parts import earlier_parts, is_of_parts, open_recording, parts_in
 from pans.runtime.record.pictures import PictureLog
 from pans.runtime.record.replaying import Replayed, replay
 from pans.runtime.record.sent_plan import recorded_plan
@@ -146,11 +146,12 @@ def _export(args: argparse.Namespace) -> int:
         "clicks": len(clicks.start_tick),
         "exposures": clicks.exposures,
         "complete": recording.complete,
+        "earlier_parts": earlier_parts(recording),
         "simulated": recording.simulated,
     }
     banner = "SIMULATED: " if payload["simulated"] else ""
-    names = ", ".join(payload["files"])
-    emit(args, payload, f"{banner}{payload['decisions']} decisions, {payload['clicks']} clicks in {names}")
+    found = f"{banner}{payload['decisions']} decisions, {payload['clicks']} clicks in {', '.join(payload['files'])}"
+    emit(args, payload, f"{found}\nwithout {payload['earlier_parts']}" if payload["earlier_parts"] else found)
     return EXIT_FINE
 
 

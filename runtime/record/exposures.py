@@ -1,7 +1,8 @@
 """The exposures of a recording, in the order of the device's clock: what was shown when, and what clicked.
 
 Recorded messages come in, arrays of many exposures go out, for exports and reports. Repeated and damaged messages are left out as in the
-run itself (`StreamTracker`); what was lost is simply not there. Memory does not depend on the length of the recording.
+run itself (`StreamTracker`); what was lost is simply not there. Memory does not depend on the length of the recording. A later part of
+a run begins at the place in the stream that it says.
 """
 
 from __future__ import annotations
@@ -13,12 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
+from pans.runtime.core.follower import Place
 from pans.runtime.core.plan import Plan
+from pans.runtime.errors import DamagedFileError
 from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock, Mark, unpack_body
 from pans.runtime.wire.session import STREAM_TYPES
 from pans.runtime.wire.tracker import StreamTracker
 
+from .parts import place_of
 from .recording import Recording
+from .sent_plan import first_session
 
 EXPOSURES_AT_ONCE = 1 << 16
 I64 = NDArray[np.int64]
@@ -47,6 +52,13 @@ def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures]:
     tracker, session, stream = StreamTracker(), None, -1
     held = list[ClickBlock | FrameBlock]()
     truths, n = dict[int, int](), 0
+    if (place := place_of(recording)) is not None:  # of a later part: what its stream had come to, and the marks before it
+        try:
+            begun, session, stream = Place.of(place), first_session(recording), 0
+            tracker.resume(begun.tracker, begun.heard)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DamagedFileError(f"{recording.path}: the place where it begins cannot be read: {error}") from error
+        truths = {mark.object_index: mark.truth for mark in begun.marks}
     for _, body in recording.messages():
         frame = unpack_body(body)
         if frame.type not in STREAM_TYPES:

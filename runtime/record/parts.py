@@ -109,6 +109,19 @@ def first_decision(recording: Recording) -> int:
     return 0 if part is None else int(part["first_decision"])
 
 
+def earlier_parts(recording: Recording) -> str:
+    """Return in words which parts of the run come before `recording` and what was in them, "" where the run itself begins."""
+    part = part_of(recording)
+    if part is None or part["number"] == 1:
+        return ""
+    before, decisions = int(part["number"]) - 1, int(part["first_decision"])
+    each = recording.parts if isinstance(recording, JoinedRecording) else ()
+    deleted = max([int((one.get("deleted") or {}).get("parts", 0)) for _, one in _known(each)], default=0)
+    which = f"parts 1 to {before}" if before > 1 else "part 1"
+    how = "not read" if not each else "deleted by the run (--keep-mb)" if deleted >= before else "missing"
+    return f"{which} of the run, with the decisions before number {decisions}: {how}"
+
+
 def chain_violations(recordings: Sequence[Recording]) -> list[str]:
     """Return what is wrong between parts that should follow each other; verify.py checks each by itself."""
     known = _known(recordings)

@@ -54,6 +54,11 @@ def never_armed(recording: Recording) -> bool:
         raise DamagedFileError(f"{recording.path}: a command cannot be read: {error}") from error
 
 
+def first_session(recording: Recording) -> int | None:
+    """Return the session of the first ARM, with which a part begins too; None without one, MalformedMessage for what is no command."""
+    return next((session for session, one in _sent_commands(recording) if one.opcode == Opcode.ARM), None)
+
+
 @dataclass(frozen=True, slots=True)
 class Sent:
     """What a device was sent: plan, states of an automaton, what each state named by the host showed, and ARM by session."""

@@ -21,7 +21,7 @@ from pans.runtime.wire.messages import NO_OBJECT
 
 from .exposures import ClickList, click_list, first_tick, is_dark
 from .format import TIMING_DTYPE
-from .parts import part_of
+from .parts import earlier_parts, first_decision, part_of
 from .recording import Recording
 from .sent_plan import recorded_plan
 
@@ -89,6 +89,8 @@ def facts_of(recording: Recording) -> dict[str, Any]:
         "recording": recording.path.name,
         "simulated": recording.simulated,
         "complete": recording.complete,
+        "first_decision": first_decision(recording),
+        "earlier_parts": earlier_parts(recording),
         "tick_us": tick_us(recording),
         "classes": list(recording.bundle().classes if recording.bundle_place else ()),
         "decisions_sha256": recording.decisions_sha256,

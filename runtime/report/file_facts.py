@@ -18,7 +18,7 @@ from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import Recording
-from pans.runtime.record.parts import open_recording
+from pans.runtime.record.parts import earlier_parts, first_decision, open_recording
 from pans.runtime.record.recording import together
 from pans.runtime.registration.file import load_registration
 from pans.runtime.wire import messages as wire
@@ -118,10 +118,12 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
     return {
         "complete": recording.complete,
         "damage": recording.damage,
+        "earlier_parts": earlier_parts(recording),
         "size_bytes": recording.size,
         "readable_bytes": recording.end_offset,
         "simulated": recording.simulated,
         "blocks": {kind.name.lower(): count for kind, count in recording.kinds.items()},
+        "first_decision": first_decision(recording),
         "decisions": recording.n_decisions,
         "abstained": recording.n_decisions - decided,
         "decisions_sha256": recording.decisions_sha256,
