@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pans.runtime.decide.verdict import Verdicts
     from pans.runtime.instrument.profile import Profile, load_profile
     from pans.runtime.record import Recording
-    from pans.runtime.record import read_recording as load_recording
+    from pans.runtime.record.parts import open_recording as load_recording
     from pans.runtime.record.replaying import Replayed, replay
     from pans.trainer.choose.estimator import PansClassifier
     from pans.trainer.choose.own import train_own as train
@@ -54,7 +54,7 @@ _HOMES = {
     "build_plan": ("pans.runtime.core.plan", "build_plan"),
     "evaluate": ("pans.trainer.evaluate", "evaluate"),
     "load_profile": ("pans.runtime.instrument.profile", "load_profile"),
-    "load_recording": ("pans.runtime.record", "read_recording"),
+    "load_recording": ("pans.runtime.record.parts", "open_recording"),
     "replay": ("pans.runtime.record.replaying", "replay"),
     "train": ("pans.trainer.choose.own", "train_own"),
 }

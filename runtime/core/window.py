@@ -261,7 +261,7 @@ class DecisionWindows:
         self._counts: I64 = np.zeros((self.n_windows, n_features), np.int64)
         self._out: I64 = np.zeros((self.n_windows, n_features * self._channels), np.int64)
         self._seen: I64 = np.zeros((self.n_windows, 2), np.int64)
-        self._feature_at, self._window_at = _visit_maps(plan, shots)
+        self._feature_at, self._window_at = visit_maps(plan, shots)
         self._last = _last_exposures(self._window_at, self.n_windows, self.visit_exposures)
         self.walks = _make_walks(plan, n_features, shots, self._last)
         self._need, self._last = self.walks.need, self.walks.last
@@ -427,7 +427,7 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
     return Walks(read_only(automaton.successors), nodes, np.full(len(last), slots, np.int64), last, shown)
 
 
-def _visit_maps(plan: Plan, shots: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+def visit_maps(plan: Plan, shots: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
     """Return, for each exposure of a visit, its pattern or its slot in the walk (-1: dark) and its window, both int32 (visit,)."""
     pattern = plan.slot_pattern.astype(np.int32)
     adaptive = pattern == ADAPTIVE_PATTERN

@@ -21,7 +21,7 @@ from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock, Mar
 from pans.runtime.wire.session import STREAM_TYPES
 from pans.runtime.wire.tracker import StreamTracker
 
-from .parts import place_of
+from .parts import JoinedRecording, place_of
 from .recording import Recording
 from .sent_plan import first_session
 
@@ -50,37 +50,44 @@ class Exposures(NamedTuple):
 def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures]:
     """Yield the exposures of `recording` in the order of its messages, at most about EXPOSURES_AT_ONCE at a time."""
     tracker, session, stream = StreamTracker(), None, -1
-    held = list[ClickBlock | FrameBlock]()
-    truths, n = dict[int, int](), 0
-    if (place := place_of(recording)) is not None:  # of a later part: what its stream had come to, and the marks before it
-        try:
-            begun, session, stream = Place.of(place), first_session(recording), 0
-            tracker.resume(begun.tracker, begun.heard)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DamagedFileError(f"{recording.path}: the place where it begins cannot be read: {error}") from error
-        truths = {mark.object_index: mark.truth for mark in begun.marks}
-    for _, body in recording.messages():
-        frame = unpack_body(body)
-        if frame.type not in STREAM_TYPES:
-            continue
-        begins = frame.session != session
-        if begins:
-            tracker.restart()
-        message, _ = tracker.accept(frame)
-        # arrays are made of blocks of one stream and form
-        differs = held and isinstance(message, ClickBlock | FrameBlock) and _form(message) != _form(held[0])
-        if begins or differs or max(n, len(truths)) >= EXPOSURES_AT_ONCE:
-            if held:
-                yield _exposures(held, truths, stream, plan)
-            held, truths, n = [], {}, 0
-        session, stream = frame.session, stream + begins
-        if isinstance(message, Mark):
-            truths[message.object_index] = message.truth
-        elif message is not None:
-            held.append(message)
-            n += len(message[6])
-    if held:
-        yield _exposures(held, truths, stream, plan)
+    for part in recording.parts if isinstance(recording, JoinedRecording) else (recording,):
+        held, truths, n = list[ClickBlock | FrameBlock](), dict[int, int](), 0
+        if (begun := _begun(part)) is not None:
+            place, continued = begun
+            tracker.resume(place.tracker)
+            session, stream = continued, stream + (continued != session)
+            truths = {mark.object_index: mark.truth for mark in place.marks}
+        for _, body in part.messages():
+            frame = unpack_body(body)
+            if frame.type not in STREAM_TYPES:
+                continue
+            begins = frame.session != session
+            if begins:
+                tracker.restart()
+            message, _ = tracker.accept(frame)
+            # arrays are made of blocks of one stream and form
+            differs = held and isinstance(message, ClickBlock | FrameBlock) and _form(message) != _form(held[0])
+            if begins or differs or max(n, len(truths)) >= EXPOSURES_AT_ONCE:
+                if held:
+                    yield _exposures(held, truths, stream, plan)
+                held, truths, n = [], {}, 0
+            session, stream = frame.session, stream + begins
+            if isinstance(message, Mark):
+                truths[message.object_index] = message.truth
+            elif message is not None:
+                held.append(message)
+                n += len(message[6])
+        if held:
+            yield _exposures(held, truths, stream, plan)
+
+
+def _begun(part: Recording) -> tuple[Place, int | None] | None:
+    """Return where in the stream of which session a later part begins; None where the run does."""
+    facts = place_of(part)
+    try:
+        return None if facts is None else (Place.of(facts), first_session(part))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DamagedFileError(f"{part.path}: the place where it begins cannot be read: {error}") from error
 
 
 def _form(block: ClickBlock | FrameBlock) -> tuple[int, ...]:

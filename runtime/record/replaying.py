@@ -27,17 +27,15 @@ from pans.runtime.flow.matching import PassageFigures
 from pans.runtime.html_card import html_card
 from pans.runtime.instrument.profile import parse_profile
 from pans.runtime.kernel.calls import StreamCore
-from pans.runtime.ranges import Range
 from pans.runtime.wire.commands import Arm, announces_exposed
 from pans.runtime.wire.messages import Frame, MalformedMessage, MessageType, decode_welcome, unpack_body
 
 from .log import LogEncoder
-from .parts import place_of
+from .parts import JoinedRecording, place_of
 from .recording import Recording
-from .sent_plan import TICK_HZ, Sent, automaton_of, never_armed, sent_to_device, walk_dose
+from .sent_plan import SHOTS, TICK_HZ, Sent, automaton_of, never_armed, sent_to_device, walk_dose
 
 ASKED = DecisionFlag.NOT_FINITE | DecisionFlag.AMBIGUOUS  # abstained after the back end had been asked
-SHOTS = Range(1, 1 << 20, whole=True)
 # what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
 _NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, MalformedMessage)
 
@@ -109,13 +107,21 @@ class Replayed:
 
 
 def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = None) -> Replayed:
-    """Decide `recording` again with `bundle`; `pictures`, or another log, collects what the back end is asked."""
+    """Decide `recording` again with `bundle`; `pictures`, or another log, collects what the back end is asked.
+
+    The `sha256` of a run in parts is that of one log, as if it had been recorded in one file.
+    """
     if never_armed(recording):
         return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True, contradictions={}, exposure_timing={})
     core, log = _replayed(recording, bundle, pictures)
     passages = replayed_figures(core, recording.events()) if isinstance(core, FlowCore) else None
-    sha256 = log.encoder.hexdigest()
-    agrees = (sha256 if recording.complete else log.sha256_as_far) == recording.decisions_sha256
+    sha256, recorded = log.encoder.hexdigest(), recording.decisions_sha256
+    if isinstance(recording, JoinedRecording):  # whose hash is a chain: the replay's is over one log
+        whole = LogEncoder()
+        for rows in recording.iter_decisions():
+            whole.update(rows)
+        recorded = whole.hexdigest()
+    agrees = (sha256 if recording.complete else log.sha256_as_far) == recorded
     told = log.decisions, sha256, passages, recording.n_decisions, agrees, dict(core.contradictions)
     return Replayed(*told, _exposure_timing(recording, core))
 

@@ -34,6 +34,7 @@ from pans.runtime.wire.schema import MAX_PHOTON_NUMBER
 from .recording import Recording
 
 TICK_HZ = Range(1000, 10_000_000_000, whole=True)
+SHOTS = Range(1, 1 << 20, whole=True)
 PHOTON_NUMBER = Range(1, MAX_PHOTON_NUMBER, whole=True)
 
 

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from pans.runtime.cli.finding import needed
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
+from pans.runtime.core.window import visit_maps
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.wire.messages import NO_OBJECT
 
 from .exposures import ClickList, click_list, first_tick, is_dark
 from .format import TIMING_DTYPE
 from .parts import earlier_parts, first_decision, part_of
-from .recording import Recording
-from .sent_plan import recorded_plan
+from .recording import Recording, together
+from .sent_plan import SHOTS, recorded_plan
 
 Table = Mapping[str, NDArray[Any]]
 
@@ -72,9 +73,12 @@ CLICKS = {
     "channel": Column("int64", "", "channel of the detector"),
     "pattern": Column("int64", "", "pattern displayed", "no light"),
     "dark_slot": Column("int64", "", "1 in an exposure without light"),
-    "stream": Column("int64", "", "0 until the device was lost and found again, then 1, ..."),
+    "stream": Column("int64", "", "0 until the device was lost and found again, then 1, ...; in the parts that are read"),
     "state": Column("int64", "", "state of the automaton", "fixed patterns, or no light"),
     "photons": Column("int64", "", "photons counted", "the detector tells a click, not how many photons"),
+    "decision": Column(
+        "int64", "", "decision that the click was counted for", "none: in the dark, cut off, or objects pass by"
+    ),
 }
 
 
@@ -150,8 +154,35 @@ def click_table(recording: Recording, plan: Plan, clicks: ClickList) -> Table:
         "stream": clicks.stream,
         "state": np.ma.array(clicks.state, mask=dark | (plan.automaton is None)),
         "photons": np.ma.array(clicks.photons, mask=np.full(len(dark), not counts)),
+        "decision": _decisions_of(recording, plan, clicks),
     }
     return _typed(found, CLICKS)
+
+
+def _decisions_of(recording: Recording, plan: Plan, clicks: ClickList) -> NDArray[np.int64]:
+    """Return the number of the decision that each click was counted for, masked where there is none.
+
+    A visit and a window in it name a decision within its stream; a later stream has the same names again, later in time.
+    """
+    config, n_clicks = recording.header["config"], len(clicks.start_tick)
+    if "flow" in config:
+        return np.ma.masked_all(n_clicks, np.int64)
+    shots = SHOTS.checked(config["shots"], "shots")
+    _, window_at = visit_maps(plan, shots)
+    per_visit, visit = plan.shots_per_cycle * plan.cycles_per_object // shots, len(window_at)
+    fields, nobody = ("index", "tick", "exposure_index", "shot"), np.full((1, 4), -1)
+    blocks = together(recording.iter_decisions())
+    made = [np.column_stack([rows[name].astype(np.int64) for name in fields]) for rows in blocks]
+    index, tick, last, shot = np.concatenate([*made, nobody]).T
+    names = np.where(index < 0, np.iinfo(np.int64).max, last // visit * per_visit + shot // shots)
+    index, tick, last, names = np.array((index, tick, last, names))[:, np.lexsort((tick, names))]
+    window = window_at[clicks.exposure % visit]
+    wanted = clicks.exposure // visit * per_visit + window
+    at = np.searchsorted(names, wanted)
+    while (before := (names[at] == wanted) & (tick[at] <= clicks.start_tick)).any():
+        at += before
+    counted = (names[at] == wanted) & (clicks.exposure <= last[at]) & (window >= 0) & ~is_dark(clicks.pattern)
+    return np.ma.array(index[at], mask=~counted)
 
 
 def frame_of(recording: Recording, table: str) -> Any:

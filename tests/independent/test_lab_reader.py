@@ -6,6 +6,7 @@ import secrets
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,9 @@ from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.cli import EXIT_DEVICE, main
 from pans.runtime.errors import UsageError
 from pans.runtime.record import read_recording as our_reader
+from pans.runtime.record.exposures import click_list
+from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.record.tables import click_table
 
 D_F, CLASSES, LEVELS = 6, 4, 16
 EXPOSURE_US = 100.0
@@ -101,6 +105,15 @@ def record(folder: Path, case: Case, bundle: Path) -> Path:
     return folder / "out" / "run.pansrec"
 
 
+def clicks_by_decision(recording: Any, n: int) -> list[float]:
+    """Return the clicks, or photons, of each decision, added up from the table of clicks alone."""
+    plan = recorded_plan(recording)
+    table = click_table(recording, plan, click_list(recording, plan))
+    counted = ~np.ma.getmaskarray(table["decision"])
+    weights = table["photons"].filled(1)[counted]
+    return np.bincount(table["decision"][counted], weights, n).tolist()
+
+
 @pytest.mark.parametrize(
     "case", [*CASES, *COUNTED], ids=lambda case: f"{case.mode}-{case.backend}-{bool(case.faults)}-{case.outcomes}"
 )
@@ -119,6 +132,7 @@ def test_decisions_come_out_the_same(tmp_path: Path, case: Case) -> None:
     assert len(rows) >= case.decisions // 2
     if case.outcomes > 2:
         assert rows["clicks"].max() > D_F * case.shots  # more than a click each
+    assert clicks_by_decision(our_reader(path), len(rows)) == rows["clicks"].tolist()
     if case.faults:
         assert 0 < np.count_nonzero(rows["flags"]) < len(rows)
 

@@ -98,7 +98,7 @@ def spoilt(bodies: list[bytes], dice: random.Random) -> list[bytes]:
 
 def recording_of(bodies: list[bytes]) -> Any:
     """What `iter_exposures` asks of a recording."""
-    return SimpleNamespace(messages=lambda: ((0, body) for body in bodies))
+    return SimpleNamespace(header={}, messages=lambda: ((0, body) for body in bodies))
 
 
 def one_by_one(bodies: list[bytes], plan: Plan) -> list[tuple[Any, ...]]:

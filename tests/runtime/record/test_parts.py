@@ -13,16 +13,19 @@ import pytest
 from commands import Pans
 from small_runs import Disk, fails, record_small
 
+import pans
 from pans.runtime.cli import main
 from pans.runtime.container import open_regular
+from pans.runtime.core.plan import Plan
 from pans.runtime.errors import DamagedFileError, RecordingError, UsageError
 from pans.runtime.live import LiveRun
 from pans.runtime.pages import page_of
-from pans.runtime.record import PartLimits, Recorder, read_recording, recording
-from pans.runtime.record.exposures import click_list
+from pans.runtime.record import PartLimits, Recorder, Recording, read_recording, recording
+from pans.runtime.record.exposures import click_list, iter_exposures
 from pans.runtime.record.parts import (
     JoinedRecording,
     chain_violations,
+    earlier_parts,
     first_decision,
     open_recording,
     part_of,
@@ -31,7 +34,9 @@ from pans.runtime.record.parts import (
 )
 from pans.runtime.record.replaying import replay
 from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.record.tables import click_table
 from pans.runtime.report.verify import verify_parts
+from pans.runtime.wire.schema import RECEIVE_WINDOW
 
 KIB = 1024
 SMALL = PartLimits(48 * KIB)
@@ -64,6 +69,33 @@ def check_each(folder: Path) -> list[int]:
     return numbers
 
 
+def marked_objects(recording: Recording, plan: Plan) -> set[int]:
+    return {number for item in iter_exposures(recording, plan) for number in item.truths}
+
+
+def check_clicks(whole: Path, scratch: Path) -> None:
+    """Parts alone, and those left where earlier ones are gone, hold the exposures of the whole run and the clicks of their decisions."""
+    paths, recording = parts_in(whole), open_recording(whole)
+    plan = recorded_plan(recording)
+    every, marked = click_list(recording, plan), marked_objects(recording, plan)
+    alone = [read_recording(path) for path in paths]
+    assert sum(click_list(one, plan).exposures for one in alone) == every.exposures
+    for first in (1, len(paths) - 2):
+        for path in paths[first:]:
+            (folder := scratch / str(first)).mkdir(exist_ok=True)
+            shutil.copy(path, folder)
+        for one in (open_recording(folder), alone[first]):
+            clicks, rows = click_list(one, plan), one.decisions()
+            begin = int(np.searchsorted(every.start_tick, clicks.start_tick[0]))
+            for found, expected in zip(clicks[:6], every[:6]):
+                np.testing.assert_array_equal(found, expected[begin : begin + len(found)])
+            of = click_table(one, plan, clicks)["decision"].compressed() - first_decision(one)
+            np.testing.assert_array_equal(np.bincount(of, minlength=len(rows)), rows["clicks"])
+            assert rows["clicks"].sum() > 100
+            assert clicks.stream[0] >= 0
+            assert marked.intersection(rows["object"].tolist()) <= marked_objects(one, plan)
+
+
 def test_every_part_replays_and_verifies_by_itself(parts: Path) -> None:
     numbers, found = check_each(parts), [read_recording(path) for path in parts_in(parts)]
     assert len(found) > 2
@@ -78,6 +110,7 @@ def test_parts_replay_under_faults(tmp_path: Path, faults: str) -> None:
     result = record_small(tmp_path / "run.pansrec", 3000, limits=SMALL, faults=faults)
     assert len(parts_in(tmp_path)) > 2
     assert len(check_each(tmp_path)) == result.tally.decisions
+    check_clicks(tmp_path, tmp_path)
 
 
 def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> None:
@@ -90,6 +123,7 @@ def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> No
     kept = len(check_each(tmp_path))
     assert last["deleted"]["decisions"] == first["first_decision"] == result.tally.decisions - kept
     assert "part_deleted" in {event["kind"] for event in result.events}
+    assert earlier_parts(open_recording(tmp_path)).endswith("deleted by the run (--keep-mb)")
     paths[0].unlink()
     assert f"{paths[0].name} is missing" in " ".join(verify_parts(tmp_path)[-1].violations)
 
@@ -115,7 +149,14 @@ def test_a_part_that_is_missing_is_found_wherever_it_was(parts: Path, tmp_path: 
         assert "missing" in " ".join(found.violations), name
     with pytest.raises(DamagedFileError, match="one is missing between"):
         open_recording(tmp_path / names[1])
-    assert "one is missing" in open_recording(tmp_path / names[1], salvage=True).damage
+    for name in names[2:-1]:
+        (tmp_path / names[1] / name).unlink()
+    left = open_recording(tmp_path / names[1], salvage=True)
+    assert "one is missing" in left.damage
+    exposures, *others = (
+        click_list(one, recorded_plan(one)).exposures for one in (left, *map(read_recording, parts_in(left.path)))
+    )
+    assert exposures == sum(others)
 
 
 def test_a_surplus_part_is_found_wherever_it_is(parts: Path, tmp_path: Path) -> None:
@@ -189,13 +230,17 @@ def test_parts_are_one_recording(runs: Path, parts: Path) -> None:
     for found, expected in zip(click_list(joined, plan), click_list(one, plan), strict=True):
         assert np.array_equal(found, expected)
     assert joined.bundle().classes == one.bundle().classes
+    for found, wanted in ((pans.load_recording(place), one) for place in (parts, parts / "run.pansrec")):
+        again = pans.replay(found, found.bundle())
+        assert (again.as_recorded, again.sha256) == (True, wanted.decisions_sha256)
     assert open_recording(parts / "run.pansrec").n_decisions == one.n_decisions
 
 
 def test_a_page_reads_each_part_as_often_however_many_there_are(
     parts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To check it, for the plan that was sent, and of the page each kind of block; the first part, which has the bundle, more often."""
+    """To check it, for the plan that was sent, and of the page each kind of block, and twice its beginning alone, where it says its place;
+    the first part, which has the bundle, more often."""
     reads: Counter[str] = Counter()
 
     def opened(path: Path) -> Any:
@@ -215,7 +260,28 @@ def test_a_page_reads_each_part_as_often_however_many_there_are(
     assert len(many) > len(few) == 2
     assert all(many[name] == few[name] for name in few)
     assert {many[path.name] for path in paths[1:]} == {few[paths[1].name]}
-    assert few[paths[1].name] < 8
+    assert few[paths[1].name] < 10
+
+
+def test_clicks_of_the_parts_that_are_left_are_those_of_the_whole(parts: Path, tmp_path: Path) -> None:
+    beyond_its_beginning = part_of(read_recording(parts_in(parts)[-2]))["place"]["tracker"][0]
+    assert beyond_its_beginning > RECEIVE_WINDOW
+    check_clicks(parts, tmp_path)
+
+
+def test_what_came_before_is_said(parts: Path, tmp_path: Path, pans: Pans) -> None:
+    paths = parts_in(parts)
+    assert earlier_parts(open_recording(parts)) == earlier_parts(open_recording(paths[0])) == ""
+    first = first_decision(read_recording(paths[2]))
+    said = f"parts 1 to 2 of the run, with the decisions before number {first}"
+    assert earlier_parts(read_recording(paths[2])) == f"{said}: not read"
+    for path in paths[2:]:
+        shutil.copy(path, tmp_path)
+    assert earlier_parts(open_recording(tmp_path)) == f"{said}: missing"
+    facts = pans("info", tmp_path)
+    assert (facts["earlier_parts"], facts["first_decision"]) == (f"{said}: missing", first)
+    assert main(["export", str(tmp_path), "--format", "csv", "-o", str(tmp_path / "csv")]) == 0
+    assert f"without {said}: missing" in pans.said().out
 
 
 def test_commands_take_a_folder_or_the_name_of_the_recording(parts: Path, tmp_path: Path, pans: Pans) -> None:
