@@ -19,18 +19,23 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, warn
 from pans.runtime.cli.option_fields import refuse_without
-from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block
+from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block, skim_blocks
+from pans.runtime.core.decision import known_and_right
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import LATEST, RUNS, locked
 from pans.runtime.ranges import Range
 from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
+from pans.runtime.record.log import LogReader
 from pans.runtime.record.parts import part_number
 from pans.runtime.safe_text import one_line
 
 OURS = re.compile(r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock")
 RUN_LOCK = ".pans-run.lock"
+LOG_MAX_BYTES = 1 << 26  # of a run that was cut, in whose decision log it is looked how far it went
 END_MAX_BYTES = 1 << 24  # read from the end of a recording, in which its END is looked for
 KEEP = Range(0, 1_000_000, whole=True)
 _TIMES = {"s": 1, "min": 60, "h": 3600, "d": 86400, "w": 7 * 86400, "y": 365 * 86400}
@@ -96,13 +101,14 @@ def run_of(folder: Path) -> Run | None:
     with suppress(ValueError):
         started = datetime.fromisoformat(str(header.get("created_utc", "")))
     is_locked = _is_locked(folder / RUN_LOCK)
+    far = summary if summary or is_locked else _as_far_as(recordings)
     return Run(
         folder=folder,
         started=started if started.tzinfo else started.replace(tzinfo=UTC),
         bundle=bundle or str(header.get("bundle_sha256", ""))[:12],
         verdict="running" if is_locked else str(summary.get("verdict", "cut"))[:20],
-        decisions=_number(summary.get("decisions")),
-        accuracy=_number(summary.get("accuracy")),
+        decisions=_number(far.get("decisions")),
+        accuracy=_number(far.get("accuracy")),
         dark_per_exposure=_number(dark.get("per_exposure")),
         bytes=sum(path.stat().st_size for path in files),
         simulated=bool(header.get("simulated") or summary.get("simulated")),
@@ -137,6 +143,21 @@ def _end(path: Path) -> dict[str, Any]:
         summary = _object_at(tail, tail.rfind(b'{"blocks":')).get("summary")
         return summary if isinstance(summary, dict) else {}
     return {}
+
+
+def _as_far_as(recordings: Sequence[Path]) -> dict[str, Any]:
+    """Return decisions and accuracy of a run that was cut, from its decision log alone; {} of a large one, and without any."""
+    if sum(path.stat().st_size for path in recordings) > LOG_MAX_BYTES:
+        return {}
+    sums = np.zeros(3, np.int64)
+    for path in recordings:
+        with suppress(PansError, OSError), open_regular(path) as file:
+            log = LogReader()
+            for payload in skim_blocks(file, Kind.DECISIONS, LIMITS):
+                rows = log.rows(payload, str(path))
+                sums += len(rows), *known_and_right(rows)
+    decisions, known, right = sums.tolist()
+    return {"decisions": decisions, "accuracy": right / known if known else None} if decisions else {}
 
 
 def _object_at(data: bytes, start: int) -> dict[str, Any]:

@@ -175,14 +175,12 @@ def _decisions_of(recording: Recording, plan: Plan, clicks: ClickList) -> NDArra
     made = [np.column_stack([rows[name].astype(np.int64) for name in fields]) for rows in blocks]
     index, tick, last, shot = np.concatenate([*made, nobody]).T
     names = np.where(index < 0, np.iinfo(np.int64).max, last // visit * per_visit + shot // shots)
-    index, tick, last, names = np.array((index, tick, last, names))[:, np.lexsort((tick, names))]
-    window = window_at[clicks.exposure % visit]
-    wanted = clicks.exposure // visit * per_visit + window
+    index, tick, names = np.array((index, tick, names))[:, np.lexsort((tick, names))]
+    wanted = clicks.exposure // visit * per_visit + window_at[clicks.exposure % visit]
     at = np.searchsorted(names, wanted)
     while (before := (names[at] == wanted) & (tick[at] <= clicks.start_tick)).any():
         at += before
-    counted = (names[at] == wanted) & (clicks.exposure <= last[at]) & (window >= 0) & ~is_dark(clicks.pattern)
-    return np.ma.array(index[at], mask=~counted)
+    return np.ma.array(index[at], mask=(names[at] != wanted) | is_dark(clicks.pattern))
 
 
 def frame_of(recording: Recording, table: str) -> Any:

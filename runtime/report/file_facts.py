@@ -14,7 +14,7 @@ import numpy as np
 from pans.runtime.bundle.automaton import Automaton, shortest_walk
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.bundle.optics import Analyser, amplification
-from pans.runtime.core.decision import DecisionFlag
+from pans.runtime.core.decision import DecisionFlag, known_and_right
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import Recording
@@ -106,12 +106,12 @@ def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
 
 
 def _recording_facts(recording: Recording) -> dict[str, Any]:
-    decided = clicks = known = right = 0
+    bundle = recording.bundle() if recording.bundle_place else None
+    sums = np.zeros(4, np.int64)
     for rows in together(recording.iter_decisions()):
-        rows = rows[(rows["flags"] & int(DecisionFlag.ABSTAINED)) == 0]
-        decided, clicks = decided + len(rows), clicks + int(rows["clicks"].sum(dtype=np.int64))
-        rows = rows[rows["truth"] >= 0]
-        known, right = known + len(rows), right + int((rows["label"] == rows["truth"]).sum())
+        abstained = np.count_nonzero(rows["flags"] & int(DecisionFlag.ABSTAINED))
+        sums += abstained, rows["clicks"].sum(dtype=np.int64), *known_and_right(rows)
+    abstained, clicks, known, right = sums.tolist()
     header = dict(recording.header)
     if isinstance(profile := header.pop("profile", None), dict):
         header["profile"] = {key: value for key, value in profile.items() if key != "toml"}
@@ -125,17 +125,17 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "blocks": {kind.name.lower(): count for kind, count in recording.kinds.items()},
         "first_decision": first_decision(recording),
         "decisions": recording.n_decisions,
-        "abstained": recording.n_decisions - decided,
+        "abstained": abstained,
         "decisions_sha256": recording.decisions_sha256,
-        "clicks_mean": clicks / decided if decided else None,
-        "accuracy": right / known if known else None,
+        "clicks_mean": clicks / recording.n_decisions if recording.n_decisions else None,
+        "accuracy": right / known if known and (bundle is None or bundle.picture_shape is None) else None,
         "messages": sum(1 for _ in recording.messages()),
         "answers": sum(1 for _ in recording.answers()),
         "handshakes": handshakes(recording),
         "events": dict(Counter(str(event.get("kind", "?")) for event in recording.events())),
         "header": header,
         "summary": dict(recording.summary),
-        "bundle": recording.bundle().name if recording.bundle_place else None,
+        "bundle": None if bundle is None else bundle.name,
     }
 
 

@@ -148,7 +148,7 @@ def test_info_of_every_kind(tmp_path: Path, pans: Pans) -> None:
     record(tmp_path / "a.pansrec", [decision(0), decision(1, truth=0), decision(2, flags=9, label=0xFFFF)])
     found = pans("info", tmp_path / "a.pansrec")
     assert (found["kind"], found["complete"], found["simulated"], found["bundle"]) == ("recording", True, True, "toy")
-    assert (found["decisions"], found["abstained"], found["accuracy"]) == (3, 1, 0.5)
+    assert (found["decisions"], found["abstained"], found["accuracy"]) == (3, 1, 1 / 3)
     assert found["events"] == {"gap": 1}
     assert "toml" not in found["header"]["profile"]
     assert main(["info", str(tmp_path / "a.pansrec")]) == 0

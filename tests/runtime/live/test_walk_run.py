@@ -20,10 +20,12 @@ from pans.runtime.errors import DeviceError, PlanError
 from pans.runtime.instrument.click_law import click_law, object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.fit import check_automaton
+from pans.runtime.pages.run import Decisions
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.parts import parts_in
 from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.record.tables import click_table
 from pans.runtime.wire.commands import count_announcement
 from pans.runtime.wire.messages import DARK_PATTERN
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA
@@ -119,7 +121,12 @@ def test_a_walk_stops_when_it_is_sure_and_abstains_where_it_is_not(folder: Path,
     assert not walks["flags"][~unsure].any()
     assert (summary["verdict"], summary["confidence"]) == ("PASS", 0.8)
     assert summary["abstained_below_confidence"] == summary["abstained"] == unsure.sum()
-    assert replays(tmp_path / "device" / "run.pansrec")
+    path = tmp_path / "device" / "run.pansrec"
+    assert replays(path)
+    facts, page = pans("info", path), Decisions({"tick_hz": 1e6}, len(walks))
+    page.take(walks)
+    assert summary["accuracy"] == facts["accuracy"] == page.right / page.known < 1 - unsure.mean()
+    assert (summary["clicks_mean"], summary["abstained"]) == (facts["clicks_mean"], facts["abstained"])
 
 
 def test_a_host_that_is_held_up_leaves_slots_dark_and_guesses_nothing(folder: Path, tmp_path: Path, pans: Pans) -> None:
@@ -234,6 +241,10 @@ def test_clicks_are_exported_by_channel_and_reported(runs: Path, tmp_path: Path,
         rows = list(csv.DictReader(file))
     assert [int(row["channel"]) for row in rows] == clicks.channel.tolist()
     assert {row["photons"] for row in rows} == {""}  # clicks, not photon numbers
+    of = np.array([int(row["decision"]) for row in rows if row["dark_slot"] == "0"])
+    assert np.bincount(of, minlength=recording.n_decisions).tolist() == recording.decisions()["clicks"].tolist()
+    dark = clicks._replace(pattern=np.full_like(clicks.pattern, DARK_PATTERN))
+    assert np.ma.getmaskarray(click_table(recording, plan, dark)["decision"]).all()
     assert main(["report", str(path), "--out", str(tmp_path / "page.html")]) == 0
     assert "patterns, side by side" in (tmp_path / "page.html").read_text()
     facts = pans("info", runs / "walk.pans")

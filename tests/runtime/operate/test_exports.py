@@ -190,9 +190,9 @@ def test_csv_holds_every_click_and_decision(run_of: Path, tmp_path: Path, capsys
         clicks = list(csv.DictReader(file))
     assert len(clicks) == found["clicks"]
     # the clicks behind each decision, counted from the exported file alone
-    lit = [row for row in clicks if row["dark_slot"] == "0"]
-    per_object = np.bincount([int(row["object"]) for row in lit], minlength=len(rows))
-    assert per_object.tolist() == decisions["clicks"].tolist()
+    assert all((row["decision"] == "") == (row["dark_slot"] == "1") for row in clicks)
+    counted = np.bincount([int(row["decision"]) for row in clicks if row["decision"]], minlength=len(rows))
+    assert counted.tolist() == decisions["clicks"].tolist()
     assert found["simulated"] is True
     about = json.loads((tmp_path / "csv" / "about.json").read_text())
     assert about["exposures"] == found["exposures"]

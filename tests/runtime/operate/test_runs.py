@@ -9,12 +9,14 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import Pans, fixed_run, json_of
 
 from pans.runtime.cli import main
 from pans.runtime.operate.runs import RUN_LOCK, Run, duration_s, prunable, run_of, size_bytes
 from pans.runtime.outputs import locked
+from pans.runtime.record import read_recording
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
 
@@ -65,7 +67,10 @@ def test_a_cut_run_and_one_that_goes_on(root: Path, capsys: pytest.CaptureFixtur
     (root / "parts" / "run-0001.pansrec").write_bytes(b"damaged")
     with locked(root / "parts" / ".pans-run.lock"):
         found = {Path(run["folder"]).name: run for run in listed(capsys, root)["runs"]}
-    assert (found["whole"]["verdict"], found["whole"]["decisions"]) == ("cut", None)
+    rows = read_recording(path).decisions()
+    whole = found["whole"]
+    assert (whole["verdict"], whole["decisions"]) == ("cut", len(rows))
+    assert whole["accuracy"] == np.mean(rows["label"] == rows["truth"])
     assert (found["parts"]["verdict"], found["parts"]["locked"]) == ("running", True)
 
 
