@@ -43,7 +43,7 @@ def _verify(args: argparse.Namespace) -> int:
         "ok": all(one.ok for one in verdicts),
         "alerts": [{"path": one.path, "message": text} for one in verdicts for text in one.alerts],
         "violations": [{"path": one.path, "message": text} for one in verdicts for text in one.violations],
-        "files": [{key: getattr(one, key) for key in ("path", "kind", "ok", "damaged")} for one in verdicts],
+        "files": [{key: getattr(one, key) for key in ("path", "kind", "ok", "damaged", "cut")} for one in verdicts],
     }
     emit(args, payload, "\n".join(line for one in verdicts for line in _verdict_lines(one)))
     if any(one.damaged for one in verdicts):
@@ -52,12 +52,16 @@ def _verify(args: argparse.Namespace) -> int:
 
 
 def _verdict_lines(verdict: FileVerdict) -> Iterator[str]:
-    word = "ok" if verdict.ok else "DAMAGED" if verdict.damaged else "VIOLATED" if verdict.violations else "alerts"
+    only_cut = verdict.cut and len(verdict.violations) == 1
+    bad = "CUT" if only_cut else "VIOLATED" if verdict.violations else "alerts"
+    word = "ok" if verdict.ok else "DAMAGED" if verdict.damaged else bad
     yield f"{word:<8}  {verdict.kind:<9}  {verdict.path}"
     yield from (f"          violation: {text}" for text in verdict.violations)
     yield from (f"          alert: {text}" for text in verdict.alerts)
     if verdict.damaged:
         yield f"          remedy: {DamagedFileError.usual_remedy}"
+    elif only_cut:
+        yield "          remedy: use it as far as it goes: `pans replay`, `report` and `export` read its whole blocks"
     elif verdict.violations:
         yield "          remedy: do not rely on this file; make it again with the present version"
 

@@ -25,7 +25,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.live.run_options import RunOptions
 from pans.runtime.operate.runs import make_room
 from pans.runtime.outputs import check_outputs, locked, make_folder, new_run_folder, refuse_existing
-from pans.runtime.record.parts import files_of_parts
+from pans.runtime.record.parts import files_of_parts, find_parts
 from pans.runtime.record.recorder import PartLimits
 from pans.runtime.watch.state_file import read_state
 
@@ -145,13 +145,15 @@ def what_was_run(
     options: RunOptions, profile: Profile, name: str, header: Mapping[str, Any], summary: Summary
 ) -> dict[str, str]:
     """The lines below the summary page's figures; `header` is the recording's."""
+    parts = find_parts(options.recording) if options.recording and options.rotate_bytes else []
+    written = f"{parts[0]} to {parts[-1].name}" if len(parts) > 1 else next(iter(parts), options.recording)
     log = f"decision log SHA-256 {summary.decisions_sha256[:16]}…; pans replay recomputes it"
     return {
         "bundle": f"{name} ({options.bundle.name}, SHA-256 {header['bundle_sha256'][:16]}…)",
         "device": f"{options.device} (firmware {summary.device.get('firmware', 'unknown')})",
         "profile": f"{profile.name}: {profile.description}",
         "decision back end": header["config"]["backend"],
-        "recording": f"{options.recording} ({log})",
+        "recording": f"{written} ({log})",
         "command": options.command,
         "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
     }

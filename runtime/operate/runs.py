@@ -23,7 +23,14 @@ import numpy as np
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, warn
 from pans.runtime.cli.option_fields import refuse_without
-from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block, skim_blocks
+from pans.runtime.container import (
+    FILE_PROLOGUE,
+    check_prologue,
+    open_regular,
+    parse_json_object,
+    read_block,
+    skim_blocks,
+)
 from pans.runtime.core.decision import known_and_right
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import LATEST, RUNS, locked

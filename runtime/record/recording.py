@@ -159,7 +159,8 @@ class Recording:
         """Return the `decisions` with their host times, or the `clicks`, as a pandas.DataFrame; needs the extra `frames`.
 
         The index `time` is the time of day in UTC: exact between rows, its beginning known to about two seconds. Columns are those of
-        the CSV export; `attrs` has their `units` and `meanings` and the recording's facts. What is missing is NA or NaN.
+        the CSV export; `attrs` has their `units` and `meanings` and the recording's facts. What is missing is NA or NaN. Of the column
+        `flags` only `frame["flags"]` is the way: pandas has an attribute of that name.
 
         `pans.load_recording("run.pansrec").to_frame().latency_us.resample("1min").quantile(0.99)` is the latency over time.
         """

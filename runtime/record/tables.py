@@ -73,7 +73,9 @@ CLICKS = {
     "channel": Column("int64", "", "channel of the detector"),
     "pattern": Column("int64", "", "pattern displayed", "no light"),
     "dark_slot": Column("int64", "", "1 in an exposure without light"),
-    "stream": Column("int64", "", "0 until the device was lost and found again, then 1, ...; in the parts that are read"),
+    "stream": Column(
+        "int64", "", "0 until the device was lost and found again, then 1, ...; in the parts that are read"
+    ),
     "state": Column("int64", "", "state of the automaton", "fixed patterns, or no light"),
     "photons": Column("int64", "", "photons counted", "the detector tells a click, not how many photons"),
     "decision": Column(

@@ -52,7 +52,8 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList,
         "exposures": clicks.exposures,
         "time_zero": "the begin of the first recorded exposure",
         "header": {key: value for key, value in recording.header.items() if key != "profile"},
-        "events": list(recording.events()),
+        # without the place of a part, which only a replay needs
+        "events": [{key: event[key] for key in event if key != "place"} for event in recording.events()],
     }
     texts = written | {"about.json": json.dumps(about, indent=1, sort_keys=True) + "\n"}
     for name, text in texts.items():

@@ -48,6 +48,7 @@ class FileVerdict:
     alerts: list[str] = field(default_factory=list)
     violations: list[str] = field(default_factory=list)
     damaged: bool = False
+    cut: bool = False  # a recording whose run did not close it
 
     @property
     def ok(self) -> bool:
@@ -208,7 +209,8 @@ def _never_decided(bundle: Bundle, scores: NDArray[np.float32]) -> Iterator[str]
 
 
 def _verify_recording(recording: Recording, verdict: FileVerdict) -> None:
-    if not recording.complete:
+    verdict.cut = not recording.complete
+    if verdict.cut:
         verdict.violations.append(
             f"incomplete: no END block; {recording.end_offset} of {recording.size} bytes hold whole blocks, "
             f"with {recording.n_decisions} decisions"

@@ -73,9 +73,15 @@ def test_whole_files_are_fine(tmp_path: Path, pans: Pans) -> None:
 def test_an_incomplete_recording_is_a_violation_not_damage(tmp_path: Path, pans: Pans) -> None:
     path = record(tmp_path / "a.pansrec", [decision(0)], close=False)
     found = pans("verify", path, code=1)
-    assert (found["ok"], found["files"][0]["damaged"]) == (False, False)
+    assert (found["ok"], found["files"][0]["damaged"], found["files"][0]["cut"]) == (False, False, True)
     assert "incomplete" in (message := found["violations"][0]["message"])
     assert "1 decisions" in message
+    assert main(["verify", str(path)]) == 1
+    assert (said := pans.said().out).startswith("CUT ")
+    assert "as far as it goes" in said
+    odd = record(tmp_path / "b.pansrec", [decision(0), decision(2)], close=False)
+    assert main(["verify", str(odd)]) == 1
+    assert "do not rely on this file" in pans.said().out
 
 
 def test_one_damaged_file_does_not_hide_the_others(tmp_path: Path, pans: Pans) -> None:

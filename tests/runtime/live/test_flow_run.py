@@ -28,7 +28,10 @@ from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, run_live
 from pans.runtime.live.dark_run import DarkRun
 from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import Recorder, read_recording
+from pans.runtime.record.exposures import click_list
 from pans.runtime.record.replaying import replay
+from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.record.tables import click_table
 from pans.runtime.wire.messages import DARK_PATTERN
 from pans.trainer.export.tape_bundle import Tape, exact_table, tape_bundle
 
@@ -58,6 +61,10 @@ def test_cells_are_decided_once_gated_on_time_and_replayed(flow_folder: Path, pa
     assert f"; yield {summary['yield']:.3%} (" in page
     recording = read_recording(Path(summary["recording"]))
     assert recording.n_decisions == counts["decisions"]
+    plan = recorded_plan(recording)
+    clicks = click_table(recording, plan, click_list(recording, plan))
+    assert len(clicks["channel"]) > 1000
+    assert np.ma.getmaskarray(clicks["decision"]).all()
     replayed = pans("replay", summary["recording"])
     assert replayed["identical"] is True
     for key in ("accuracy", "passages", "aborted", "yield", "purity", "missed", "clicks_mean"):

@@ -50,6 +50,8 @@ def test_the_list_says_what_the_summary_says(root: Path, capsys: pytest.CaptureF
         assert told == (decisions, "fashion10", True, False)
         assert run["verdict"] in ("PASS", "FAIL")
         assert run["verdict"] in summary
+        files = sorted(path.name for path in (root / name).glob("*.pansrec"))
+        assert set(re.findall(r"[\w-]+\.pansrec", summary)) == {files[0], files[-1]}
         assert all(f"- {fault}" in summary for fault in run["faults"])
         clicks, exposures = re.findall(r"(\d+) clicks in (\d+) dark exposures", summary)[0]
         assert run["dark_per_exposure"] == pytest.approx(int(clicks) / int(exposures))

@@ -1,6 +1,7 @@
 """Recordings in parts: each part replayed and verified by itself, the chain, the cap, the disk, and all parts as one recording."""
 
 import errno
+import json
 import shutil
 from collections import Counter
 from dataclasses import fields
@@ -291,6 +292,9 @@ def test_commands_take_a_folder_or_the_name_of_the_recording(parts: Path, tmp_pa
         assert payload["identical"]
         assert len(payload["parts"]) == len(parts_in(parts))
     assert pans("export", place, "--format", "csv", "-o", tmp_path / "csv")["decisions"] > 1000
+    told = json.loads((tmp_path / "csv/about.json").read_text())["events"]
+    assert [event["number"] for event in told if event["kind"] == "part"] == list(range(1, len(parts_in(parts)) + 1))
+    assert not any("place" in event for event in told)
     assert pans("info", place)["decisions"] == payload["decisions"]
     assert main(["verify", str(tmp_path / "run.pansrec")]) == main(["verify", str(tmp_path / "csv")]) == 2
     with pytest.raises(UsageError, match="0 recordings are here"):
