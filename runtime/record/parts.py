@@ -118,7 +118,7 @@ def earlier_parts(recording: Recording) -> str:
     each = recording.parts if isinstance(recording, JoinedRecording) else ()
     deleted = max([int((one.get("deleted") or {}).get("parts", 0)) for _, one in _known(each)], default=0)
     which = f"parts 1 to {before}" if before > 1 else "part 1"
-    how = "not read" if not each else "deleted by the run (--keep-mb)" if deleted >= before else "missing"
+    how = "not read" if not each else "deleted by the run" if deleted >= before else "missing"
     return f"{which} of the run, with the decisions before number {decisions}: {how}"
 
 

@@ -73,14 +73,10 @@ CLICKS = {
     "channel": Column("int64", "", "channel of the detector"),
     "pattern": Column("int64", "", "pattern displayed", "no light"),
     "dark_slot": Column("int64", "", "1 in an exposure without light"),
-    "stream": Column(
-        "int64", "", "0 until the device was lost and found again, then 1, ...; in the parts that are read"
-    ),
+    "stream": Column("int64", "", "0 until the device was lost and found again, then 1, ...; of what is read"),
     "state": Column("int64", "", "state of the automaton", "fixed patterns, or no light"),
     "photons": Column("int64", "", "photons counted", "the detector tells a click, not how many photons"),
-    "decision": Column(
-        "int64", "", "decision that the click was counted for", "none: in the dark, cut off, or objects pass by"
-    ),
+    "decision": Column("int64", "", "decision it was counted for", "none: in the dark, cut off, or objects pass by"),
 }
 
 
@@ -166,9 +162,9 @@ def _decisions_of(recording: Recording, plan: Plan, clicks: ClickList) -> NDArra
 
     A visit and a window in it name a decision within its stream; a later stream has the same names again, later in time.
     """
-    config, n_clicks = recording.header["config"], len(clicks.start_tick)
+    config = recording.header["config"]
     if "flow" in config:
-        return np.ma.masked_all(n_clicks, np.int64)
+        return np.ma.array(clicks.exposure, mask=np.full(len(clicks.exposure), True))
     shots = SHOTS.checked(config["shots"], "shots")
     _, window_at = visit_maps(plan, shots)
     per_visit, visit = plan.shots_per_cycle * plan.cycles_per_object // shots, len(window_at)

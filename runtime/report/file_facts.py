@@ -107,11 +107,12 @@ def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
 
 def _recording_facts(recording: Recording) -> dict[str, Any]:
     bundle = recording.bundle() if recording.bundle_place else None
-    sums = np.zeros(4, np.int64)
+    abstained = clicks = known = right = 0
     for rows in together(recording.iter_decisions()):
-        abstained = np.count_nonzero(rows["flags"] & int(DecisionFlag.ABSTAINED))
-        sums += abstained, rows["clicks"].sum(dtype=np.int64), *known_and_right(rows)
-    abstained, clicks, known, right = sums.tolist()
+        abstained += int(np.count_nonzero(rows["flags"] & int(DecisionFlag.ABSTAINED)))
+        clicks += int(rows["clicks"].sum(dtype=np.int64))
+        more_known, more_right = known_and_right(rows)
+        known, right = known + more_known, right + more_right
     header = dict(recording.header)
     if isinstance(profile := header.pop("profile", None), dict):
         header["profile"] = {key: value for key, value in profile.items() if key != "toml"}

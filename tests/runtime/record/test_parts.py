@@ -124,7 +124,7 @@ def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> No
     kept = len(check_each(tmp_path))
     assert last["deleted"]["decisions"] == first["first_decision"] == result.tally.decisions - kept
     assert "part_deleted" in {event["kind"] for event in result.events}
-    assert earlier_parts(open_recording(tmp_path)).endswith("deleted by the run (--keep-mb)")
+    assert earlier_parts(open_recording(tmp_path)).endswith("deleted by the run")
     paths[0].unlink()
     assert f"{paths[0].name} is missing" in " ".join(verify_parts(tmp_path)[-1].violations)
 
