@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.core.follower import Place
 from pans.runtime.core.plan import Plan
-from pans.runtime.errors import DamagedFileError
 from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock, Mark, unpack_body
 from pans.runtime.wire.session import STREAM_TYPES
 from pans.runtime.wire.tracker import StreamTracker
@@ -52,10 +50,10 @@ def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures]:
     tracker, session, stream = StreamTracker(), None, -1
     for part in recording.parts if isinstance(recording, JoinedRecording) else (recording,):
         held, truths, n = list[ClickBlock | FrameBlock](), dict[int, int](), 0
-        if (begun := _begun(part)) is not None:
-            place, continued = begun
+        if (place := place_of(part)) is not None:
             tracker.resume(place.tracker)
-            session, stream = continued, stream + (continued != session)
+            before, session = session, first_session(part)
+            stream += session != before
             truths = {mark.object_index: mark.truth for mark in place.marks}
         for _, body in part.messages():
             frame = unpack_body(body)
@@ -79,15 +77,6 @@ def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures]:
                 n += len(message[6])
         if held:
             yield _exposures(held, truths, stream, plan)
-
-
-def _begun(part: Recording) -> tuple[Place, int | None] | None:
-    """Return where in the stream of which session a later part begins; None where the run does."""
-    facts = place_of(part)
-    try:
-        return None if facts is None else (Place.of(facts), first_session(part))
-    except (KeyError, TypeError, ValueError) as error:
-        raise DamagedFileError(f"{part.path}: the place where it begins cannot be read: {error}") from error
 
 
 def _form(block: ClickBlock | FrameBlock) -> tuple[int, ...]:
@@ -142,31 +131,22 @@ class ClickList(NamedTuple):
 
 def click_list(recording: Recording, plan: Plan) -> ClickList:
     """Return the clicks of `recording` as arrays."""
-    columns: list[list[NDArray[np.int64]]] = [[] for _ in range(8)]
+    found = [np.zeros((8, 0), np.int64)]
     exposures, first_tick, last_tick = 0, 0, 0
     for item in iter_exposures(recording, plan):
         if not len(item.start_tick):
             continue
         row, channels = np.nonzero(item.clicks)
-        of_channel = np.where(item.pattern[row] == DARK_PATTERN, 0, channels if plan.channels_at_once > 1 else 0)
-        shown = item.pattern[row] + of_channel, item.state[row]
-        stream = np.full(len(row), item.stream)
-        for column, values in zip(
-            columns,
-            (
-                *(item.start_tick[row], item.number[row], item.object[row], channels, *shown, stream),
-                item.photons[row, channels],
-            ),
-        ):
-            column.append(np.asarray(values, np.int64))
+        dark = is_dark(item.pattern[row])
+        shown = item.pattern[row] + np.where(dark | (plan.channels_at_once == 1), 0, channels)
+        columns = item.start_tick[row], item.number[row], item.object[row], channels, shown, item.state[row]
+        found.append(np.array([*columns, np.full(len(row), item.stream), item.photons[row, channels]], np.int64))
         first_tick = first_tick if exposures else int(item.start_tick[0])
         last_tick = int(item.start_tick[-1]) + plan.exposure_ticks
         exposures += len(item.clicks)
-    empty = [np.zeros(0, np.int64)]
-    start, number, thing, channel, pattern, state, streams, photons = (
-        np.concatenate(column or empty) for column in columns
-    )
-    return ClickList(start, number, thing, channel, pattern, state, streams, exposures, first_tick, last_tick, photons)
+    start, number, thing, channel, pattern, state, stream, photons = np.concatenate(found, axis=1)
+    seven = start, number, thing, channel, pattern, state, stream
+    return ClickList(*seven, exposures, first_tick, last_tick, photons)
 
 
 def first_tick(recording: Recording, plan: Plan) -> int:

@@ -19,6 +19,7 @@ from typing import Any
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.container import Block
+from pans.runtime.core.follower import Place
 from pans.runtime.errors import DamagedFileError, UsageError, refusing
 
 from .format import PART_EVENT, Kind
@@ -97,10 +98,13 @@ def part_of(recording: Recording) -> Mapping[str, Any] | None:
     return event
 
 
-def place_of(recording: Recording) -> dict[str, Any] | None:
-    """Return the core's place at the beginning of a later part; None where the run itself begins."""
+def place_of(recording: Recording) -> Place | None:
+    """Return the core's place at the beginning of a later part; None where the run itself begins. Errors as of `part_of`."""
     part = part_of(recording)
-    return None if part is None or part["number"] == 1 else dict(part["place"])
+    try:
+        return None if part is None or part["number"] == 1 else Place.of(part["place"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DamagedFileError(f"{recording.path}: the place where it begins cannot be read: {error}") from error
 
 
 def first_decision(recording: Recording) -> int:
@@ -200,10 +204,6 @@ class JoinedRecording(Recording):
     def read(self, *wanted: Kind) -> Iterator[tuple[Kind, Any]]:
         """Yield the kind and the content of each whole block of these kinds, part by part."""
         return (one for part in self.parts for one in part.read(*wanted))
-
-    def bundle_data(self) -> bytes:
-        """Return the bytes of the bundle that the run used, b"" if it was not recorded."""
-        return self.parts[0].bundle_data()
 
     def bundle(self) -> Bundle:
         """Return the bundle that the run used; UsageError if it was not recorded."""

@@ -224,9 +224,7 @@ def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
         if never_armed(recording):
             return []
         _, sent = _rebuilt(recording, bundle, None)
-        place = place_of(recording)
-        if place is not None:
-            Place.of(place)
+        place_of(recording)
         later, session = iter(sent.arms.items()), 0
         for _, body in recording.messages():
             frame = unpack_body(body)
@@ -276,13 +274,11 @@ def _decided(
     yield from (decisions for _, decisions in streams)  # those that gave no message at all
 
 
-def _begun(
-    core: Follower, arms: Mapping[int, Arm], place: Mapping[str, Any] | None
-) -> Iterator[tuple[int, Sequence[Any]]]:
+def _begun(core: Follower, arms: Mapping[int, Arm], place: Place | None) -> Iterator[tuple[int, Sequence[Any]]]:
     """Begin the stream of each ARM, the first one at the `place` of a later part; yield its session, and the decisions."""
     for session, arm in arms.items():
         output = core.begin(arm.start_tick, arm.n_cycles)
         if place is not None:
-            core.resume(Place.of(place))
+            core.resume(place)
             place = None
         yield session, output.decisions

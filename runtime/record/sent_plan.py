@@ -50,7 +50,7 @@ def _sent_commands(recording: Recording) -> Iterator[tuple[int, CommandMessage]]
 def never_armed(recording: Recording) -> bool:
     """Whether the run ended before it armed the device, so that there was nothing to decide; DamagedFileError for what is no command."""
     try:
-        return not recording.n_decisions and all(one.opcode != Opcode.ARM for _, one in _sent_commands(recording))
+        return not recording.n_decisions and first_session(recording) is None
     except MalformedMessage as error:
         raise DamagedFileError(f"{recording.path}: a command cannot be read: {error}") from error
 
