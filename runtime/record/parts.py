@@ -184,7 +184,7 @@ def _known(recordings: Sequence[Recording]) -> list[tuple[Recording, Mapping[str
 # ---- a run in parts as one recording ----
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class JoinedRecording(Recording):
     """The parts of a run, read one after the other; the bundle, which each part repeats, is that of the first. Plan and ARM,
     which they repeat too, come again in `commands`, where repetitions change nothing.
