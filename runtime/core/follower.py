@@ -161,15 +161,17 @@ class Place:
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Place:
-        """Invert `facts`; KeyError, TypeError or ValueError if they are damaged."""
+        """Invert `facts`; LookupError, TypeError or ValueError if they are damaged."""
         marks = tuple(
-            Mark._make([*mark[:5], math.nan if mark[5] is None else mark[5], *mark[6:]]) for mark in facts["marks"]
+            Mark._make([*map(int, mark[:5]), math.nan if mark[5] is None else float(mark[5]), *map(int, mark[6:])])
+            for mark in facts["marks"]
         )
         decisions, abstained, last_tick = (int(facts[name]) for name in ("decisions", "abstained", "last_tick"))
+        seq, exposure, drops = map(int, facts["tracker"])
         heard = b64decode(facts.get("heard", ""), validate=True)
         if len(heard) not in (0, MEMORY_BYTES):
             raise ValueError(f"heard has {len(heard)} bytes, expected {MEMORY_BYTES}")
-        return cls(tuple(facts["tracker"]), marks, decisions, abstained, last_tick, facts["core"], heard)
+        return cls((seq, exposure, drops), marks, decisions, abstained, last_tick, facts["core"], heard)
 
 
 class Follower:

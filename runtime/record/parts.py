@@ -103,7 +103,7 @@ def place_of(recording: Recording) -> Place | None:
     part = part_of(recording)
     try:
         return None if part is None or part["number"] == 1 else Place.of(part["place"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise DamagedFileError(f"{recording.path}: the place where it begins cannot be read: {error}") from error
 
 
@@ -150,10 +150,9 @@ def chain_violations(recordings: Sequence[Recording]) -> list[str]:
             "decisions_sha256": earlier.decisions_sha256,
             "chain_sha256": chained(chain_before, earlier.decisions_sha256),
         }
-        for key, found in expected.items():
-            if before.get(key) != found:
-                said = ascii(before.get(key))[:80]
-                violations.append(f"{where}: it says that the part before has {key} {said}, found {found}")
+        for key in (key for key in expected if before.get(key) != expected[key]):
+            said = f"{key} {ascii(before.get(key))[:80]}, found {expected[key]}"
+            violations.append(f"{where}: it says that the part before has {said}")
         if second["first_decision"] != first["first_decision"] + earlier.n_decisions:
             violations.append(f"{where}: it begins with decision {second['first_decision']}, which does not follow")
     return violations

@@ -96,14 +96,8 @@ class Replayed:
         return max(0, self.decisions - self.recorded)
 
     def _repr_html_(self) -> str:
-        agreement = "yes" if self.as_recorded else "NO"
-        facts = {
-            "as recorded": agreement,
-            "decisions": self.decisions,
-            "recorded": self.recorded,
-            "sha256": self.sha256,
-        }
-        return html_card("Replay", facts | self.contradictions)
+        facts = {name: getattr(self, name) for name in ("decisions", "recorded", "sha256")}
+        return html_card("Replay", {"as recorded": "yes" if self.as_recorded else "NO"} | facts | self.contradictions)
 
 
 def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = None) -> Replayed:
@@ -127,12 +121,10 @@ def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = Non
 
 
 def _exposure_timing(recording: Recording, core: Follower) -> dict[str, Any]:
-    toml, frames = (
-        (recording.header.get("profile") or {}).get("toml"),
-        (unpack_body(body) for _, body in recording.answers()),
-    )
+    toml = (recording.header.get("profile") or {}).get("toml")
     if not toml:
         return {}
+    frames = (unpack_body(body) for _, body in recording.answers())
     welcomes = (decode_welcome(frame.payload) for frame in frames if frame.type == MessageType.WELCOME)
     announced = any(announces_exposed(welcome.facts) for welcome in welcomes)
     tolerance_us = parse_profile(toml, f"{recording.path}: its profile").exposure_tolerance_us(core.plan.exposure_us)

@@ -32,6 +32,7 @@ from pans.runtime.record.parts import (
     part_of,
     part_path,
     parts_in,
+    place_of,
 )
 from pans.runtime.record.replaying import replay
 from pans.runtime.record.sent_plan import recorded_plan
@@ -178,14 +179,20 @@ def test_a_surplus_part_is_found_wherever_it_is(parts: Path, tmp_path: Path) -> 
 def test_a_part_without_its_place_is_refused(parts: Path) -> None:
     found = read_recording(parts_in(parts)[1])
 
-    class Silent:
+    class Strange:
         header, path, complete = found.header, found.path, True
 
-        def events(self) -> Any:
-            return iter(())
+        def __init__(self, *events: Any) -> None:
+            self.events = lambda: iter(events)
 
     with pytest.raises(DamagedFileError, match="does not say where it begins"):
-        part_of(Silent())  # type: ignore[arg-type]
+        part_of(Strange())  # type: ignore[arg-type]
+    event = next(found.events())
+    assert place_of(Strange(event)) == place_of(found)  # type: ignore[arg-type]
+    mark = event["place"]["marks"][0]
+    for wrong in ({"tracker": ["x", 0, 0]}, {"tracker": [0, 0]}, {"marks": [[[], *mark[1:]]]}, {"marks": [mark[:4]]}):
+        with pytest.raises(DamagedFileError, match="place where it begins cannot be read"):
+            place_of(Strange(event | {"place": event["place"] | wrong}))  # type: ignore[arg-type]
 
 
 def test_parts_of_another_run_are_not_overwritten(parts: Path, tmp_path: Path) -> None:
@@ -234,7 +241,10 @@ def test_parts_are_one_recording(runs: Path, parts: Path) -> None:
     for found, wanted in ((pans.load_recording(place), one) for place in (parts, parts / "run.pansrec")):
         again = pans.replay(found, found.bundle())
         assert (again.as_recorded, again.sha256) == (True, wanted.decisions_sha256)
-    assert repr(open_recording(parts / "run.pansrec")) == f"<Recording run.pansrec: {one.n_decisions} decisions, SIMULATED>"
+    assert (
+        repr(open_recording(parts / "run.pansrec"))
+        == f"<Recording run.pansrec: {one.n_decisions} decisions, SIMULATED>"
+    )
 
 
 def test_a_page_reads_each_part_as_often_however_many_there_are(
