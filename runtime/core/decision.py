@@ -111,9 +111,10 @@ def rows_of(decisions: Sequence[Decision]) -> npt.NDArray[np.void]:
     return decisions.rows if isinstance(decisions, RowDecisions) else np.array(decisions, DECISION_DTYPE)
 
 
-def known_and_right(rows: npt.NDArray[np.void]) -> tuple[int, int]:
+def known_and_right(rows: npt.NDArray[np.void], n_classes: int = NO_LABEL) -> tuple[int, int]:
     """Return how many of the decisions have a known truth, and how many of these are right: one without a label is not."""
-    return int(np.count_nonzero(rows["truth"] >= 0)), int(np.count_nonzero(rows["label"] == rows["truth"]))
+    known = (rows["truth"] >= 0) & (rows["truth"] < n_classes)
+    return int(np.count_nonzero(known)), int(np.count_nonzero(known & (rows["label"] == rows["truth"])))
 
 
 class Action(NamedTuple):

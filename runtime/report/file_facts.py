@@ -14,7 +14,7 @@ import numpy as np
 from pans.runtime.bundle.automaton import Automaton, shortest_walk
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.bundle.optics import Analyser, amplification
-from pans.runtime.core.decision import DecisionFlag, known_and_right
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag, known_and_right
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import Recording
@@ -107,11 +107,12 @@ def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
 
 def _recording_facts(recording: Recording) -> dict[str, Any]:
     bundle = recording.bundle() if recording.bundle_place else None
+    n_classes = NO_LABEL if bundle is None else len(bundle.classes)
     abstained = clicks = known = right = 0
     for rows in together(recording.iter_decisions()):
         abstained += int(np.count_nonzero(rows["flags"] & int(DecisionFlag.ABSTAINED)))
         clicks += int(rows["clicks"].sum(dtype=np.int64))
-        more_known, more_right = known_and_right(rows)
+        more_known, more_right = known_and_right(rows, n_classes)
         known, right = known + more_known, right + more_right
     header = dict(recording.header)
     if isinstance(profile := header.pop("profile", None), dict):
@@ -129,7 +130,7 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "abstained": abstained,
         "decisions_sha256": recording.decisions_sha256,
         "clicks_mean": clicks / recording.n_decisions if recording.n_decisions else None,
-        "accuracy": right / known if known and (bundle is None or bundle.picture_shape is None) else None,
+        "accuracy": right / known if known else None,
         "messages": sum(1 for _ in recording.messages()),
         "answers": sum(1 for _ in recording.answers()),
         "handshakes": handshakes(recording),
