@@ -20,7 +20,7 @@ from pans.runtime.flow.matching import abort_reason
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import iter_exposures
-from pans.runtime.record.parts import first_decision
+from pans.runtime.record.parts import earlier_parts, first_decision
 from pans.runtime.record.recording import together
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.words import dark_words, rows_of, stage_rows
@@ -318,6 +318,7 @@ def run_page(recording: Recording) -> bytes:
     confusion = passing[1] if passing else decisions.confusion
     return render(
         "run.html",
+        earlier=earlier_parts(recording),
         told_dark=dark_words(summary.get("dark") or {}, calibrated=bool(summary.get("calibration"))),
         recording=recording,
         summary=summary,
