@@ -120,12 +120,12 @@ def headline(history: History) -> str:
     picture, expected = history.picture, history.begin.get("expected", 0)
     decisions = picture["decisions"]
     accuracy = f" · accuracy {picture['right'] / picture['known']:.1%}" if picture["known"] else ""
-    p99 = quantile_us(history.latency, 0.99) or 0.0  # 0 in virtual time
+    p99 = quantile_us(history.latency, 0.99) or 0.0  # next to nothing in virtual time
     dark, _, level = dark_state(picture)
     return (
         f"{decisions}{f' of {expected}' if expected else ''} decisions{accuracy}"
         f" · {picture['clicks'] / max(decisions, 1):.2f} clicks each"
-        + (f" · p99 {p99 / 1000:.2f} ms" if p99 else "")
+        + (f" · p99 {p99 / 1000:.2f} ms" if p99 >= 5 else "")
         + f" · late {picture['late']} · lost {picture['lost_exposures']}"
         + (f" · dark counts: {dark}" if level not in ("", "good") else "")
     )
@@ -147,6 +147,9 @@ def dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
     expected = picture.get("dark_expected")
     if expected is None or not picture["dark_exposures"]:
         return "", "", ""
+    if picture.get("dark_changed"):  # and is over
+        again = "as expected again"
+        return again, f"{again}, after a change whose counts are in the rate", "good"
     low, high = wilson_interval(picture["dark_clicks"], picture["dark_exposures"])
     if low <= picture["dark_high"] and high >= picture.get("dark_low", expected):
         rise = f"a mean above {high / expected:.3g} times the expected rate is excluded"
@@ -204,7 +207,8 @@ def health(history: History) -> list[tuple[str, str, str]]:
     some = sums if sums["dark_exposures"] > 0 else picture
     dark, exposures = some["dark_clicks"], some["dark_exposures"]
     words, _, level = dark_state(picture)
-    rate = f"{dark / exposures:.2g} dark counts per exposure" if exposures else "No dark exposures yet"
+    when = " in the last minute" if some is sums else ""
+    rate = f"{dark / exposures:.2g} dark counts per exposure{when}" if exposures else "No dark exposures yet"
     if dark and picture.get("dark_states"):  # of the counts that stand here, like the rate
         words = f"{number(dark / exposures / picture['dark_expected'])} times the expected rate"
     detector = level or "note", f"{rate}{f', {words}' if words else ''}."

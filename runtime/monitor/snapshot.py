@@ -148,6 +148,7 @@ class Snapshots:
             "dark_low": float(watch.low.mean()),
             "dark_high": float(watch.high.mean()),
             "dark_alarm_after": watch.alarm_after(),
+            "dark_changed": bool(guard.findings),
             "dark_states": [
                 [one.level, rates[list(one.channels)].mean() / one.expected, one.words, one.since * watch.n_channels]
                 for one in sorted(guard.health.present, key=lambda one: -LEVELS.index(one.level))

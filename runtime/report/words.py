@@ -113,7 +113,7 @@ def dark_words(dark: Facts, *, calibrated: bool) -> str:
 
     A calibrated rate is an interval, which the summary does not have: then only a rate that may be the expected one is judged.
     """
-    if not dark.get("exposures") or not dark.get("expected") or dark.get("alarm") or dark.get("present"):
+    if not dark.get("exposures") or not dark.get("expected") or dark.get("alarm") or dark.get("findings"):
         return ""
     watched = dark.get("channels") or (dark,)  # which leaves out afterpulses
     counts = {f"dark_{name}": sum(row[name] for row in watched) for name in ("exposures", "clicks")}

@@ -61,7 +61,7 @@ def test_a_recording_s_page(demo: Path, tmp_path: Path) -> None:
     assert "Latency" not in words  # in virtual time
     assert len(page) < 1_000_000
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"|url\((?!#)|<script|@import', page) == []
-    assert "docs/" not in words
+    assert "docs/" not in words.replace(read_recording(demo).header["command"], "")  # which is that of these tests
 
 
 def test_the_confusion_on_the_page_is_that_of_the_decisions(demo: Path, tmp_path: Path) -> None:
