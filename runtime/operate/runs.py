@@ -23,20 +23,13 @@ import numpy as np
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, warn
 from pans.runtime.cli.option_fields import refuse_without
-from pans.runtime.container import (
-    FILE_PROLOGUE,
-    check_prologue,
-    open_regular,
-    parse_json_object,
-    read_block,
-    skim_blocks,
-)
+from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block
 from pans.runtime.core.decision import known_and_right
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import LATEST, RUNS, locked
 from pans.runtime.ranges import Range
 from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
-from pans.runtime.record.log import LogReader
+from pans.runtime.record.log import skim_decisions
 from pans.runtime.record.parts import part_number
 from pans.runtime.safe_text import one_line
 
@@ -154,15 +147,9 @@ def _end(path: Path) -> dict[str, Any]:
 
 def _as_far_as(recordings: Sequence[Path]) -> dict[str, Any]:
     """Return decisions and accuracy of a run that was cut, from its decision log alone; {} of a large one, and without any."""
-    if sum(path.stat().st_size for path in recordings) > LOG_MAX_BYTES:
-        return {}
     sums = np.zeros(3, np.int64)
-    for path in recordings:
-        with suppress(PansError, OSError), open_regular(path) as file:
-            log = LogReader()
-            for payload in skim_blocks(file, Kind.DECISIONS, LIMITS):
-                rows = log.rows(payload, str(path))
-                sums += len(rows), *known_and_right(rows)
+    for rows in skim_decisions(recordings, LOG_MAX_BYTES):
+        sums += len(rows), *known_and_right(rows)
     decisions, known, right = sums.tolist()
     return {"decisions": decisions, "accuracy": right / known if known else None} if decisions else {}
 

@@ -13,10 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pans.runtime.container import open_regular, skim_blocks
-from pans.runtime.errors import DamagedFileError
-from pans.runtime.record.format import LIMITS, Kind
-from pans.runtime.record.log import LogReader
+from pans.runtime.record.log import skim_decisions
 from pans.runtime.report.words import accuracy_interval
 
 from .charts import spark
@@ -47,23 +44,9 @@ def _spark(run: Run) -> Any:
 
 
 def accuracy_over(recordings: Sequence[Path]) -> list[float]:
-    """Return the share of right decisions in stretches of a run; empty where it is not known or the recordings are large.
-
-    The blocks are not checked against the rest of their file.
-    """
-    if sum(path.stat().st_size for path in recordings) > LOG_MAX_BYTES:
-        return []
-    right: list[np.ndarray] = []
-    for path in recordings:
-        log = LogReader()
-        try:
-            with open_regular(path) as file:
-                for payload in skim_blocks(file, Kind.DECISIONS, LIMITS):
-                    rows = log.rows(payload, str(path))
-                    known = rows[rows["truth"] >= 0]
-                    right.append(known["label"] == known["truth"])
-        except (DamagedFileError, OSError, ValueError):
-            break
+    """Return the share of right decisions in stretches of a run; empty where it is not known or the recordings are large."""
+    known = (rows[rows["truth"] >= 0] for rows in skim_decisions(recordings, LOG_MAX_BYTES))
+    right = [rows["label"] == rows["truth"] for rows in known]
     every = np.concatenate([np.zeros(0, np.bool_), *right])
     return [float(one.mean()) for one in np.array_split(every, min(SPARKS, len(every) // 10 or 1)) if len(one)]
 

@@ -13,20 +13,23 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.container import open_regular, skim_blocks
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.decision import RUN_DTYPE as RUN_DTYPE
 from pans.runtime.core.decision import VERDICT_DTYPE as VERDICT_DTYPE
 from pans.runtime.core.decision import VERDICT_FIELDS as VERDICT_FIELDS
-from pans.runtime.errors import DamagedFileError
+from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.wire.framing import read_only
 
-from .format import LONG_VERDICT
+from .format import LIMITS, LONG_VERDICT, Kind
 
 BLOCK_ROWS = 1 << 14  # of one block of ours: 1.2 MB when nothing repeats
 ROWS_MAX = 1 << 18  # of one block that is read, so that a small file cannot ask for much memory
@@ -136,6 +139,20 @@ class LogReader:
     def hexdigest(self) -> str:
         """Return the SHA-256 (hex) of all rows so far."""
         return self._hash.hexdigest()
+
+
+def skim_decisions(recordings: Sequence[Path], most_bytes: int) -> Iterator[NDArray[np.void]]:
+    """Yield the decisions of these files, DECISION_DTYPE (n,), of each as far as it can be read; none of more than `most_bytes` together.
+
+    Their decision logs alone are read. The blocks are not checked against the rest of their file.
+    """
+    if sum(path.stat().st_size for path in recordings) > most_bytes:
+        return
+    for path in recordings:
+        log = LogReader()
+        with suppress(PansError, OSError, ValueError), open_regular(path) as file:
+            for payload in skim_blocks(file, Kind.DECISIONS, LIMITS):
+                yield log.rows(payload, str(path))
 
 
 class _LogHash:
