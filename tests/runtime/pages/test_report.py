@@ -22,6 +22,7 @@ from pans.runtime.pages.run import PHASES, Decisions, advice_on, is_virtual, led
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list, iter_exposures
 from pans.runtime.record.format import TIMING_DTYPE
+from pans.runtime.record.log import skim_decisions
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.wire.messages import DARK_PATTERN
 
@@ -258,6 +259,10 @@ def test_a_folder_of_runs_has_a_line_and_a_picture_each(demo: Path, tmp_path: Pa
     assert np.average(right, weights=[len(p) for p in np.array_split(rows, len(right))]) == pytest.approx(
         summary["accuracy"]
     )
+    size = demo.stat().st_size
+    for most, read in ((size - 1, 0), (2 * size - 1, 0), (2 * size, 2 * len(rows))):  # of all files together
+        paths = [demo] if most < size else [demo, demo]
+        assert sum(map(len, skim_decisions(paths, most))) == read
     (tmp_path / "empty").mkdir()
     assert "no runs" in pans.refuses("report", tmp_path / "empty", "-o", tmp_path / "none.html")
 
