@@ -31,6 +31,7 @@ class Stop:
         self.raised = False  # KeyboardInterrupt, wherever the main thread was
         self._continuous = continuous
         self._waits = False  # a signal that came while libraries were loaded comes again
+        self._again: threading.Timer | None = None
 
     def request(self, why: str) -> None:
         """Ask for an end at the end of a turn, from another thread; a signal that came before is the reason."""
@@ -43,11 +44,18 @@ class Stop:
         self.word = ASKED_TO_STOP if self._continuous and signum == signal.SIGTERM else INTERRUPTED
         if (second or not self.polled) and _is_loading(frame):
             self._waits = True
-            again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), signum))
-            again.daemon = True
-            again.start()
+            self._again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), signum))
+            self._again.daemon = True
+            self._again.start()
         elif second or not self.polled:
             self.raised = True
+            raise KeyboardInterrupt(self.word)
+
+    def obey(self) -> None:
+        """Raise KeyboardInterrupt where a signal has asked for an end; it does not come again then."""
+        if self.word:
+            if self._again is not None:
+                self._again.cancel()
             raise KeyboardInterrupt(self.word)
 
 

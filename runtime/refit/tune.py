@@ -417,8 +417,7 @@ class Tuning:
             )
             watching = Observers(lambda _, output: log.note(output.decisions), stop=self.stop, acts=False)
             result = run_live(link, self.profile, bundle, plan, core, config, None, None, watching)
-        if self.stop.word:
-            raise KeyboardInterrupt(self.stop.word)
+        self.stop.obey()
         if result.link_lost or len(log.counts) != len(log.decisions) or not log.counts:
             what = "lost during" if result.link_lost else "no decision in"
             raise LinkError(f"{self.device}: {what} trial {number}: {result.ended}")

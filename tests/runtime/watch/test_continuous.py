@@ -25,7 +25,7 @@ from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.commands.one_run import _exit_code
 from pans.runtime.core.decision import DECISION_DTYPE
-from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
+from pans.runtime.live.continuous import AGAIN_S, ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
 from pans.runtime.live.run_options import RunOptions
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.parts import parts_in
@@ -106,6 +106,20 @@ def test_signals_become_words_while_somebody_looks() -> None:
         asked = Stop(continuous=continuous)
         with pytest.raises(KeyboardInterrupt, match=word):  # nobody looks
             asked.ask(signum, None)
+
+
+def test_a_signal_that_came_while_a_library_loaded_comes_again_unless_it_was_obeyed() -> None:
+    loading: Any = SimpleNamespace(f_globals={"__name__": "numba.core"}, f_back=None)
+    with stop_signals(continuous=False) as stop:
+        stop.obey()
+        stop.ask(signal.SIGTERM, loading)
+        with pytest.raises(KeyboardInterrupt, match=INTERRUPTED):
+            time.sleep(10 * AGAIN_S)
+    with stop_signals(continuous=False) as stop:
+        stop.ask(signal.SIGTERM, loading)
+        with pytest.raises(KeyboardInterrupt, match=INTERRUPTED):
+            stop.obey()
+        time.sleep(10 * AGAIN_S)  # and no more
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs SIGHUP")
