@@ -286,6 +286,26 @@ def read_block(file: BinaryIO, index: int, chain: int, limits: Mapping[int, int]
     return Block(index, kind, payload, file.tell(), payload_crc)
 
 
+def last_block(file: BinaryIO, wanted: int, chain: int, limits: Mapping[int, int], where: str) -> Block | None:
+    """Return the first block of kind `wanted` from the file's position on, None if the file does not end with it.
+
+    `chain` seeds the block at the file's position. Payloads before the wanted block are passed over, so that no bytes in them are taken
+    for a block. DamagedFileError if the wanted block was altered.
+    """
+    index = 0
+    while len(head := file.read(_BLOCK_HEADER.size)) == _BLOCK_HEADER.size:
+        length, _, kind, header_crc = _BLOCK_HEADER.unpack(head)
+        if zlib.crc32(head[:-4], chain) != header_crc or length > limits.get(kind, 0):
+            return None
+        if kind == wanted:
+            file.seek(-_BLOCK_HEADER.size, os.SEEK_CUR)
+            block = read_block(file, index, chain, limits, where)
+            return None if file.read(1) else block
+        file.seek(length, os.SEEK_CUR)
+        index, chain = index + 1, int.from_bytes(file.read(_CRC.size), "little")
+    return None
+
+
 def skim_blocks(file: BinaryIO, wanted: int, limits: Mapping[int, int]) -> Iterator[bytes]:
     """Yield the payloads of the blocks of kind `wanted` after the prologue, as far as they seem to be blocks: nothing is checked."""
     file.seek(FILE_PROLOGUE.size)

@@ -1,14 +1,13 @@
 """`pans runs`: list what lies in a folder of runs (date, bundle, verdict, decisions, size), and prune it.
 
 No file is deleted that no run of pans has written, and none of a run that is under way. A recording is read as far as it is needed: its
-header, and its END, which `read_recording` would check against all bytes.
+header, the headers of its blocks, and its END, which `read_recording` would check against all bytes.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +22,14 @@ import numpy as np
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, warn
 from pans.runtime.cli.option_fields import refuse_without
-from pans.runtime.container import FILE_PROLOGUE, check_prologue, open_regular, parse_json_object, read_block
+from pans.runtime.container import (
+    FILE_PROLOGUE,
+    check_prologue,
+    last_block,
+    open_regular,
+    parse_json_object,
+    read_block,
+)
 from pans.runtime.core.decision import known_and_right
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import LATEST, RUNS, locked
@@ -36,7 +42,6 @@ from pans.runtime.safe_text import one_line
 OURS = re.compile(r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock")
 RUN_LOCK = ".pans-run.lock"
 LOG_MAX_BYTES = 1 << 26  # of a run that was cut, in whose decision log it is looked how far it went
-END_MAX_BYTES = 1 << 24  # read from the end of a recording, in which its END is looked for
 KEEP = Range(0, 1_000_000, whole=True)
 _TIMES = {"s": 1, "min": 60, "h": 3600, "d": 86400, "w": 7 * 86400, "y": 365 * 86400}
 _SIZES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
@@ -136,12 +141,13 @@ def _begin(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def _end(path: Path) -> dict[str, Any]:
-    """Return the summary of a recording's END, {} without one; its bytes are not checked against the whole file."""
-    with suppress(OSError), open_regular(path) as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - END_MAX_BYTES))
-        tail = file.read(END_MAX_BYTES)
-        summary = _object_at(tail, tail.rfind(b'{"blocks":')).get("summary")
-        return summary if isinstance(summary, dict) else {}
+    """Return the summary of the END that a recording ends with, {} without one; the payloads before it are not checked."""
+    with suppress(PansError, OSError), open_regular(path) as file:
+        where = str(path)
+        chain = check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, FORMAT_VERSION, where)
+        if (block := last_block(file, Kind.END, chain, LIMITS, where)) is not None:
+            summary = parse_json_object(block.payload, where).get("summary")
+            return summary if isinstance(summary, dict) else {}
     return {}
 
 

@@ -14,9 +14,12 @@ import pytest
 from commands import Pans, fixed_run, json_of
 
 from pans.runtime.cli import main
+from pans.runtime.container import block_ends, canonical_json
 from pans.runtime.operate.runs import RUN_LOCK, Run, duration_s, prunable, run_of, size_bytes
 from pans.runtime.outputs import locked
 from pans.runtime.record import read_recording
+from pans.runtime.record.format import Kind
+from pans.runtime.record.recording_file import RecordingFile
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
 
@@ -74,6 +77,35 @@ def test_a_cut_run_and_one_that_goes_on(root: Path, capsys: pytest.CaptureFixtur
     assert (whole["verdict"], whole["decisions"]) == ("cut", len(rows))
     assert whole["accuracy"] == np.mean(rows["label"] == rows["truth"])
     assert (found["parts"]["verdict"], found["parts"]["locked"]) == ("running", True)
+
+
+def test_no_bytes_of_the_device_are_taken_for_the_end_of_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run was killed: WELCOME's text reads as an END, and a message holds a whole block of one, where the file was cut."""
+    summary = {"verdict": "PASS", "decisions": 99, "accuracy": 1.0}
+    text = canonical_json({"blocks": 1, "summary": summary})
+    with monkeypatch.context() as patch:
+        patch.setattr("pans.firmware_sim.device.facts.FIRMWARE", text.decode())
+        assert main([*fixed_run(20), "--out", str(tmp_path / "killed")]) in (0, 1)
+    path = tmp_path / "killed" / "run.pansrec"
+    recording = read_recording(path)
+    assert run_of(path.parent).summary == recording.summary  # type: ignore[union-attr]
+    cut = path.read_bytes()[: -len(canonical_json(dict(recording.summary)))]
+    assert text in cut
+    path.write_bytes(cut)
+    forged = RecordingFile(tmp_path / "forged.pansrec", {})
+    seed = bytes(4)  # what stands before a block's header is the checksum that it begins from
+    head, tail, _ = block_ends(Kind.END, 1, 0, text)
+    forged.write(*forged.framed(Kind.MESSAGES, seed + head + text + tail)[:2])
+    forged.take_name()
+    forged.close()
+    (tmp_path / "forging").mkdir()
+    forged.path.rename(tmp_path / "forging" / "run.pansrec")
+    runs = {Path(run["folder"]).name: run for run in listed(capsys, tmp_path)["runs"]}
+    assert {name: run["verdict"] for name, run in runs.items()} == {"killed": "cut", "forging": "cut"}
+    assert runs["killed"]["decisions"] == 20
+    assert runs["forging"]["decisions"] is None
 
 
 def test_prune_lists_first_and_deletes_only_what_is_ours(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
