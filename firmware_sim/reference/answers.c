@@ -40,10 +40,12 @@ enum pans_status refuse_number(struct pans_device *d, enum pans_status status, c
 
 /* -- answers -- */
 
-static void send(struct pans_device *d, uint32_t payload_bytes, enum message type, uint32_t session)
+static bool send(struct pans_device *d, uint32_t payload_bytes, enum message type, uint32_t session)
 {
-    if (!ring_put_frame(&d->answers, d->scratch, HEADER_BYTES + payload_bytes, type, session))
+    bool put = ring_put_frame(&d->answers, d->scratch, HEADER_BYTES + payload_bytes, type, session);
+    if (!put)
         d->counters.answers_lost++; /* the line takes nothing: the host asks again, and STATUS comes every second */
+    return put;
 }
 
 void send_ack(struct pans_device *d)
@@ -67,8 +69,8 @@ static void send_exposed(struct pans_device *d)
     put32(at + 8, (uint32_t)e->length);
     put64(at + 12, e->start_at);
     put64(at + 20, e->length_at);
-    send(d, 28, EXPOSED, d->session);
-    d->evidence = (struct evidence){0};
+    if (send(d, 28, EXPOSED, d->session))
+        d->evidence = (struct evidence){0}; /* what found no room goes with the next one */
 }
 
 void send_status(struct pans_device *d)

@@ -124,20 +124,38 @@ class PlanRules:
             return Contradiction("claimed_drops", claimed, status.drops, claimed)
         return None
 
+    def of_exposed(self, told: Exposed, n_told: int, end_exposure: int) -> Contradiction | None:
+        """Exposures that lie beyond the plan, were told of before (`n_told`), or are farther apart than as many as it tells of."""
+        named = sorted((told.start_exposure, told.length_exposure))
+        last = max(n_told + told.exposures - 1, named[1])
+        if last >= end_exposure:
+            return Contradiction("exposed", told.start_exposure, last, end_exposure - 1)
+        if named[0] < n_told or named[1] - named[0] >= told.exposures:
+            return Contradiction("exposed", told.start_exposure, named[0], max(n_told, named[1] - told.exposures + 1))
+        return None
+
 
 NOTHING_EXPOSED = Exposed(0, 0, 0, 0, 0)
 ANY_CLASS = 1 << 15  # where nothing is classified, every truth that fits its field is one
 PART_MARKS = 16  # of them that a part of a recording begins with
+TAIL_US = 2e6  # STATUS comes every second: so much of a stream that broke off may lie behind the last EXPOSED
+I32_MAX = (1 << 31) - 1
 
 
-def exposure_timing(told: Exposed, tick_us: float, tolerance_us: float, *, announced: bool) -> dict[str, Any]:
-    """Return when exposures happened, under the summary's keys, judged; what the device has not told is None."""
+def exposure_timing(
+    told: Exposed, tick_us: float, tolerance_us: float, *, announced: bool, untold: int = 0
+) -> dict[str, Any]:
+    """Return when exposures happened, under the summary's keys, judged; what the device has not told is None.
+
+    `untold` exposures have ended of which EXPOSED did not tell, though it should have.
+    """
     start_us, length_us = told.start_error * tick_us, told.length_error * tick_us
     keys = ("within", "worst_start_us", "worst_length_us", "worst_start_exposure", "worst_length_exposure")
     within = max(abs(start_us), abs(length_us)) <= tolerance_us
     values = (within, start_us, length_us, told.start_exposure, told.length_exposure)
     facts = dict(zip(keys, values if told.exposures else [None] * len(keys)))
-    return {"announced": announced, "exposures": told.exposures, "tolerance_us": tolerance_us, **facts}
+    counts = {"exposures": told.exposures, "untold": untold if announced else 0}
+    return {"announced": announced, **counts, "tolerance_us": tolerance_us, **facts}
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,13 +169,17 @@ class Place:
     last_tick: int
     core: dict[str, Any]
     heard: bytes = b""  # StreamTracker.memory; b"" in recordings that were made without
+    # exposures that EXPOSED has told of, their largest start error, how far blocks were from the plan, and how far that was judged;
+    # () in recordings that were made without
+    told: tuple[int, ...] = ()
 
     def facts(self) -> dict[str, Any]:
         """Return it as it stands at the beginning of a part of a recording; JSON has no NaN."""
         marks = [[*mark[:5], None if math.isnan(mark.photons) else mark.photons, *mark[6:]] for mark in self.marks]
         numbers = {"decisions": self.decisions, "abstained": self.abstained, "last_tick": self.last_tick}
         heard = b64encode(self.heard).decode()
-        return {"tracker": list(self.tracker), "marks": marks, **numbers, "core": self.core, "heard": heard}
+        device = {"heard": heard, "told": list(self.told)}
+        return {"tracker": list(self.tracker), "marks": marks, **numbers, "core": self.core, **device}
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Place:
@@ -171,7 +193,10 @@ class Place:
         heard = b64decode(facts.get("heard", ""), validate=True)
         if len(heard) not in (0, MEMORY_BYTES):
             raise ValueError(f"heard has {len(heard)} bytes, expected {MEMORY_BYTES}")
-        return cls((seq, exposure, drops), marks, decisions, abstained, last_tick, facts["core"], heard)
+        told = tuple(map(int, facts.get("told", ())))
+        if len(told) not in (0, 4):
+            raise ValueError(f"told has {len(told)} numbers, expected 4")
+        return cls((seq, exposure, drops), marks, decisions, abstained, last_tick, facts["core"], heard, told)
 
 
 class Follower:
@@ -194,6 +219,7 @@ class Follower:
         self.last_tick = 0
         self.jitter_ticks = 0  # most that a block's end differed from the plan
         self.exposed = NOTHING_EXPOSED  # what the device told of all streams
+        self.untold = 0  # exposures of all streams that ended, of which EXPOSED should have told
         self.plan = plan
         self._rules = PlanRules(plan, n_classes, moving=self.moving)
         self._exposure_ticks = plan.exposure_ticks
@@ -201,8 +227,10 @@ class Follower:
         self.end_exposure = self._exposures_of(n_cycles)
         self._begun = False
         self._idle_steps: Any = None
-        self._exposed = NOTHING_EXPOSED  # the latest, and how many exposures all of this stream have
-        self._n_exposed = 0
+        self._exposed = NOTHING_EXPOSED  # the latest of this stream
+        # exposures that all of this stream have told of; None in a part of an old recording
+        self._n_told: int | None = 0
+        self._worst_told = self._jitter_known = 0  # their largest start error; what has been judged of `jitter_ticks`
         self._status: Status | None = None  # the latest of this stream
         self._told_end: int | None = None  # tick of the first STATUS that told of the end
         self._told_wrong = False  # whether that one has been found to contradict the plan
@@ -269,7 +297,8 @@ class Follower:
         self.marks.keep(PART_MARKS)
         marks = tuple(self.marks.latest())
         numbers = self.n_decisions, self.n_abstained, self.last_tick
-        return Place(self.tracker.position, marks, *numbers, own, self.tracker.memory)
+        told = () if self._n_told is None else (self._n_told, self._worst_told, self.jitter_ticks, self._jitter_known)
+        return Place(self.tracker.position, marks, *numbers, own, self.tracker.memory, told)
 
     def resume(self, place: Place) -> None:
         """Go on from the place that `part` returned, right after `begin`."""
@@ -277,6 +306,7 @@ class Follower:
         for mark in place.marks:
             self.remember(mark)
         self.n_decisions, self.n_abstained, self.last_tick = place.decisions, place.abstained, place.last_tick
+        self._n_told, self._worst_told, self.jitter_ticks, self._jitter_known = place.told or (None, 0, 0, 0)
         self._go_on_from(place.core)
 
     # -- one stream ----------------------------------------------------------------------------------------------------
@@ -290,7 +320,7 @@ class Follower:
             self.marks.keep(0)
         self._begun, self.completed, self._told_end, self._told_wrong, self._status = True, False, None, False, None
         self.start_tick, self.end_exposure = start_tick, self._exposures_of(n_cycles)
-        self._exposed, self._n_exposed = NOTHING_EXPOSED, 0
+        self._exposed, self._n_told, self._worst_told, self._jitter_known = NOTHING_EXPOSED, 0, 0, self.jitter_ticks
         return output
 
     def begin_later(self, start_tick: int) -> None:
@@ -305,6 +335,8 @@ class Follower:
         if status is not None and status.state in (DeviceState.IDLE, DeviceState.SAFE):
             return self._finish(status)
         self.completed = True
+        due = self._rules.begun_by(self.last_tick - self.start_tick - round(TAIL_US / self.plan.tick_us))
+        self._count_untold(due if status is None else max(due, status.next_exposure - 1))  # one may be under way
         unknown = StreamEndUnknown(self.tracker.next_exposure)
         output = Output([], [unknown], None)
         if self._nothing_left():
@@ -348,8 +380,16 @@ class Follower:
     def _take_mark(self, mark: Mark) -> Output:
         wrong = self._rules.of_mark(mark, self.tracker.next_exposure, self.end_exposure)
         if wrong is None:
-            self.remember(mark)
+            wrong = self._other_class(mark)
+            self.remember(mark)  # also then: recordings made before this rule must replay to the same decisions
         return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
+
+    def _other_class(self, mark: Mark) -> Contradiction | None:
+        """Whether an earlier mark of the same object named another class: a device would choose its accuracy."""
+        known = None if mark.object_index == NO_OBJECT else self.marks.get(mark.object_index)
+        if known is None or known.truth == mark.truth:
+            return None
+        return Contradiction("truth", mark.exposure_index, mark.truth, known.truth)
 
     def _contradicts(self, wrong: Contradiction) -> Contradiction:
         self.contradictions[wrong.what] += 1
@@ -362,13 +402,31 @@ class Follower:
             if told == self._exposed:
                 return Output([], [], None)
             self._exposed = told
-            last = max(self._n_exposed + told.exposures - 1, told.start_exposure, told.length_exposure)
-            if last >= self.end_exposure:
-                wrong = Contradiction("exposed", told.start_exposure, last, self.end_exposure - 1)
+            wrong = self._rules.of_exposed(told, self._n_told or 0, self.end_exposure)
+            if wrong is not None:
                 return Output([], [self._contradicts(wrong)], None)
-            self._n_exposed += told.exposures
+            if self._n_told is not None:
+                self._n_told += told.exposures
+            self._worst_told = max(self._worst_told, abs(told.start_error))
             self.exposed = self.exposed.joined(told)
+            if (wrong := self._late_blocks()) is not None:
+                return Output([], [self._contradicts(wrong)], None)
         return Output([], [], None)
+
+    def _late_blocks(self) -> Contradiction | None:
+        """Compare the ticks of blocks with EXPOSED, once it has told of all that came: none may be farther from the plan than that."""
+        if not self._n_told or self._n_told < self.tracker.next_exposure:
+            return None
+        told = max(self._worst_told + 1, self._jitter_known)  # a device may round the tick of a block by itself
+        if min(self.jitter_ticks, I32_MAX) <= told:
+            return None
+        self._jitter_known = self.jitter_ticks
+        return Contradiction("exposed", self.tracker.next_exposure - 1, self.jitter_ticks, self._worst_told)
+
+    def _count_untold(self, due: int) -> None:
+        """Account for what EXPOSED has not told of: of the stream's first `due` exposures, those that came or were lost."""
+        if self._n_told is not None:
+            self.untold += max(0, min(due, self.tracker.next_exposure) - self._n_told)
 
     def _on_status(self, frame: Frame) -> Output:
         """When the device says that the plan is done, settle what will never be complete.
@@ -384,7 +442,11 @@ class Follower:
         if self.completed:
             wrong = self._rules.of_status(status, self.start_tick, self.end_exposure)
             return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
-        self._status = status
+        wrong, self._status = self._takes_back(status), status
+        events: list[CoreEvent] = [] if wrong is None else [self._contradicts(wrong)]
+        return joined(Output([], events, None), self._settle_status(status))
+
+    def _settle_status(self, status: Status) -> Output:
         if (status.state, status.reason) != (DeviceState.IDLE, StateReason.COMPLETED):
             wrong = self._rules.of_status(status, self.start_tick, self.end_exposure)
             # one that ends a stream otherwise is judged when the stream is closed
@@ -398,18 +460,40 @@ class Follower:
             return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
         return self._finish(status)
 
+    def _takes_back(self, status: Status) -> Contradiction | None:
+        """What `status` takes back of an earlier STATUS, of EXPOSED, or of blocks that had ended by its tick.
+
+        A run that is stopped has one exposure less than had begun, as the one under way is not counted.
+        """
+        known, claimed = self._status, status.next_exposure
+        if known is not None and status.tick <= known.tick:
+            return None  # it came twice
+        least, dropped, most = self._n_told or 0, 0, claimed
+        if known is not None:
+            least, dropped = max(least, known.next_exposure - 1), known.drops
+            most = claimed if known.state in (DeviceState.ARMED, DeviceState.RUNNING) else known.next_exposure
+        if status.tick >= self.last_tick:
+            _, came, drops = self.tracker.position
+            least, dropped = max(least, came), max(dropped, drops)
+        if not min(least, self.end_exposure) <= claimed <= most:
+            return Contradiction("claimed_exposures", claimed, claimed, most if claimed > most else least)
+        if status.drops < dropped and claimed < 1 << 32:
+            return Contradiction("claimed_drops", claimed, status.drops, dropped)
+        return None
+
     def _finish(self, status: Status) -> Output:
         """Close the stream; what `status` claims beyond the plan or beyond what is believed is no gap but a contradiction."""
         self.completed = True
         wrong = None if self._told_wrong else self._rules.of_status(status, self.start_tick, self.end_exposure)
         end = min(status.next_exposure, self.end_exposure)
+        late = self._late_blocks()
         unexplained = self.tracker.counters.unexplained_drops
         gap = self.tracker.finish(end, status.drops)
+        self._count_untold(end)
         if wrong is None and self.tracker.counters.unexplained_drops != unexplained:
             wrong = Contradiction("closing_status", status.next_exposure, status.drops, self.tracker.next_exposure)
         events: list[CoreEvent] = [] if gap is None else [gap]
-        if wrong is not None:
-            events.append(self._contradicts(wrong))
+        events += [self._contradicts(one) for one in (wrong, late) if one is not None]
         return joined(Output([], events, None), self._skip_to(min(end, self.tracker.next_exposure), status.tick))
 
     def remember_rows(self, rows: npt.NDArray[np.void]) -> None:

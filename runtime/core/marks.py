@@ -22,6 +22,7 @@ class Marks:
         self._rows: Rows = np.zeros(2 * MAX_MARKS, MARK_DTYPE)
         self._objects: npt.NDArray[np.int64] = np.zeros(len(self._rows), np.int64)
         self._n = 0
+        self.following = 0  # above the numbers of all objects that are remembered
 
     def __len__(self) -> int:
         return len(self._latest())
@@ -42,9 +43,12 @@ class Marks:
             here = slice(self._n, self._n + len(some))
             self._rows[here], self._objects[here] = some, some["object_index"]
             self._n += len(some)
+            self.following = max(self.following, int(some["object_index"].max()) + 1)
 
     def get(self, number: int) -> Mark | None:
         """Return the mark of object `number`, None where it is not remembered."""
+        if number >= self.following:
+            return None
         objects = self._objects[: self._n]
         found = np.flatnonzero(objects == number)
         if not len(found):
@@ -69,6 +73,7 @@ class Marks:
         kept = kept[max(0, len(kept) - most) :].copy()
         self._n = len(kept)
         self._rows[: self._n], self._objects[: self._n] = kept, kept["object_index"]
+        self.following = self.following if len(kept) else 0
 
     def _latest(self) -> Rows:
         """Return the latest row of each object that is remembered."""

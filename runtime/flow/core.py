@@ -209,7 +209,7 @@ class FlowCore(Follower):
         """Copy what the core and its tracker know into the kernel's state."""
         state = self.walk.state
         load_core(self, state)
-        state[kernels.ASKS] = 0
+        state[kernels.ASKS], state[kernels.MARKED] = 0, self.marks.following
         state[kernels.WATCH_AT] = self.watched_frames + WATCHED_FRAMES if self.watches_empty else 1 << 62
 
     def store(self) -> None:
@@ -408,8 +408,10 @@ class FlowCore(Follower):
 
     def remember(self, mark: Mark) -> None:
         """See Follower."""
+        is_new = mark.object_index == NO_OBJECT or self.marks.get(mark.object_index) is None
         super().remember(mark)
-        self.matcher.add_mark(mark)
+        if is_new:
+            self.matcher.add_mark(mark)
 
     # -- parts of a recording ------------------------------------------------------------------------------------------
 

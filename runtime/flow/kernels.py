@@ -41,8 +41,8 @@ W, ON, OFF, LONGEST, REFRACTORY, BACKGROUND, VALLEY_FRAMES, VALLEY_SIGMA2 = rang
 
 # stream state, int64 (N_FACTS,): the columns of a core's state, and of a flow alone the most frames of a block, the frames of a cycle that
 # ends with a dark one (0: none does), from how many empty frames on they are told, the frames of a decision, objects so far, how often the
-# empty field was told, whether a pulse is asked for; ...
-MAX_BLOCK, DARK_EVERY, WATCH_AT, FRAMES, OBJECTS, TOLD, ASKS = range(core.N_STATE, core.N_STATE + 7)
+# empty field was told, above which numbers no passage has been marked, whether a pulse is asked for; ...
+MAX_BLOCK, DARK_EVERY, WATCH_AT, FRAMES, OBJECTS, TOLD, MARKED, ASKS = range(core.N_STATE, core.N_STATE + 8)
 # ... of a tape the middle of the next window in whole exposures and 2^-Q of one, the pitch and what it is by the settings, and how fast it
 # is followed; the window before (-1: not known) and its middle; the position
 MIDDLE, MIDDLE_PART, PITCH, NOMINAL_PITCH, TRACK, BEFORE, BEFORE_MIDDLE, BEFORE_PART, POSITION, N_FACTS = range(
@@ -319,7 +319,8 @@ def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
 
     TOOK_URGENT is a block of which a pulse is asked for.
 
-    A mark is only counted: who compares decisions with the truth looks for it in what was kept.
+    A mark is only counted: who compares decisions with the truth looks for it in what was kept. One of a passage that may have been marked
+    before is ODD.
     """
     state, payload = walk.state, start + _U(stream.BODY_HEADER)
     if not core.is_ours(buffer, start, stop, state):
@@ -329,6 +330,10 @@ def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
             return core.ODD
         if not stream.mark_fits(buffer, payload, state, state[core.N_CLASSES]):
             return core.ODD
+        number = np.int64(load4(buffer, payload + _U(4)))
+        if number < state[MARKED]:
+            return core.ODD
+        state[MARKED] = number + 1
         stream.go_on(state, np.int64(0))
         return core.TOOK_MARK
     if buffer[start] != stream.FRAMES:

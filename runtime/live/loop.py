@@ -235,7 +235,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
     found = dark_report(dark, int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
     guard: DarkGuard | None = getattr(run.core, "guard", None)
     fit, announced = run.connection.known_clock().fit, run.connection.session.tells_exposed
-    tolerance_us = profile.exposure_tolerance_us(run.plan.exposure_us)
+    told, tolerance_us = run.core.exposed, profile.exposure_tolerance_us(run.plan.exposure_us)
     return RunResult(
         tally=run.tally,
         timing=run.timing,
@@ -248,7 +248,9 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         page_faults=run.page_faults,
         device=device,
         slot_jitter_us=run.core.jitter_ticks * run.plan.tick_us,
-        exposure_timing=exposure_timing(run.core.exposed, run.plan.tick_us, tolerance_us, announced=announced),
+        exposure_timing=exposure_timing(
+            told, run.plan.tick_us, tolerance_us, announced=announced, untold=run.core.untold
+        ),
         wrong_patterns=int(tallies[WRONG_PATTERNS]),
         armed_after_s=run.armed_after_s,
         seconds=(run.now_ns() - run.start_ns) / NS_PER_S,

@@ -128,7 +128,7 @@ def _exposure_timing(recording: Recording, core: Follower) -> dict[str, Any]:
     welcomes = (decode_welcome(frame.payload) for frame in frames if frame.type == MessageType.WELCOME)
     announced = any(announces_exposed(welcome.facts) for welcome in welcomes)
     tolerance_us = parse_profile(toml, f"{recording.path}: its profile").exposure_tolerance_us(core.plan.exposure_us)
-    return exposure_timing(core.exposed, core.plan.tick_us, tolerance_us, announced=announced)
+    return exposure_timing(core.exposed, core.plan.tick_us, tolerance_us, announced=announced, untold=core.untold)
 
 
 class _Log:

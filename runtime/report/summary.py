@@ -215,7 +215,10 @@ def exposure_fault(timing: Mapping[str, Any], received: int = 0) -> str:
         told = f"the device announces EXPOSED, and told of none of {received} exposures"
         return f"{told}: pans conform --rule 15.1 tries it"
     if timing.get("within") is not False:
-        return ""
+        if not timing.get("untold"):
+            return ""
+        told = f"the device told of {timing['exposures']} exposures by EXPOSED, and of {timing['untold']} more that ended it told nothing"
+        return f"{told}: pans conform --rule 15.1 tries it"
     allowed_us = timing["tolerance_us"]
     worst = ((what, timing[f"worst_{what}_exposure"], timing[f"worst_{what}_us"]) for what in ("start", "length"))
     farther = (f"the {what} of exposure {n} was {us:+.3g} us off" for what, n, us in worst if abs(us) > allowed_us)

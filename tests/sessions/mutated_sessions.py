@@ -225,19 +225,30 @@ class Stage:
 
     def run(self, folder: Path, seed: int, *mutations: Mutation) -> Session:
         """Run one session with `mutations` and judge what can be judged of any."""
-        session, began_s, path = Session(), time.process_time(), folder / "fields.pansrec"
-        clock = DeviceClock(self.profile.clock.tick_hz)
-        device = Instrument(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
         exposures = OBJECTS * self.plan.cycles_per_object * self.plan.slots_per_cycle
         evidence = Evidence(exposures, len(self.bundle.classes), self.profile.clock.tick_hz)
-        link = MutatedLink(VirtualLink(device, clock, "fields"), mutations, evidence)
+        link = MutatedLink(self.link(Instrument, seed), mutations, evidence)
+        session = self.session(link, folder)
+        session.changed = link.changed
+        if session.summary is not None and session.summary.verdict == "PASS":
+            session.wrong += [f"PASS in spite of {mutation}" for mutation in link.impossible[:3]]
+        return session
+
+    def link(self, kind: Any, seed: int) -> VirtualLink:
+        """Return the link to a device that `kind` makes as `Instrument` is made."""
+        clock = DeviceClock(self.profile.clock.tick_hz)
+        device = kind(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
+        return VirtualLink(device, clock, "fields")
+
+    def session(self, link: Any, folder: Path, objects: int = OBJECTS) -> Session:
+        """Run one session of `objects` decisions behind `link` and judge what must hold of any."""
+        session, began_s, path = Session(), time.process_time(), folder / "fields.pansrec"
         try:
-            session.summary = self._run(link, path)
+            session.summary = self._run(link, path, objects)
         except PansError as error:
             session.error = f"{type(error).__name__}: {error.message}"
         except Exception:
             session.wrong.append(traceback.format_exc())
-        session.changed = link.changed
         if session.summary is not None:
             recording = read_recording(path)
             again = replay(recording, self.bundle)
@@ -245,19 +256,17 @@ class Stage:
                 session.wrong.append(f"a replay gives {again}, recorded are {recording.n_decisions} decisions")
         if (took_s := time.process_time() - began_s) > MAX_SESSION_S:
             session.wrong.append(f"it took {took_s:.1f} s of processor time, allowed {MAX_SESSION_S:g}")
-        if session.summary is not None and session.summary.verdict == "PASS":
-            session.wrong += [f"PASS in spite of {mutation}" for mutation in link.impossible[:3]]
         return session
 
-    def _run(self, link: MutatedLink, path: Path) -> Summary:
+    def _run(self, link: Any, path: Path, objects: int) -> Summary:
         # No claim on the processor: many sessions share it, and none is judged by its latencies.
-        config = RunOptions(n_cycles=OBJECTS * self.plan.cycles_per_object, deadline_us=1e5, realtime=False)
+        config = RunOptions(n_cycles=objects * self.plan.cycles_per_object, deadline_us=1e5, realtime=False)
         core = Core(self.plan, self.decider, 1, config.n_cycles)
         facts = {"shots": 1, "tick_hz": self.profile.clock.tick_hz, "backend": self.backend}
         header = {"config": {**facts, "drive": self.plan.drive, "confidence": 0.0}}
         with Recorder(path, header, overwrite=True) as recorder:
             result = run_live(link, self.profile, self.bundle, self.plan, core, config, recorder)
-            decisions = OBJECTS * self.plan.shots_per_object
+            decisions = objects * self.plan.shots_per_object
             summary = summarise(result, illumination=1.0, expected_decisions=decisions)
             recorder.close(summary.as_json())
         return summary

@@ -157,6 +157,9 @@ def strange(kind: str, message: bytes) -> list[bytes]:
         return [wire.encode_frame(frame.type, frame.payload[:-1], SESSION)]
     if kind == "drops":  # the device has dropped something
         return [wire.encode_frame(frame.type, frame.payload[:4] + b"\5\0\0\0" + frame.payload[8:], SESSION)]
+    if kind == "marked again":  # a mark becomes one of the first passage
+        of = b"\0" * 4 if frame.type == wire.MessageType.MARK else frame.payload[4:8]
+        return [wire.encode_frame(frame.type, frame.payload[:4] + of + frame.payload[8:], SESSION)]
     assert kind == "period"
     return [wire.encode_frame(frame.type, frame.payload[:24] + b"\7\0\0\0" + frame.payload[28:], SESSION)]
 

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 from c_core import COMPILER
-from c_device import needs_compiler
+from c_device import NONCE, Pair, needs_compiler
 
 from pans.firmware_sim.lab.core import FOLDER, core_sources
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.messages import MessageType, Opcode
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZERS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -54,6 +56,24 @@ def test_strange_input_harms_nothing(tmp_path: Path) -> None:
     assert figures["frames"] > 1000
     assert figures["armed"] > 3
     assert figures["blocks"] > 30
+
+
+@needs_compiler
+def test_what_exposed_had_to_tell_when_there_was_no_room_it_tells_later() -> None:
+    """More answers at once than the core holds, and a STOP behind them, whose EXPOSED and STATUS find no room."""
+    pair = Pair("sequential")
+    hz = pair.profile.clock.tick_hz
+    pair.open()
+    pair.arm(cycles=10_000)
+    pair.after(hz // 10)
+    before = len(pair.heard[1])
+    again = wire.encode_command(pair.last_id, Opcode.STOP, b"", NONCE)  # of an id that has been carried out: an ACK
+    pair.after(5, again * 400 + wire.encode_command(pair.last_id + 1, Opcode.STOP, b"", NONCE))
+    assert not any(frame.type == MessageType.STATUS for frame in pair.heard[1][before:])
+    pair.after(2 * hz)
+    statuses = [wire.decode_status(f.payload) for f in pair.heard[1] if f.type == MessageType.STATUS]
+    told = [wire.decode_exposed(f.payload).exposures for f in pair.heard[1] if f.type == MessageType.EXPOSED]
+    assert sum(told) == statuses[-1].next_exposure > 500
 
 
 @pytest.mark.parametrize("target", TARGETS)

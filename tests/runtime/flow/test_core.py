@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from flows import PERIOD_TICKS, SESSION, SETTINGS, feed, frame, make, plan_of, scene
+from flows import PERIOD_TICKS, SESSION, SETTINGS, feed, frame, make, mark, plan_of, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_flow import passages as naive_passages
@@ -89,6 +89,15 @@ def test_every_cell_is_decided_once_in_its_middle() -> None:
         assert passage.leave_tick == 1000 + (passage.last + 1) * PERIOD_TICKS
         assert decision.tick == 1000 + (decision.exposure_index + 1) * PERIOD_TICKS
         assert passage.clicks == 2 * length + length - 2 * (length // 3)
+
+
+@pytest.mark.parametrize(("again", "wrong"), [(2, {}), (3, {"truth": 1})])
+def test_a_passage_that_is_marked_again_is_one_passage_and_of_one_class(again: int, wrong: dict[str, int]) -> None:
+    core = make()
+    feed(core, scene((100, 60, 2)), marks=(mark(0, 130, 2, 30), mark(0, 131, again, 30)))
+    core.step(frame(wire.encode_status(Status(DeviceState.IDLE, StateReason.COMPLETED, 0, 0, 10**6, 1000), SESSION)))
+    assert core.contradictions == wrong
+    assert core.matcher.figures(1).passages["marks"] == 1
 
 
 def test_a_flickering_cell_is_one_cell() -> None:

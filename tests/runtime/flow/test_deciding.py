@@ -74,7 +74,7 @@ def test_each_decision_is_the_core_s(data: st.DataObject) -> None:
     changes: dict[str, Any] = dict(data.draw(st.sampled_from([{}, TAPE, FOLLOWED])))
     changes |= {"sure": data.draw(st.sampled_from([0.0, 0.6])), "gate_classes": ("a", "c")}
     messages = stream(words, block)
-    kinds = ["lost", "twice", "another session", "short", "drops", "period"]
+    kinds = ["lost", "twice", "another session", "short", "drops", "period", "marked again"]
     for place in sorted(data.draw(st.sets(st.integers(0, len(messages) - 1), max_size=4)), reverse=True):
         kind = data.draw(st.sampled_from(kinds))
         if kind == "period" and frame(messages[place]).type == MessageType.MARK:  # it has none
