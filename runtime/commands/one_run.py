@@ -124,9 +124,11 @@ def run_once(
     """
     check_together(options)
     profile = profile or load_profile(options.profile or "")
+    if options.deadline_us:  # it sizes the blocks, too
+        profile = replace(profile, timing=replace(profile.timing, decision_deadline_us=options.deadline_us))
     options = replace(
         options,
-        deadline_us=options.deadline_us or profile.timing.decision_deadline_us,
+        deadline_us=profile.timing.decision_deadline_us,
         started_ns=options.started_ns or time.perf_counter_ns(),
     )
     check_run_files(options)

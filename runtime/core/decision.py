@@ -118,9 +118,13 @@ def known_and_right(rows: npt.NDArray[np.void], n_classes: int = NO_LABEL) -> tu
 
 
 class Action(NamedTuple):
-    """A pulse that decision `number` asks for: output `channel` from `tick` on; worthless after `tick`. Absolute device ticks."""
+    """A pulse that decision `number` asks for: output `channel` from `tick` on; worthless after `tick`. Absolute device ticks.
+
+    The deadline of the decision counts from `end_tick`, the end of its last exposure.
+    """
 
     number: int
+    end_tick: int
     tick: int
     duration_ticks: int
     channel: int

@@ -316,7 +316,7 @@ class FlowCore(Follower):
     def _pulse(self, number: int, leave_tick: int) -> Action:
         """Return the pulse that decision `number` asks for, whose object left at `leave_tick`."""
         tick = leave_tick + self.limits.gate_delay_ticks
-        return Action(number, tick, self.limits.gate_ticks, self.settings.gate_channel)
+        return Action(number, leave_tick, tick, self.limits.gate_ticks, self.settings.gate_channel)
 
     # -- what the follower asks for ------------------------------------------------------------------------------------
 

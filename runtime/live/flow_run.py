@@ -114,8 +114,9 @@ class FlowReceiver(Receiver):
             kernel.blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
         if run.recorder is not None:
             run.recorder.add_decisions(kernel.rows)
-        if pulses := steps.pulses(len(kernel.rows)):
-            run.gates.take(pulses)
+        if pulses := steps.pulses(len(kernel.rows)):  # of the last block, which ended the call
+            arrival_ns, decided_ns = kernel.blocks[-1, [ring.ARRIVAL, ring.DECIDED]].tolist()
+            run.take_pulses(pulses, arrival_ns, decided_ns)
             run.pulse()
 
     def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:

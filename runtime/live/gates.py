@@ -1,7 +1,7 @@
 """Acting on decisions: pulses at absolute device ticks, on time or not at all.
 
-A pulse whose tick has passed, or will have before the command can be there, is not sent: it expires, as an event. What is acted upon is on
-record before its command leaves. The instrument refuses what comes too late; that is an event too.
+A pulse whose tick has passed, or will have before the command can be there, or whose decision was late, is not sent: it expires, as an
+event. What is acted upon is on record before its command leaves. The instrument refuses what comes too late; that is an event too.
 
 `--act` may name a second instrument: a pulse's tick is then converted to the host's time and on to the other clock's tick, and what both
 conversions may be off stands in the event beside it. An actuator of a laboratory's own is found by entry point (`pans.actuators`): a
@@ -220,11 +220,14 @@ class GateQueue:
         self._sent: deque[tuple[int, Action]] = deque()  # command id, action
         self._session: HostSession | None = None
 
-    def take(self, actions: Iterable[Action]) -> None:
-        """Queue pulses; beyond MAX_WAITING the oldest expires."""
+    def take(self, actions: Iterable[Action], late_us: Callable[[Action], float] = lambda action: 0.0) -> None:
+        """Queue pulses; beyond MAX_WAITING the oldest expires, and so does one whose decision was `late_us` after its deadline, above 0."""
         for action in actions:
             self.counters.asked += 1
-            self._waiting.append(action)
+            if (by_us := late_us(action)) > 0:
+                self._expire(action, f"its decision was {by_us:.0f} us later than the deadline allows")
+            else:
+                self._waiting.append(action)
         while len(self._waiting) > MAX_WAITING:
             self._expire(self._waiting.popleft(), "too many pulses wait")
 

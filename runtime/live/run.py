@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.core.decision import DECISION_DTYPE, Output
+from pans.runtime.core.decision import DECISION_DTYPE, Action, Output
 from pans.runtime.core.follower import Follower
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
@@ -360,6 +360,17 @@ class LiveRun:
             self.pulse()
         outputs.append(output)
 
+    def take_pulses(self, actions: Iterable[Action], arrival_ns: int, decided_ns: int) -> None:
+        """Queue the pulses of decisions made at `decided_ns` on what came at `arrival_ns`; late ones expire, as `account_times` judges."""
+        clock, deadline_ns = self.connection.known_clock(), self.timing.deadline_ns
+
+        def late_us(action: Action) -> float:
+            end_ns, unsure_ns = clock.to_host_ns(action.end_tick)
+            end_ns = arrival_ns if end_ns - unsure_ns > arrival_ns else end_ns
+            return (decided_ns - end_ns - unsure_ns - deadline_ns) / NS_PER_US
+
+        self.gates.take(actions, late_us)
+
     def pulse(self) -> None:
         """Send the pulses that wait, unless nothing more can be sent."""
         try:
@@ -394,7 +405,10 @@ class LiveRun:
                 self.journal.take(self.lateness.lost(event, self.connection, self.now_ns()))
         if not output.decisions:
             return
-        self.gates.take(output.actions)
+        if output.block_end_tick is None:
+            self.gates.take(output.actions)
+        elif output.actions:
+            self.take_pulses(output.actions, times_ns[0], times_ns[2])
         rows = np.array(output.decisions, DECISION_DTYPE)
         self.tally.add_rows(rows, unknown_photons if output.passages else self.core.marks.photons_of)
         if self.recorder is not None:

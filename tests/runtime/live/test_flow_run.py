@@ -86,6 +86,45 @@ def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: 
     assert figures["gates"]["done"] == figures["passages"]["pulses"] == len(pulses)
 
 
+def test_a_late_decision_does_not_pulse_although_its_pulse_could_still_be_made(flow_folder: Path) -> None:
+    """A deadline below the gate's delay of 900 us: blocks end up to 500 us behind the objects in them."""
+    link = open_sim(f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast")
+    device = link.device  # type: ignore[attr-defined]
+    result, figures, recording, _ = run(flow_folder, SETTINGS, link, 0.05, deadline_us=150.0)
+    events = list(recording.events())
+    late = {event["decision"] for event in events if event["kind"] == "late"}
+    expired = {event["decision"]: event["text"] for event in events if event["kind"] == "gate_expired"}
+    gated = {int(row["index"]) for row in recording.decisions() if row["label"] in (0, 1)}
+    assert set(expired) == late & gated
+    assert all("later than the deadline allows" in text for text in expired.values())
+    assert len(expired) > 5
+    assert figures["gates"]["expired"] == len(expired)
+    assert figures["gates"]["done"] == len(device.gates.pulses) == len(gated - late) > 5
+    assert figures["passages"]["pulses"] == len(gated - late)
+    assert result.ended == "completed"
+
+
+def test_blocks_are_as_long_as_the_deadline_of_the_run_allows(flow_folder: Path, pans: Pans) -> None:
+    """`--deadline-us` stands in the place of the profile's 1000 us, also where blocks are laid out."""
+    found = run_command(flow_folder, pans, "--deadline-us", "10", code=2)
+    assert "block_us is" in found["error"]["message"]
+    folder = flow_folder / "deadlines"
+    bundle, device = flow_folder / "thirds.pans", "sim:wdm-snspd?scene=uniform&seed=4&pace=fast"
+    blocks = {}
+    for deadline in (0, 100, 4000):
+        words = ("--out", folder / str(deadline), "--deadline-us", deadline)
+        done = pans("run --trials 2000 --decisions 4000", bundle, "--device", device, *words, code=None)
+        recording = read_recording(Path(done["recording"]))
+        plan = recorded_plan(recording)
+        limit_us = done["deadline_us"] / 4
+        block_us = plan.block_exposures * plan.slot_period_ticks * plan.tick_us
+        assert block_us <= max(limit_us, plan.slot_period_ticks * plan.tick_us)
+        assert recording.header["config"]["deadline_us"] == done["deadline_us"] == (deadline or 1000)
+        assert pans("replay", done["recording"])["identical"]
+        blocks[deadline] = plan.block_exposures
+    assert blocks[100] < blocks[0] < blocks[4000]
+
+
 def test_lost_blocks_are_never_decided_over(flow_folder: Path, pans: Pans) -> None:
     summary = run_command(flow_folder, pans, faults="loss:0.02", code=4)
     assert summary["lost"] > 0
@@ -204,14 +243,20 @@ SETTINGS = FlowSettings("cells", fields_per_s=20_000.0, onset_frames=4, gate_cla
 
 
 def run(
-    folder: Path, settings: FlowSettings, link: Any, seconds: float, url: str = "", watch: Any = None
+    folder: Path,
+    settings: FlowSettings,
+    link: Any,
+    seconds: float,
+    url: str = "",
+    watch: Any = None,
+    deadline_us: float = 1e9,
 ) -> tuple[Any, ...]:
     bundle = load_bundle(folder / "thirds.pans")[0]
     plan, core, cycles = plan_flow(PROFILE, bundle, make_decider(bundle), settings, 1, seconds)
     dark = DarkRun.of(RunOptions(), PROFILE)
     core.guard = dark.guard(plan, bundle, 1, flow=True)
     flow, path = FlowRun(core, None), folder / "run.pansrec"
-    config = RunOptions(n_cycles=cycles, deadline_us=1e9, realtime=False)
+    config = RunOptions(n_cycles=cycles, deadline_us=deadline_us, realtime=False)
     facts = {"shots": 1, "tick_hz": PROFILE.clock.tick_hz, "backend": "table", "confidence": 0.0, "dark": dark.header()}
     with Recorder(path, {"config": facts | {"flow": flow.header()}}, overwrite=True) as recorder:
         recovery, observers = Recovery.of(link, url, 10.0), Observers(watch, flow.prepared)

@@ -68,7 +68,7 @@ class Bench:
 
 
 def pulse(number: int, tick: int) -> Action:
-    return Action(number, tick, 50, 0)
+    return Action(number, tick - 1000, tick, 50, 0)
 
 
 def test_a_pulse_is_sent_at_once_and_counts_when_it_was_accepted() -> None:
@@ -169,7 +169,7 @@ def test_an_actuator_of_ones_own_gets_host_times() -> None:
 
     bench = Bench()
     bench.queue.actuator = Sorter()
-    bench.queue.take([pulse(4, 20_000), Action(5, 21_000, 50, 1)])
+    bench.queue.take([pulse(4, 20_000), Action(5, 20_000, 21_000, 50, 1)])
     assert bench.turn(10_000) == []
     assert [(round(at / 1000), duration, channel) for at, duration, channel in fired] == [
         (20_000, 50.0, 0),
@@ -272,11 +272,11 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
     for number in range(10):
         tick = lab.clock.to_tick(time.perf_counter_ns() + 400 * MS)
         asked.append(tick)
-        lab.queue.take([Action(number, tick, 2000, 3)])
+        lab.queue.take([Action(number, tick, tick, 2000, 3)])
         lab.turns(0.02)
     lab.turns(PATIENCE_S, lambda: lab.queue.counters.done == 10)
     late = lab.clock.to_tick(time.perf_counter_ns() - 5 * MS)
-    lab.queue.take([Action(10, late, 2000, 3)])  # it is known to be late: never sent
+    lab.queue.take([Action(10, late, late, 2000, 3)])  # it is known to be late: never sent
     lab.turns(0.01)
     assert lab.queue.summary() == {"asked": 11, "done": 10, "refused": 0, "expired": 1}
     lab.close()
@@ -302,7 +302,7 @@ def test_what_the_second_instrument_refuses_is_counted_and_told(serve_one: Calla
     first, other = serve_one("flow-snspd"), serve_one("ideal")
     lab = Lab(first, connected(other))
     tick = lab.clock.to_tick(time.perf_counter_ns() + 200 * MS)
-    lab.queue.take([Action(1, tick, 100, 99), Action(2, tick, 100, 0)])  # there is no output 99
+    lab.queue.take([Action(1, tick, tick, 100, 99), Action(2, tick, tick, 100, 0)])  # there is no output 99
     lab.turns(PATIENCE_S, lambda: lab.queue.counters.done == 1)
     assert lab.queue.summary() == {"asked": 2, "done": 1, "refused": 1, "expired": 0}
     assert lab.failed == [1]
@@ -315,7 +315,8 @@ def test_a_second_instrument_that_is_gone_does_not_end_the_run(serve_one: Callab
     lab = Lab(first, connected(other))
     other.vanish()
     lab.turns(PATIENCE_S, lambda: bool(lab.events("actuator_lost")))
-    lab.queue.take([Action(5, lab.clock.to_tick(time.perf_counter_ns() + 500 * MS), 100, 0)])
+    later = lab.clock.to_tick(time.perf_counter_ns() + 500 * MS)
+    lab.queue.take([Action(5, later, later, 100, 0)])
     lab.turns(0.01)
     assert lab.queue.summary() == {"asked": 1, "done": 0, "refused": 1, "expired": 0}
     assert lab.failed == [5]

@@ -31,7 +31,7 @@ def test_a_link_that_breaks_under_a_pulse_loses_nothing_that_has_arrived(monkeyp
 
     def step(frame: Frame) -> Output:
         seen.append(frame)
-        return Output([], [], None, (), (Action(1, 5, 1, 0),))
+        return Output([], [], None, (), (Action(1, 4, 5, 1, 0),))
 
     def act(self: LiveRun, now_ns: int) -> None:
         raise LinkError("the port is gone")
