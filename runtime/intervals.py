@@ -14,6 +14,17 @@ _EPSILON = 1e-16
 Z_95 = 1.959963984540054  # 0.975 quantile of the normal distribution: what a two-sided 95 % interval takes
 CHI2_95 = 3.841458820694124  # 0.95 quantile of chi-square with one degree of freedom
 
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # that are reported of durations
+
+
+def has_quantile(n: int, q: float) -> bool:
+    """Return whether `n` samples are enough for quantile `q`: one of them is expected beyond it.
+
+    >>> has_quantile(99, 0.99), has_quantile(100, 0.99)
+    (False, True)
+    """
+    return n >= round(1 / (1 - q))
+
 
 def number(value: float) -> str:
     """Return a number in three digits, thousands with commas.

@@ -73,7 +73,7 @@ def _row(bundle: Bundle, slot_us: float, realtime: bool, drive: str, options: Be
         cpu_s, steal = time.process_time() - started, steal_ms()
     turns: Row = {}
     if drive == "host":
-        turns = {f"turn_{name}_us": round(value, 1) for name, value in result.turn_us.items()}
+        turns = {f"turn_{name}_us": value and round(value, 1) for name, value in result.turn_us.items()}
         budget_us = (plan.slot_period_ticks - plan.exposure_ticks) * plan.tick_us
         turns |= {"turn_budget_us": round(budget_us, 1), "late_slots": result.late_slots}
     wanted = "real time asked for" if realtime else "ordinary"
@@ -82,7 +82,7 @@ def _row(bundle: Bundle, slot_us: float, realtime: bool, drive: str, options: Be
     granted = {name: value for name, value in result.realtime.items() if name in ("sched_fifo", "mlockall")}
     return {
         "name": f"SIMULATED loop, {slots_hz:.0f} slots/s, {wanted}{driven}{', under load' if options.load else ''}",
-        **{f"{name}_us": round(value, 1) for name, value in result.timing.total.summary().items()},
+        **{f"{name}_us": value and round(value, 1) for name, value in result.timing.total.summary().items()},
         "deadline_us": DEADLINE_US,
         "decisions": result.tally.decisions,
         **turns,

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pans.runtime import SHIPPED
 from pans.runtime.cli.finding import needed
 from pans.runtime.outputs import whole_file
+from pans.runtime.timing.ledger import quantiles_us
 
 Row = dict[str, Any]
 REPEATS = 7
@@ -82,10 +83,9 @@ def latencies_us(call: Callable[[Any], Any], inputs: Sequence[Any]) -> Row:
 
 
 def percentiles_us(times_ns: NDArray[np.int64]) -> Row:
-    """p50, p99, p99.9 and the largest of durations in ns, in us."""
-    p50, p99, p999 = np.quantile(times_ns, [0.5, 0.99, 0.999]) / 1000
-    figures = {"p50_us": p50, "p99_us": p99, "p999_us": p999, "max_us": times_ns.max() / 1000}
-    return {name: round(float(value), 3) for name, value in figures.items()} | {"calls": len(times_ns)}
+    """p50, p99, p99.9 and the largest of durations in ns, in us; None of too few (intervals.has_quantile)."""
+    figures = quantiles_us(times_ns) | {"max_us": float(times_ns.max()) / 1000}
+    return {name: value and round(value, 3) for name, value in figures.items()} | {"calls": len(times_ns)}
 
 
 def copy_ns(n_bytes: int) -> float:
@@ -150,7 +150,9 @@ def table_text(rows: list[Row]) -> str:
     """Rows for people: one line each, figures as they are."""
     width = max((len(str(row["name"])) for row in rows), default=0)
     figures = (
-        "  ".join(f"{key} {_short(value)}" for key, value in row.items() if key not in ("name", "bench"))
+        "  ".join(
+            f"{key} {_short(value)}" for key, value in row.items() if key not in ("name", "bench") and value is not None
+        )
         for row in rows
     )
     return "\n".join(f"{row['name']:<{width}}  {text}" for row, text in zip(rows, figures))

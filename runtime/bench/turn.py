@@ -193,7 +193,8 @@ def trip_row(trips: Trips) -> Row:
     row: Row = {"name": f"command to click block, decided and recorded, {trips.kind}, device in C", **ours}
     row |= {f"echo_{key}": value for key, value in echo_us.items() if key != "calls"}
     for key in ("p50", "p99"):
-        row[f"{key}_of_echo"] = round(ours[f"{key}_us"] / echo_us[f"{key}_us"], 3)
+        both = ours[f"{key}_us"], echo_us[f"{key}_us"]
+        row[f"{key}_of_echo"] = None if None in both else round(both[0] / both[1], 3)
     row |= {"samples": ours["calls"], "ratio_p50": row["p50_of_echo"]}
     return row | {"command_bytes": command, "answer_bytes": answer, "changed_percent": changed}
 

@@ -454,7 +454,8 @@ def _cell(values: dict[str, Any]) -> str:
         return f"{values['away_ms_per_s']:.2f} ms/s, {values['largest_away_us']:.0f} us"
     if "p50_us" not in values:
         return "not tried"
-    return f"{values['p50_us']:.1f} / {values['p99_us']:.1f} / {values['p999_us']:.0f} / {values['max_us']:.0f}"
+    some = (("p50_us", ".1f"), ("p99_us", ".1f"), ("p999_us", ".0f"), ("max_us", ".0f"))
+    return " / ".join("-" if values[name] is None else f"{values[name]:{form}}" for name, form in some)
 
 
 def _configure_devices(parser: argparse.ArgumentParser) -> None:

@@ -72,7 +72,8 @@ class Outcome:
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the figures of the summary, and the files."""
         found = self.summary.as_json()
-        names = ("verdict", "faults", "ended", "decisions", "accuracy", "clicks_mean", "photons_mean", "illumination")
+        names = ("verdict", "faults", "ended", "decisions", "abstained", "judged")
+        names += ("accuracy", "clicks_mean", "photons_mean", "illumination")
         latency = found.get("latency_us") or {}
         rows = {
             "clicks are": "SIMULATED" if found.get("simulated") else "",
@@ -320,7 +321,7 @@ class _Run:
                 recorder = opened.enter_context(
                     Recorder(
                         options.recording,
-                        self.header | {"simulated": link.simulated},
+                        self.header | {"simulated": link.simulated, "virtual_time": link.virtual},
                         bundle=_same_bundle(options.bundle, self.header["bundle_sha256"]),
                         overwrite=options.force,
                         limits=part_limits(options),

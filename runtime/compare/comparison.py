@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.container import parse_json_object, read_file
+from pans.runtime.core.decision import is_decided, is_judged
+from pans.runtime.denominators import group_of
 from pans.runtime.errors import UsageError
 from pans.runtime.intervals import number
 from pans.runtime.pages.page import flat, render, words
@@ -107,7 +109,10 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A figure of both sides. `difference` is first less second, or their ratio where `is_ratio`; None where no interval is known.
+    """A figure of both sides, as the runs say it.
+
+    `difference` is first less second, or their ratio where `is_ratio`; None where no interval is known. In a difference of decisions each
+    object counts once: it is that of the means in `method`.
 
     `p` is the p-value of the test named in `method`, `p_corrected` that after Holm; None where nothing was tested.
     """
@@ -248,25 +253,33 @@ def _untested(name: str, unit: str, values: list[Any], why: str = "not tested", 
 Column = Callable[[NDArray[np.void]], NDArray[Any]]
 
 
-def _of_objects(sides: Sides, value: Column, chosen: Column | None = None) -> list[dict[int, float]]:
-    """The mean `value` of the (`chosen`) decisions about each object, on both sides; empty where a side has no decisions."""
-    found = []
-    for side in sides:
-        if side.decisions is None:
-            return []
-        rows = side.decisions if chosen is None else side.decisions[chosen(side.decisions)]
-        objects, at = np.unique(rows["object"], return_inverse=True)
-        found.append(dict(zip(objects.tolist(), (np.bincount(at, value(rows)) / np.bincount(at)).tolist())))
-    return found
+def _of_objects(rows: NDArray[np.void], value: Column) -> dict[int, float]:
+    """The mean `value` of the decisions about each object."""
+    objects, at = np.unique(rows["object"], return_inverse=True)
+    return dict(zip(objects.tolist(), (np.bincount(at, value(rows)) / np.bincount(at)).tolist()))
+
+
+def _both(sides: Sides, chosen: Column) -> list[NDArray[np.void]]:
+    """The `chosen` decisions of both sides; empty where a side has no decisions."""
+    found = [side.decisions for side in sides if side.decisions is not None]
+    return [rows[chosen(rows)] for rows in found] if len(found) == len(sides) else []
+
+
+def _figures_are_of(rows: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Which decisions the figures of a run are of."""
+    of = {"judged": is_judged(rows), "decided": is_decided(rows), "decisions": np.ones(len(rows), np.bool_)}
+    return of[group_of({name: np.count_nonzero(some) for name, some in of.items()})]
 
 
 def _accuracy(sides: Sides, paired: bool) -> Finding | None:
     values, sizes = _told(sides, "accuracy"), [int(one or 0) for one in _told(sides, "objects")]
-    if shares := _of_objects(sides, lambda rows: rows["label"] == rows["truth"], lambda rows: rows["truth"] >= 0):
-        if paired:
-            return _paired_accuracy(*shares)
+    if both := _both(sides, is_judged):
+        right = [rows["label"] == rows["truth"] for rows in both]
+        values = [float(one.mean()) if len(one) else None for one in right]
+        shares = [_of_objects(rows, lambda rows: rows["label"] == rows["truth"]) for rows in both]
+        if paired and None not in values and shares[0].keys() & shares[1].keys():
+            return _paired_accuracy(*shares, *values)
         sizes = [len(one) for one in shares]
-        values = [sum(one.values()) / len(one) if one else None for one in shares]
     if None in values or not all(sizes):
         return None
     return _two_shares("accuracy", values, sizes, f"two shares of {sizes[0]} and {sizes[1]} distinct objects")
@@ -286,12 +299,14 @@ def _pairs(first: dict[int, float], second: dict[int, float]) -> tuple[NDArray[n
     return np.array([first[number] for number in common]), np.array([second[number] for number in common])
 
 
-def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Finding:
+def _paired_accuracy(first: dict[int, float], second: dict[int, float], *values: float | None) -> Finding:
+    """The accuracies of the runs, `values`; their difference is that of the objects in both, each of which counts once."""
     one, two = _pairs(first, second)
     better, worse = int((one > two).sum()), int((one < two).sum())
-    method = f"pairs of {len(one)} objects: {better} better in A, {worse} better in B, McNemar exact"
+    method = f"pairs of {len(one)} objects, each counts once (A {one.mean():.2%}, B {two.mean():.2%})"
+    method += f": {better} better in A, {worse} better in B, McNemar exact"
     between, p = statistics.paired_difference(one, two, 1.0), statistics.mcnemar_exact(better, worse)
-    return Finding("accuracy", "share", float(one.mean()), float(two.mean()), *between, False, p, method)
+    return Finding("accuracy", "share", *values, *between, False, p, method)
 
 
 def _abstained(sides: Sides) -> Iterator[Finding]:
@@ -304,18 +319,22 @@ def _abstained(sides: Sides) -> Iterator[Finding]:
 
 
 def _clicks(sides: Sides, paired: bool) -> Finding:
-    unit, shares = "clicks per decision", _of_objects(sides, lambda rows: rows["clicks"])
+    unit, both = "clicks per decision", _both(sides, _figures_are_of)
+    shares = [_of_objects(rows, lambda rows: rows["clicks"]) for rows in both]
     paired = paired and len(shares) == 2
     means = _pairs(*shares) if paired else [np.array([*one.values()]) for one in shares]
     if min(map(len, means), default=0) < 2:
         return _untested("clicks_mean", unit, _told(sides, "clicks_mean"))
     one, two = means
+    values = [float(rows["clicks"].mean()) for rows in both]
     if paired:
-        between, method = statistics.paired_difference(one, two), f"pairs of {len(one)} objects"
+        between = statistics.paired_difference(one, two)
+        method = f"pairs of {len(one)} objects, each counts once (A {one.mean():.4g}, B {two.mean():.4g})"
     else:
-        between, method = statistics.mean_difference(one, two), f"means of {len(one)} and {len(two)} objects"
+        between = statistics.mean_difference(one, two)
+        method = f"{len(one)} and {len(two)} objects, each counts once (A {one.mean():.4g}, B {two.mean():.4g})"
     method += "; interval by the spread of their differences" if paired else "; interval by their spread"
-    return Finding("clicks_mean", unit, float(one.mean()), float(two.mean()), *between, False, None, method)
+    return Finding("clicks_mean", unit, *values, *between, False, None, method)
 
 
 def _latencies(sides: Sides) -> Iterator[Finding]:
@@ -415,7 +434,8 @@ def comparison_words(comparison: Comparison) -> str:
         lines.append(f"{name}  {one_line(side.path)}: {one_line(side.summary.get('verdict', CUT))}")
         lines += [f"     {one_line(fault)}" for fault in side.summary.get("faults", ())]
     lines += ["", conclusion(comparison)]
-    lines += [f"Objects: {'paired' if comparison.paired else 'two samples'}; {one_line(comparison.why)}", ""]
+    how = "paired, each counts once in a difference" if comparison.paired else "two samples"
+    lines += [f"Objects: {how}; {one_line(comparison.why)}", ""]
     lines += ["  {:<26}A {}, B {}; {}; {}".format(*_row(one)) for one in comparison.findings]
     lines += ["", "What changed:" if comparison.changes else SAME]
     for change in comparison.changes:

@@ -111,10 +111,15 @@ def rows_of(decisions: Sequence[Decision]) -> npt.NDArray[np.void]:
     return decisions.rows if isinstance(decisions, RowDecisions) else np.array(decisions, DECISION_DTYPE)
 
 
-def known_and_right(rows: npt.NDArray[np.void], n_classes: int = NO_LABEL) -> tuple[int, int]:
-    """Return how many of the decisions have a known truth, and how many of these are right: one without a label is not."""
-    known = (rows["truth"] >= 0) & (rows["truth"] < n_classes)
-    return int(np.count_nonzero(known)), int(np.count_nonzero(known & (rows["label"] == rows["truth"])))
+def is_decided(rows: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
+    """Return which of the decisions, DECISION_DTYPE (n,), have a label: did not abstain."""
+    decided: npt.NDArray[np.bool_] = rows["label"] != NO_LABEL
+    return decided & (rows["flags"] & int(DecisionFlag.ABSTAINED) == 0)
+
+
+def is_judged(rows: npt.NDArray[np.void], n_classes: int = NO_LABEL) -> npt.NDArray[np.bool_]:
+    """Return which of the decisions have a label and a known true class."""
+    return is_decided(rows) & (rows["truth"] >= 0) & (rows["truth"] < n_classes)
 
 
 class Action(NamedTuple):

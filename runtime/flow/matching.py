@@ -81,6 +81,9 @@ class PassageFigures:
     passage_clicks_mean: float | None
     passage_photons_mean: float | None
     centre_offset_exposures: dict[str, float | None]
+    judged: int  # decisions with a label about objects alone
+    photons_known: int  # decisions of which `photons_mean` is
+    figures_of: dict[str, str]  # key -> "alone": decisions about objects alone, aborted ones too; "decisions": all
 
     def as_json(self) -> dict[str, Any]:
         """Return the figures under the contract's keys; a share is two of them."""
@@ -253,6 +256,7 @@ class PassageMatcher:
         photons = self._photons * frames / seen if seen else None
         gain = counts["alone_passage_clicks"] / counts["alone_clicks"] if counts["alone_clicks"] else None
         mean = counts["offset"] / seen if seen else 0.0
+        light = ("clicks_mean", "photons_mean", "illumination")
         return PassageFigures(
             accuracy=share(right, decided),
             accuracy_labelled=share(right, int(self.confusion.sum())),
@@ -271,6 +275,9 @@ class PassageMatcher:
                 "mean": mean if seen else None,
                 "std": max(0.0, counts["offset_squared"] / seen - mean**2) ** 0.5 if seen else None,
             },
+            judged=int(self.confusion.sum()),
+            photons_known=0 if photons is None else seen,
+            figures_of={"accuracy": "alone", **dict.fromkeys(light, "alone" if seen else "decisions")},
         )
 
 

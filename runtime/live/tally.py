@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.core.decision import NO_LABEL, DecisionFlag
+from pans.runtime.core.decision import DecisionFlag, is_decided
+from pans.runtime.denominators import GROUPS, group_of
 from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.timing.ledger import TimingLedger
 
 I64 = npt.NDArray[np.int64]
 PhotonsOf = Callable[[I64], npt.NDArray[np.float32]]  # object numbers (n,) -> NaN where it is not known
-_ABSTAINED, _AMBIGUOUS = int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS)
+_AMBIGUOUS = int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
 
 
@@ -36,7 +37,7 @@ def _some(values: I64, where: npt.NDArray[np.bool_]) -> I64:
 
 @dataclass(frozen=True, slots=True)
 class TallyFigures:
-    """What decisions add up to; None where it is not known. Clicks and photons are per decision."""
+    """What decisions add up to; None where it is not known. Accuracy, clicks and photons are per decision of one group."""
 
     accuracy: float | None
     accuracy_std_trials: float | None
@@ -44,9 +45,28 @@ class TallyFigures:
     objects: int
     trials: int
     decisions: int
+    decided: int  # not abstained
+    judged: int  # of these with a known true class
     abstained: int
     clicks_mean: float | None
     photons_mean: float | None
+    photons_known: int  # decisions of the group whose photons are known: `photons_mean` is of these
+    figures_of: dict[str, str]  # key -> its group (denominators.GROUPS)
+
+
+@dataclass(slots=True)
+class LightSums:
+    """Sums over the decisions of a group; photons of those where they are known."""
+
+    n: int = 0
+    clicks: int = 0
+    photons: float = 0.0
+    photons_known: int = 0
+
+    def add(self, more: LightSums) -> None:
+        """Add the sums of further decisions."""
+        self.n, self.clicks = self.n + more.n, self.clicks + more.clicks
+        self.photons, self.photons_known = self.photons + more.photons, self.photons_known + more.photons_known
 
 
 class RunTally:
@@ -59,13 +79,10 @@ class RunTally:
         self.confusion: npt.NDArray[np.int64] = np.zeros((n_classes, n_classes), np.int64)  # truth x decision
         self.shots = shots
         self.distinct = distinct
-        self.decisions = 0
-        self.abstained = 0
-        self.unsure = 0  # of them because no class was as sure as was asked for
-        self.known = self.right = 0  # decisions with a known truth, and those of them that are right
-        self.clicks = self.exposures = 0  # exposures: of walks
-        self.photons = 0.0
-        self.photons_known = 0
+        self.of = {name: LightSums() for name in GROUPS}
+        self.unsure = 0  # abstained because no class was as sure as was asked for
+        self.right = 0  # of those that are judged
+        self.exposures = 0  # of walks
         self._trials: npt.NDArray[np.int64] = np.zeros((64, 2), np.int64)  # by window within the visit: decided, right
         self._objects: dict[int, list[int]] = {}  # object -> [decided, right]
         self._past = [0.0, 0.0, 0.0]  # objects that are summed up: how many, accuracies, their squares
@@ -75,35 +92,44 @@ class RunTally:
         labels, truths, flags = rows["label"].astype(np.int64), rows["truth"].astype(np.int64), rows["flags"]
         numbers, n_classes = rows["object"], len(self.confusion)
         begins = np.append(0, np.flatnonzero(numbers[1:] != numbers[:-1]) + 1)  # of each object
-        numbers, counts = numbers[begins].astype(np.int64), np.diff(begins, append=len(rows))
-        photons = photons_of(numbers)
-        lit, silent = ~np.isnan(photons), labels == NO_LABEL
-        if flags.any():
-            silent |= flags & _ABSTAINED != 0
-            self.unsure += int(np.count_nonzero(silent & (flags & _AMBIGUOUS != 0)))
-        self.decisions += len(rows)
-        self.clicks += int(rows["clicks"].sum(dtype=np.int64))
+        numbers = numbers[begins].astype(np.int64)
+        decided = is_decided(rows)
+        judged = decided & (truths.view(np.uint64) < n_classes)  # -1 is a large number, too
+        self.unsure += int(np.count_nonzero(~decided & (flags & _AMBIGUOUS != 0)))
         self.exposures += int(rows["exposures"].sum(dtype=np.int64))
-        self.photons += float((photons[lit] * counts[lit]).sum(dtype=np.float64)) * self.shots
-        self.photons_known += int(counts[lit].sum())
-        self.abstained += int(np.count_nonzero(silent))
-        known, right = truths.view(np.uint64) < n_classes, labels == truths  # -1 is a large number, too
-        right &= known
-        if not known.any():
+        groups = {"decisions": np.ones(len(rows), np.bool_), "decided": decided, "judged": judged}
+        self._add_light(rows["clicks"], photons_of(numbers), begins, groups)
+        if not judged.any():
             return
-        decided, well = np.add.reduceat(known, begins, dtype=np.int64), np.add.reduceat(right, begins, dtype=np.int64)
-        self.known += int(decided.sum())
+        right = judged & (labels == truths)
+        seen, well = np.add.reduceat(judged, begins, dtype=np.int64), np.add.reduceat(right, begins, dtype=np.int64)
         self.right += int(well.sum())
-        self._add_objects(numbers[decided > 0], decided[decided > 0], well[decided > 0])
+        self._add_objects(numbers[seen > 0], seen[seen > 0], well[seen > 0])
         cells, trials = truths * n_classes + labels, rows["shot"].astype(np.int64)
         if self.shots > 1:
             trials //= self.shots
-        told = known & (labels != NO_LABEL)
-        self.confusion += np.bincount(_some(cells, told), minlength=n_classes**2).reshape(n_classes, n_classes)
+        self.confusion += np.bincount(_some(cells, judged), minlength=n_classes**2).reshape(n_classes, n_classes)
         while trials.max() >= len(self._trials):  # twice as long each time; a visit has at most 2^24 exposures
             self._trials = np.concatenate([self._trials, np.zeros_like(self._trials)])
-        self._trials[:, 0] += np.bincount(_some(trials, known), minlength=len(self._trials))
+        self._trials[:, 0] += np.bincount(_some(trials, judged), minlength=len(self._trials))
         self._trials[:, 1] += np.bincount(trials[right], minlength=len(self._trials))
+
+    def _add_light(
+        self,
+        clicks: npt.NDArray[np.uint32],
+        photons: npt.NDArray[np.float32],
+        begins: I64,
+        groups: dict[str, npt.NDArray[np.bool_]],
+    ) -> None:
+        """Add clicks (n,) and the photons of the objects that begin at `begins` to each of the groups, bool (n,), the largest first."""
+        more, lit = LightSums(), ~np.isnan(photons)
+        for name, some in groups.items():
+            # mostly all decisions are in every group: then the sums are made once
+            if (n := int(np.count_nonzero(some))) != more.n:
+                counts = np.add.reduceat(some, begins, dtype=np.int64)[lit]
+                light = float((photons[lit] * counts).sum(dtype=np.float64)) * self.shots
+                more = LightSums(n, int(clicks[some].sum(dtype=np.int64)), light, int(counts.sum()))
+            self.of[name].add(more)
 
     def _add_objects(self, numbers: I64, decided: I64, right: I64) -> None:
         """Count decisions on objects, and how many of them are right; one that is shown again keeps its number."""
@@ -139,23 +165,43 @@ class RunTally:
         return int(self._past[0]) + len(self._objects)
 
     @property
+    def decisions(self) -> int:
+        """All decisions."""
+        return self.of["decisions"].n
+
+    @property
+    def abstained(self) -> int:
+        """Decisions without a label."""
+        return self.decisions - self.of["decided"].n
+
+    @property
+    def judged(self) -> int:
+        """Decisions with a label and a known true class."""
+        return self.of["judged"].n
+
+    @property
     def accuracy(self) -> float | None:
-        """Right decisions over decisions with a known truth (an abstention is not right); None without any."""
-        return self.right / self.known if self.known else None
+        """Right decisions over those that are judged; None without any."""
+        return self.right / self.judged if self.judged else None
 
     def figures(self) -> TallyFigures:
         """Return accuracy, its spread over trials and over objects, clicks and photons per decision."""
         per_trial = [right / n for n, right in self._trials.tolist() if n]
+        counts = {name: sums.n for name, sums in self.of.items()}
+        group = group_of(counts)
+        light = self.of[group]
         return TallyFigures(
             accuracy=self.accuracy,
             accuracy_std_trials=float(np.std(per_trial, ddof=1)) if len(per_trial) > 1 else None,
             accuracy_stderr_objects=self._spread_over_objects(),
             objects=self.objects,
             trials=len(per_trial),
-            decisions=self.decisions,
+            **counts,
             abstained=self.abstained,
-            clicks_mean=self.clicks / self.decisions if self.decisions else None,
-            photons_mean=self.photons / self.photons_known if self.photons_known else None,
+            clicks_mean=light.clicks / light.n if light.n else None,
+            photons_mean=light.photons / light.photons_known if light.photons_known else None,
+            photons_known=light.photons_known,
+            figures_of={"accuracy": "judged", **dict.fromkeys(("clicks_mean", "photons_mean", "illumination"), group)},
         )
 
 
@@ -182,7 +228,7 @@ class RunResult:
     lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
     contradictions: dict[str, int] = field(default_factory=dict)  # messages that are excluded, by what is wrong
     late_slots: int = 0  # that stayed dark because the host named no state in time
-    turn_us: dict[str, float] = field(default_factory=dict)  # of the host's turns, where it drives
+    turn_us: dict[str, float | None] = field(default_factory=dict)  # of the host's turns, where it drives
     # exposures of each state
     states_shown: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     decisions_sha256: str = ""

@@ -6,9 +6,11 @@ All text that comes from files or devices is made inert here (safe_text).
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from pans.runtime.denominators import group_of, group_words
 from pans.runtime.intervals import number, wilson_interval
 from pans.runtime.safe_text import one_line
 
@@ -39,7 +41,7 @@ def rows_of(history: History) -> list[Row]:
 
 def _results(history: History) -> Iterator[Row]:
     picture, begin, latency = history.picture, history.begin, history.latency
-    done, expected, abstained = picture["decisions"], begin.get("expected", 0), picture["abstained"]
+    done, expected = picture["decisions"], begin.get("expected", 0)
     late, lost, deadline = picture["late"], picture["lost_exposures"], float(begin.get("deadline_us", 0.0))
     sums, _, seconds = history.recent(RATE_OVER_S)
     rate = sums["decisions"] / max(seconds, 1e-3)
@@ -50,26 +52,48 @@ def _results(history: History) -> Iterator[Row]:
     made = f"{done:,}{f' of {expected:,}' if expected else ''}, {rate:,.1f} per second"
     goes_on = expected > done and rate > 0 and not picture["ended"]
     yield Row("decisions", made + (f", {duration((expected - done) / rate)} left" if goes_on else ""))
-    if picture["known"]:
-        share, low, high = history.accuracy(picture, picture["objects"])
-        between = f"95 % interval {low:.1%} to {high:.1%} ({picture['objects']:,} objects)"
-        yield Row("accuracy", f"{share:.1%}, {between}")
-    if done:
-        yield Row("abstained", f"{abstained:,} ({abstained / done:.2%})", "note" if abstained else "")
-        known, walked = picture["photons_known"], picture.get("walk_light")
-        photons = f"{picture['photons'] / known:.2f} photons" if known else "photons unknown"
-        light = begin.get("illumination") if walked is None else walked / done
-        illumination = "" if light is None else f", illumination {light:.1f}"
-        yield Row("light per decision", f"{picture['clicks'] / done:.2f} clicks, {photons}{illumination}")
-    if (p99 := quantile_us(latency, 0.99)) is not None:
-        level = "bad" if p99 > deadline > 0 else "warn" if p99 > 0.8 * deadline > 0 else ""
-        part = f"; p99 takes {p99 / deadline:.0%} of {deadline:,.0f} us" if deadline else ""
-        text = f"p50 {quantile_us(latency, 0.5):,.0f} us, p99 {p99:,.0f} us"
-        yield Row("latency", f"{text}, longest {picture['latency_max_us']:,.0f} us{part}", level)
+    yield from _light(picture, begin, history)
+    yield from _latency(picture, latency, deadline)
     allowed = float(begin.get("late_allowed", 0.0)) * done
     yield Row("late", f"{late:,} decisions", "bad" if late > allowed else "note" if late else "good")
     gaps = f" in {picture['gaps']:,} gaps" if lost else ""
     yield Row("lost", f"{lost:,} exposures{gaps}", "bad" if lost else "good")
+
+
+def _light(picture: dict[str, Any], begin: dict[str, Any], history: History) -> Iterator[Row]:
+    """Accuracy and light per decision, of one group of decisions."""
+    done, abstained = picture["decisions"], picture["abstained"]
+    group, of = group_of(picture), group_words(picture)
+    if picture["judged"]:
+        share, low, high = history.accuracy(picture, picture["objects"])
+        between = f"95 % interval {low:.1%} to {high:.1%} ({picture['objects']:,} objects)"
+        yield Row("accuracy", f"{share:.1%}{f' {of}' if of else ''}, {between}")
+    if done:
+        yield Row("abstained", f"{abstained:,} ({abstained / done:.2%})", "note" if abstained else "")
+        known, walked = picture[f"{group}_photons_known"], picture.get("walk_light")
+        photons = f"{picture[f'{group}_photons'] / known:.2f} photons" if known else "photons unknown"
+        light = begin.get("illumination") if walked is None else walked / done
+        apart = walked is not None and bool(abstained)  # which states belong to decisions that abstained is not counted
+        text = f"{picture[f'{group}_clicks'] / picture[group]:.2f} clicks, {photons}"
+        text += "" if light is None or apart else f", illumination {light:.1f}"
+        yield Row("light per decision", f"{text}{f'; {of}' if of else ''}")
+        if apart and light is not None:
+            yield Row("illumination", f"{light:.1f} per decision, of all {done:,}")
+
+
+def _latency(picture: dict[str, Any], counts: Counter[int], deadline: float) -> Iterator[Row]:
+    """Quantiles of the latency, none of too few decisions; the upper edge of a bucket is not above the longest."""
+    if picture.get("virtual_time") or not counts:
+        return
+    longest = float(picture["latency_max_us"])
+    found = {name: quantile_us(counts, q) for name, q in (("p50", 0.5), ("p99", 0.99))}
+    texts = [f"{name} {min(us, longest):,.0f} us" for name, us in found.items() if us is not None]
+    p99, level, part = found["p99"], "", ""
+    if p99 is not None and deadline > 0:
+        share = min(p99, longest) / deadline
+        level = "bad" if share > 1 else "warn" if share > 0.8 else ""
+        part = f"; p99 takes {share:.0%} of {deadline:,.0f} us"
+    yield Row("latency", f"{', '.join([*texts, f'longest {longest:,.0f} us'])}{part}", level)
 
 
 def _instrument(picture: dict[str, Any], begin: dict[str, Any]) -> Iterator[Row]:
@@ -112,20 +136,24 @@ def _disk_level(left_s: float) -> str:
 def title_of(history: History) -> str:
     """Return what runs where."""
     title = one_line(history.begin.get("title", "pans"), 120)
-    return f"SIMULATED · {title}" if history.begin.get("simulated") else title
+    # behind a socket only the device knows that it is simulated
+    simulated = history.begin.get("simulated") or history.picture.get("simulated")
+    return f"SIMULATED · {title}" if simulated else title
 
 
 def headline(history: History) -> str:
     """Return the most important figures as one line."""
     picture, expected = history.picture, history.begin.get("expected", 0)
-    decisions = picture["decisions"]
-    accuracy = f" · accuracy {picture['right'] / picture['known']:.1%}" if picture["known"] else ""
-    p99 = quantile_us(history.latency, 0.99) or 0.0  # next to nothing in virtual time
+    decisions, abstained, group = picture["decisions"], picture["abstained"], group_of(picture)
+    accuracy = f" · accuracy {picture['right'] / picture['judged']:.1%}" if picture["judged"] else ""
+    p99 = None if picture.get("virtual_time") else quantile_us(history.latency, 0.99)
     dark, _, level = dark_state(picture)
+    of = group_words(picture)
     return (
-        f"{decisions}{f' of {expected}' if expected else ''} decisions{accuracy}"
-        f" · {picture['clicks'] / max(decisions, 1):.2f} clicks each"
-        + (f" · p99 {p99 / 1000:.2f} ms" if p99 >= 5 else "")
+        f"{decisions}{f' of {expected}' if expected else ''} decisions"
+        + (f", {abstained} abstained" if abstained else "")
+        + f"{accuracy} · {picture[f'{group}_clicks'] / max(picture[group], 1):.2f} clicks each{f' ({of})' if of else ''}"
+        + ("" if p99 is None else f" · p99 {min(p99, picture['latency_max_us']) / 1000:.2f} ms")
         + f" · late {picture['late']} · lost {picture['lost_exposures']}"
         + (f" · dark counts: {dark}" if level not in ("", "good") else "")
     )
@@ -195,8 +223,12 @@ def health(history: History) -> list[tuple[str, str, str]]:
         machine = level, f"The disk of the recording is full in {duration(full_s)}."
     elif late:
         machine = "bad", f"{late:,} decisions were late in the last minute."
-    elif p99 is None:
+    elif not latency:
         machine = "note", f"No decision was made in the last {RECENT_S:.0f} s."
+    elif picture.get("virtual_time"):
+        machine = "good", "Time is virtual: latencies are not measured."
+    elif p99 is None:
+        machine = "good", f"No decision was late in the last {RECENT_S:.0f} s."
     else:
         most = f"{p99 / deadline:.0%} of the time allowed" if deadline else f"{p99:,.0f} us"
         machine = "good", f"99 % of the last minute's decisions took at most {most}."

@@ -13,12 +13,14 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from pans.runtime.intervals import wilson_interval
+from pans.runtime.denominators import GROUPS
+from pans.runtime.intervals import has_quantile, wilson_interval
 
 LEVELS = (1.0, 5.0, 30.0, 180.0, 1200.0, 7200.0)  # seconds of a bin
 BINS = 512  # of a level: 8 minutes, 42 minutes, 4 hours, 1 day, 1 week, 6 weeks
-SUMS: tuple[str, ...] = ("decisions", "known", "right", "abstained", "late", "clicks", "photons")
-SUMS += ("photons_known", "lost_exposures", "dark_exposures", "dark_clicks")
+LIGHT = ("clicks", "photons", "photons_known")  # of each group of decisions
+SUMS: tuple[str, ...] = (*GROUPS, *(f"{of}_{what}" for of in GROUPS for what in LIGHT), "right", "late")
+SUMS += ("lost_exposures", "dark_exposures", "dark_clicks")
 
 
 @dataclass(slots=True)
@@ -84,20 +86,20 @@ class History:
     def accuracy(self, sums: dict[str, Any], objects: int | None = None) -> tuple[float, float, float]:
         """Return accuracy and its 95 % interval (Wilson), in which the trials of one visit and showings of one object count once.
 
-        NaN where no truth is known.
+        NaN where no decision is judged.
         """
-        if (known := int(sums["known"])) <= 0:
+        if (judged := int(sums["judged"])) <= 0:
             return math.nan, math.nan, math.nan
-        share = sums["right"] / known
-        n = max(1, min(known // max(1, int(self.begin.get("trials", 1))), known if objects is None else objects))
+        share = sums["right"] / judged
+        n = max(1, min(judged // max(1, int(self.begin.get("trials", 1))), judged if objects is None else objects))
         low, high = wilson_interval(round(share * n), n)
         return share, min(low, share), max(high, share)
 
 
 def quantile_us(counts: Counter[int], q: float) -> float | None:
-    """Return quantile `q` of durations, ns with their counts, in microseconds; None without any."""
+    """Return quantile `q` of durations, ns with their counts, in microseconds; None of too few."""
     total = sum(counts.values())
-    if not total:
+    if not has_quantile(total, q):
         return None
     wanted, seen = max(1, -int(-q * total // 1)), 0
     for duration_ns in sorted(counts):

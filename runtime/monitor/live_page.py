@@ -41,8 +41,9 @@ from tornado.routing import Router
 from tornado.web import Application as Answers
 from tornado.web import OutputTransform, RequestHandler
 
+from pans.runtime.denominators import group_of
 from pans.runtime.images import grey_png
-from pans.runtime.intervals import wilson_interval
+from pans.runtime.intervals import has_quantile, wilson_interval
 from pans.runtime.watch.metrics import is_loopback
 
 from . import figures
@@ -76,15 +77,16 @@ def columns(history: History, level: float, least: float) -> dict[str, F64]:
     begin, sums = _points(own, "decisions", least)
     _, dark = _points(own, "dark_clicks", LEAST_DARK)
     made, late, lost = (own[:, SUMS.index(name)] for name in ("decisions", "late", "lost_exposures"))
-    found = [history.accuracy({"known": known, "right": right}) for known, right in zip(sums["known"], sums["right"])]
+    found = [history.accuracy({"judged": n, "right": right}) for n, right in zip(sums["judged"], sums["right"])]
+    group = group_of(picture) if picture else "decisions"
     accuracy = np.array(found).reshape(n, 3).T * 100
     intervals = [wilson_interval(*one) for one in zip(dark["dark_clicks"], dark["dark_exposures"])]
     low, high = np.array(intervals).reshape(n, 2).T
     drawn = low[low > 0].min(initial=picture.get("dark_low") or 1.0) / 3  # a logarithm has no place for 0
     with np.errstate(divide="ignore", invalid="ignore"):
         curves = {
-            "clicks": sums["clicks"] / sums["decisions"],
-            "photons": sums["photons"] / sums["photons_known"],
+            "clicks": sums[f"{group}_clicks"] / sums[group],
+            "photons": sums[f"{group}_photons"] / sums[f"{group}_photons_known"],
             "dark": np.where(dark["dark_clicks"] > 0, dark["dark_clicks"] / dark["dark_exposures"], np.nan),
             **dict(zip(("accuracy", "accuracy_low", "accuracy_high"), accuracy)),
             **{"dark_low": np.maximum(low, drawn), "dark_high": high},
@@ -116,7 +118,7 @@ def _added_up(rows: F64) -> F64:
 
 
 def _quantiles(bins: list[Bin], begin: NDArray[np.int64], **wanted: float) -> dict[str, F64]:
-    """Return quantiles of the latencies in us, float64 (bins,), of the bins from `begin` up to each."""
+    """Return quantiles of the latencies in us, float64 (bins,), of the bins from `begin` up to each; NaN of too few."""
     keys = sorted({key for one in bins for key in one.latency}) or [0]
     place, counts = {key: at for at, key in enumerate(keys)}, np.zeros((len(bins), len(keys)))
     for row, one in zip(counts, bins):
@@ -124,7 +126,8 @@ def _quantiles(bins: list[Bin], begin: NDArray[np.int64], **wanted: float) -> di
     total = _added_up(counts)
     shares = (total[1:] - total[begin]).cumsum(axis=1)
     at = {name: (shares >= np.maximum(1, np.ceil(q * shares[:, -1:]))).argmax(axis=1) for name, q in wanted.items()}
-    return {name: np.where(shares[:, -1] > 0, np.array(keys)[one] / 1000, np.nan) for name, one in at.items()}
+    enough = {name: [has_quantile(n, q) for n in shares[:, -1].tolist()] for name, q in wanted.items()}
+    return {name: np.where(enough[name], np.array(keys)[one] / 1000, np.nan) for name, one in at.items()}
 
 
 class Page:

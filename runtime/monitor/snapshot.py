@@ -20,11 +20,13 @@ from pans.runtime.bundle.automaton import walk_nodes
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.core.still import Core
 from pans.runtime.decide.verdict import log_evidence
+from pans.runtime.denominators import GROUPS
 from pans.runtime.instrument.channel_health import LEVELS
 from pans.runtime.live.journal import words_of
 from pans.runtime.timing.ledger import upper_edge
 
 from .alarms import INSTANT
+from .history import LIGHT
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
@@ -37,7 +39,7 @@ SAME = 1e-3  # of two probabilities
 EVENTS_MAX = 50  # of one picture; what is left comes with the next
 PIXELS_MAX = 64  # of a side, as it is shown
 PATTERNS_MAX = 2048  # whose pixels are told in one run
-TALLIED = ("decisions", "abstained", "known", "right", "objects", "clicks", "photons_known", "photons")
+TALLIED = ("decisions", "abstained", "judged", "right", "objects")
 BREATH_S = 0.0002  # between two readings, for the loop
 
 
@@ -65,7 +67,10 @@ class Snapshots:
     def take(self, breathe: Callable[[float], None] = time.sleep) -> dict[str, Any]:
         """Return the run's figures as they are now; `breathe` is called between the parts."""
         self._breathe = breathe
+        link, welcome = self._run.connection.link, self._run.connection.session.welcome
         picture = self._look() | {"kind": "picture", "elapsed_s": round(time.monotonic() - self._began_s, 3)}
+        picture["simulated"] = bool(link.simulated or (welcome and welcome.facts.get("simulated")))
+        picture["virtual_time"] = link.virtual
         for part in (self._results, self._latency, self._decisions, self._dark, self._clock):
             breathe(BREATH_S)
             picture |= part()
@@ -75,7 +80,9 @@ class Snapshots:
         run, core = self._run, cast(Any, self._run.core)  # of any kind
         wrong = sum((run.contradictions + core.contradictions).values()) + core.tracker.counters.repeats_differing
         light = None if self._light is None else float(core.windows.walks.shown @ self._light)
-        return {name: getattr(run.tally, name) for name in TALLIED} | {"walk_light": light, "contradictions": wrong}
+        figures = {name: getattr(run.tally, name) for name in TALLIED} | {"walk_light": light, "contradictions": wrong}
+        figures["decided"] = figures["decisions"] - figures["abstained"]
+        return figures | {f"{of}_{what}": getattr(run.tally.of[of], what) for of in GROUPS for what in LIGHT}
 
     def _latency(self) -> dict[str, Any]:
         """The histogram of latencies as it has grown since the last picture: [duration in ns, how many more]."""

@@ -30,7 +30,7 @@ from pans.runtime.container import (
     parse_json_object,
     read_block,
 )
-from pans.runtime.core.decision import known_and_right
+from pans.runtime.core.decision import is_judged
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import LATEST, RUNS, locked
 from pans.runtime.ranges import Range
@@ -57,6 +57,7 @@ class Run:
     bundle: str
     verdict: str  # PASS, FAIL, "running", or "cut" without an END
     decisions: int | None
+    judged: int | None  # of which `accuracy` is
     accuracy: float | None
     dark_per_exposure: float | None  # clicks per dark exposure
     bytes: int  # of the run's own files
@@ -113,6 +114,7 @@ def run_of(folder: Path) -> Run | None:
         bundle=bundle or str(header.get("bundle_sha256", ""))[:12],
         verdict="running" if is_locked else str(summary.get("verdict", "cut"))[:20],
         decisions=_number(far.get("decisions")),
+        judged=_number(far.get("judged")),
         accuracy=_number(far.get("accuracy")),
         dark_per_exposure=_number(dark.get("per_exposure")),
         bytes=sum(path.stat().st_size for path in files),
@@ -155,9 +157,11 @@ def _as_far_as(recordings: Sequence[Path]) -> dict[str, Any]:
     """Return decisions and accuracy of a run that was cut, from its decision log alone; {} of a large one, and without any."""
     sums = np.zeros(3, np.int64)
     for rows in skim_decisions(recordings, LOG_MAX_BYTES):
-        sums += len(rows), *known_and_right(rows)
+        judged = is_judged(rows)
+        sums += len(rows), np.count_nonzero(judged), np.count_nonzero(judged & (rows["label"] == rows["truth"]))
     decisions, known, right = sums.tolist()
-    return {"decisions": decisions, "accuracy": right / known if known else None} if decisions else {}
+    found = {"decisions": decisions, "judged": known, "accuracy": right / known if known else None}
+    return found if decisions else {}
 
 
 def _object_at(data: bytes, start: int) -> dict[str, Any]:
@@ -319,6 +323,8 @@ def _table(runs: Sequence[Run]) -> list[str]:
         begun = run.started.astimezone().strftime("%Y-%m-%d %H:%M")
         decisions = "" if run.decisions is None else str(run.decisions)
         accuracy = "" if run.accuracy is None else f"{100 * run.accuracy:.1f} %"
+        if run.accuracy is not None and run.judged is not None and run.judged != run.decisions:
+            accuracy += f" of {run.judged}"
         dark = "" if run.dark_per_exposure is None else f"{run.dark_per_exposure:.2g}"
         names = one_line(run.bundle, 40), one_line(run.folder.name, 80)
         rows.append((begun, verdict, decisions, accuracy, dark, _size(run.bytes), *names))

@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from pans.runtime.core.decision import is_judged
 from pans.runtime.record.log import skim_decisions
 from pans.runtime.report.words import accuracy_interval
 
@@ -45,7 +46,7 @@ def _spark(run: Run) -> Any:
 
 def accuracy_over(recordings: Sequence[Path]) -> list[float]:
     """Return the share of right decisions in stretches of a run; empty where it is not known or the recordings are large."""
-    known = (rows[rows["truth"] >= 0] for rows in skim_decisions(recordings, LOG_MAX_BYTES))
+    known = (rows[is_judged(rows)] for rows in skim_decisions(recordings, LOG_MAX_BYTES))
     right = [rows["label"] == rows["truth"] for rows in known]
     every = np.concatenate([np.zeros(0, np.bool_), *right])
     return [float(one.mean()) for one in np.array_split(every, min(SPARKS, len(every) // 10 or 1)) if len(one)]

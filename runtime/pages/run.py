@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.core.decision import DecisionFlag
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag, is_judged
 from pans.runtime.flow.matching import abort_reason
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.record import Recording
@@ -55,7 +55,8 @@ class Decisions:
         self.n, self._first = n, first  # decisions, and the number of the first one
         self._first_tick: int | None = None
         self._tick_hz = float(config["tick_hz"])
-        self.known = self.right = 0
+        self.judged = self.right = 0
+        self._n_classes = len(classes) or NO_LABEL
         shown = len(classes) if len(classes) <= CONFUSION_MAX else 0
         self.confusion = np.zeros((shown, shown), np.int64)  # truth in rows, of those that have a label
         self.over = Stretches(objects=(TOLD_APART,))
@@ -73,17 +74,17 @@ class Decisions:
         """Take the next rows, DECISION_DTYPE (n,)."""
         if self._first_tick is None:
             self._first_tick = int(rows["tick"][0])
-        numbers, told = rows["index"], rows["truth"] >= 0
-        right, abstained = told & (rows["label"] == rows["truth"]), (rows["flags"] & int(DecisionFlag.ABSTAINED)) != 0
-        self.known, self.right = self.known + int(told.sum()), self.right + int(right.sum())
+        numbers, judged = rows["index"], is_judged(rows, self._n_classes)
+        right = judged & (rows["label"] == rows["truth"])
+        self.judged, self.right = self.judged + int(judged.sum()), self.right + int(right.sum())
         self.add("decisions", numbers)
         ticks = np.maximum(rows["tick"].astype(np.float64) - self._first_tick, 0.0)
         self.add("seconds", numbers, ticks / self._tick_hz)
-        for name, which in (("known", told), ("right", right)):
+        for name, which in (("judged", judged), ("right", right)):
             self.add(name, numbers[which])
-        self.over.tell_apart("objects", numbers[told].astype(np.int64) - self._first, rows["object"][told])
+        self.over.tell_apart("objects", numbers[judged].astype(np.int64) - self._first, rows["object"][judged])
         n = len(self.confusion)
-        fits = told & ~abstained & (rows["truth"] < n) & (rows["label"] < n)
+        fits = judged & (rows["truth"] < n) & (rows["label"] < n)
         np.add.at(self.confusion, (rows["truth"][fits], rows["label"][fits]), 1)
         if self._passing:
             for flag in np.unique(rows["flags"]).tolist():
@@ -94,14 +95,14 @@ class Decisions:
         """Return accuracy over time with its interval, and how many objects a stretch has; None where it is not known, or too short."""
         objects = np.count_nonzero(self.over.sums["objects"])
         over = self.over.merged(int(np.clip(objects // OBJECTS_PER_BIN, 1, ACCURACY_BINS)))
-        some = over.sums.get("known", np.zeros(1)) > 0
+        some = over.sums.get("judged", np.zeros(1)) > 0
         if some.sum() < 2:
             return None
-        share = over.sums["right"][some] / over.sums["known"][some]
+        share = over.sums["right"][some] / over.sums["judged"][some]
         counts = np.count_nonzero(over.sums["objects"][some], axis=1).tolist()
         low, high = np.array([wilson_interval(round(p * n), n) for p, n in zip(share.tolist(), counts)]).T
         band = {"low": np.minimum(low, share), "high": np.maximum(high, share)}
-        sums = {"mean": self.right / self.known, "objects": (min(counts), max(counts))}
+        sums = {"mean": self.right / self.judged, "objects": (min(counts), max(counts))}
         return {"seconds": self._seconds(over)[some], "share": share, **band, **sums}
 
     def stacked(self, prefix: str) -> dict[str, Any] | None:
@@ -236,7 +237,7 @@ def ledger_of(blocks: Iterable[Rows]) -> TimingLedger:
 
 def is_virtual(ledger: TimingLedger) -> bool:
     """Return whether the host took no time at all, as in virtual time: then latencies say nothing."""
-    return ledger.stages["decide"].summary()["p99"] < NO_TIME_US
+    return ledger.stages["decide"].quantile_ns(0.99) < 1000 * NO_TIME_US
 
 
 def latency_curves(ledger: TimingLedger) -> list[Curve]:
@@ -315,6 +316,7 @@ def run_page(recording: Recording) -> bytes:
     stages = {name: ledger.stages[name].summary() for name in _CURVES}
     told = {"latency_us": ledger.total.summary(), "stage_latency_us": stages, "clock": {"worst_uncertainty_us": 0.0}}
     timed, passing = not is_virtual(ledger), _passing(recording, bundle, decisions)
+    is_told = (summary.get("latency_us") or {}).get("p99") is not None
     confusion = passing[1] if passing else decisions.confusion
     return render(
         "run.html",
@@ -324,7 +326,7 @@ def run_page(recording: Recording) -> bytes:
         summary=summary,
         bundle=bundle,
         reasons=[(fault, advice_on(str(fault), simulated=recording.simulated)) for fault in summary.get("faults", ())],
-        tiles=rows_of(summary, "figures", *["timed"] * timed) if "verdict" in summary else [],
+        tiles=rows_of(summary, "figures", *["timed"] * bool(timed and is_told)) if "verdict" in summary else [],
         decisions=decisions,
         accuracy=decisions.accuracy() if len(classes) > 1 else None,
         confusion=confusion if confusion.any() else None,

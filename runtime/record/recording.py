@@ -71,13 +71,20 @@ class Recording:
         """Whether the clicks are simulated, as the link said at the start or the device by the end."""
         return bool(self.header.get("simulated") or self.summary.get("simulated"))
 
+    @property
+    def virtual_time(self) -> bool:
+        """Whether the run was in virtual time, in which nothing on the host takes any; of earlier recordings END alone tells."""
+        device = self.summary.get("device")
+        of_summary = isinstance(device, dict) and device.get("virtual_time")
+        return bool(self.header.get("virtual_time") or of_summary)
+
     def __repr__(self) -> str:
         told = ", SIMULATED" * self.simulated + ", cut off" * (not self.complete)
         return f"<Recording {self.path.name}: {self.n_decisions} decisions{told}>"
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: what was run, and how it ended."""
-        names = ("verdict", "accuracy", "clicks_mean", "photons_mean", "late", "lost")
+        names = ("verdict", "accuracy", "clicks_mean", "photons_mean", "judged", "abstained", "late", "lost")
         rows = {
             "clicks are": "SIMULATED" if self.simulated else "",
             "recorded": str(self.header.get("created_utc", ""))[:19],

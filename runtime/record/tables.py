@@ -63,7 +63,12 @@ TIMINGS = {
     "arrival_ns": Column("int64", "ns", "last bytes read, on the same clock", "not recorded"),
     "decided_ns": Column("int64", "ns", "decision made, on the same clock", "not recorded"),
     "recorded_ns": Column("int64", "ns", "decision handed to the recorder, on the same clock", "not recorded"),
-    "latency_us": Column("float64", "us", "from the end of the last exposure to the decision", "not recorded"),
+    "latency_us": Column(
+        "float64",
+        "us",
+        "from the end of the last exposure to the decision",
+        "not recorded, or not measured: virtual time",
+    ),
 }
 CLICKS = {
     "exposure_start_tick": Column("int64", "tick", "begin of the exposure that clicked, on the device's clock"),
@@ -130,10 +135,11 @@ def iter_decisions(
         yield _typed(found, DECISIONS)
 
 
-def timing_table(rows: NDArray[np.void]) -> Table:
-    """Return the host times, TIMING_DTYPE (n,), as columns of TIMINGS."""
+def timing_table(rows: NDArray[np.void], *, virtual: bool) -> Table:
+    """Return the host times, TIMING_DTYPE (n,), as columns of TIMINGS; in `virtual` time nothing took any, and there is no latency."""
     found = {"decision": rows["index"], **{name: rows[name] for name in TIMING_DTYPE.names or () if name != "index"}}
-    found["latency_us"] = np.round((rows["decided_ns"] - rows["device_end_ns"]) / 1000, 3)
+    latency_us = np.round((rows["decided_ns"] - rows["device_end_ns"]) / 1000, 3)
+    found["latency_us"] = np.ma.array(latency_us, mask=np.full(len(rows), virtual))
     return _typed(found, TIMINGS)
 
 
@@ -240,9 +246,9 @@ def _timed(recording: Recording, table: str) -> tuple[Mapping[str, Column], Tabl
     padded = np.append(timings, np.array([(2**64 - 1, 0, 0, 0, 0)], TIMING_DTYPE))
     rows = padded[np.searchsorted(timings["index"], found["decision"])]
     missing = rows["index"] != found["decision"]
-    for name, values in timing_table(rows).items():
+    for name, values in timing_table(rows, virtual=recording.virtual_time).items():
         if name != "decision":
-            found[name] = np.ma.array(values, mask=missing)
+            found[name] = np.ma.array(values, mask=missing | np.ma.getmaskarray(values))
     times = _times(recording, rows["device_end_ns"])
     times[missing] = np.datetime64("NaT")
     return DECISIONS | TIMINGS, found, times

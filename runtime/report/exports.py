@@ -41,10 +41,11 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList,
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file", remedy="name a folder: csv is several files")
     make_folder(folder)
+    timed, virtual = tables.timing_table, recording.virtual_time
     written = {
         "decisions.csv": _csv(tables.DECISIONS, tables.iter_decisions(recording, plan)),
         "clicks.csv": _csv(tables.CLICKS, [tables.click_table(recording, plan, clicks)]),
-        "timings.csv": _csv(tables.TIMINGS, map(tables.timing_table, recording.iter_timings())),
+        "timings.csv": _csv(tables.TIMINGS, (timed(rows, virtual=virtual) for rows in recording.iter_timings())),
         "columns.csv": dictionary(),
     }
     about = tables.facts_of(recording) | {

@@ -14,7 +14,8 @@ import numpy as np
 from pans.runtime.bundle.automaton import Automaton, shortest_walk
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.bundle.optics import Analyser, amplification
-from pans.runtime.core.decision import NO_LABEL, DecisionFlag, known_and_right
+from pans.runtime.core.decision import NO_LABEL, is_decided, is_judged
+from pans.runtime.denominators import group_of
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import Recording
@@ -108,12 +109,14 @@ def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
 def _recording_facts(recording: Recording) -> dict[str, Any]:
     bundle = recording.bundle() if recording.bundle_place else None
     n_classes = NO_LABEL if bundle is None else len(bundle.classes)
-    abstained = clicks = known = right = 0
+    counts, clicks, right = Counter[str](), Counter[str](), 0
     for rows in together(recording.iter_decisions()):
-        abstained += int(np.count_nonzero(rows["flags"] & int(DecisionFlag.ABSTAINED)))
-        clicks += int(rows["clicks"].sum(dtype=np.int64))
-        more_known, more_right = known_and_right(rows, n_classes)
-        known, right = known + more_known, right + more_right
+        judged, every = is_judged(rows, n_classes), np.ones(len(rows), np.bool_)
+        right += int(np.count_nonzero(judged & (rows["label"] == rows["truth"])))
+        for name, some in {"decisions": every, "decided": is_decided(rows), "judged": judged}.items():
+            counts[name] += int(np.count_nonzero(some))
+            clicks[name] += int(rows["clicks"][some].sum(dtype=np.int64))
+    group = group_of(counts)
     header = dict(recording.header)
     if isinstance(profile := header.pop("profile", None), dict):
         header["profile"] = {key: value for key, value in profile.items() if key != "toml"}
@@ -127,10 +130,13 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "blocks": {kind.name.lower(): count for kind, count in recording.kinds.items()},
         "first_decision": first_decision(recording),
         "decisions": recording.n_decisions,
-        "abstained": abstained,
+        "decided": counts["decided"],
+        "judged": counts["judged"],
+        "abstained": counts["decisions"] - counts["decided"],
         "decisions_sha256": recording.decisions_sha256,
-        "clicks_mean": clicks / recording.n_decisions if recording.n_decisions else None,
-        "accuracy": right / known if known else None,
+        "clicks_mean": clicks[group] / counts[group] if counts[group] else None,
+        "accuracy": right / counts["judged"] if counts["judged"] else None,
+        "figures_of": {"accuracy": "judged", "clicks_mean": group},
         "messages": sum(1 for _ in recording.messages()),
         "answers": sum(1 for _ in recording.answers()),
         "handshakes": handshakes(recording),

@@ -34,7 +34,9 @@ class WalkFigures:
     illumination_mean: float | None  # per decision, photoelectrons per unit transmission, of the states that were shown
     abstained_below_confidence: int
     late_slots: int  # that stayed dark because the host named no state in time
-    turn_us: dict[str, float] | None  # from a block's arrival until the next state's name had left; host-driven only
+    turn_us: (
+        dict[str, float | None] | None
+    )  # from a block's arrival until the next state's name had left; host-driven only
     turn_budget_us: float | None  # from the end of an exposure to the beginning of the next one
     expected: dict[str, Any] | None  # as the bundle says it: for its profile, task and split
     # measured accuracy less the expected one, in standard errors, on the same profile
@@ -55,8 +57,8 @@ class Summary:
     lost_cause: dict[str, int]
     blame: list[dict[str, Any]]
     lost: int
-    latency_us: dict[str, float]
-    stage_latency_us: dict[str, dict[str, float]]
+    latency_us: dict[str, float | None]
+    stage_latency_us: dict[str, dict[str, float | None]]
     deadline_us: float
     clock: dict[str, Any]
     slot_jitter_us: float
@@ -98,7 +100,9 @@ class Summary:
     def as_json(self) -> dict[str, Any]:
         """Return the summary under the contract's keys, in their order."""
         facts = asdict(self.tally) | ({} if self.flow is None else self.flow.as_json())
-        facts |= {} if self.walks is None else asdict(self.walks)
+        if self.walks is not None:  # which of the states shown belonged to which decision is not counted
+            all_of = dict.fromkeys(("illumination", "illumination_mean", "exposures_mean"), "decisions")
+            facts |= asdict(self.walks) | {"figures_of": facts["figures_of"] | all_of}
         facts |= {field.name: getattr(self, field.name) for field in fields(self)[3:]}
         return facts | {"dark": asdict(self.dark)}
 
@@ -158,7 +162,7 @@ def find_faults(
     if result.reconnects:
         faults.append(f"the device was lost and found again {result.reconnects} times")
     if timing.late > late_allowed * tally.decisions:
-        half_us, limit_ms = timing.total.summary()["p50"], timing.deadline_ns / 1e6
+        half_us, limit_ms = timing.total.summary()["p50"] or 0.0, timing.deadline_ns / 1e6
         short = f"; half of all decisions took more than {half_us:,.0f} us" if half_us > 1000 * limit_ms else ""
         of, allowed = (f" of {tally.decisions:,}", f", allowed {late_allowed * 100:g} %") if late_allowed else ("", "")
         faults.append(f"{timing.late}{of} decisions later than {limit_ms:g} ms{allowed} ({late_words(result)}){short}")
@@ -174,7 +178,7 @@ def find_faults(
     if wrong:
         faults.append(f"{wrong} exposures showed another pattern than planned")
     if wrong != result.wrong_patterns:
-        longest = f"the longest turn took {result.turn_us['max']:.0f} us"
+        longest = f"the longest turn took {result.turn_us['max'] or 0.0:.0f} us"
         faults.append(f"{result.late_slots} slots stayed dark because the host named their state too late; {longest}")
     if tally.abstained > tally.unsure and aborts_are_faults:
         faults.append(f"{tally.abstained - tally.unsure} decisions abstained")

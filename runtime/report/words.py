@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.denominators import group_of, group_words
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.monitor.figures import dark_state
 from pans.runtime.outputs import write_file
@@ -39,7 +40,8 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
     last = [("fault", fault, "") for fault in facts["faults"]] + [("busy", words, "") for words in _busy_words(facts)]
     last += [("recording", recording, ""), ("report", report, "")]
     simulated = "SIMULATED · " * facts["simulated"]
-    head = f"{simulated}{facts['verdict']}: {facts['decisions']} decisions ({objects_words(facts)})"
+    abstained = f", {facts['abstained']} abstained" if facts["abstained"] else ""
+    head = f"{simulated}{facts['verdict']}: {facts['decisions']} decisions{abstained} ({objects_words(facts)})"
     return "\n".join([head, *lines_of(rows_of(facts, "closing", "flow", "walks") + last)])
 
 
@@ -80,25 +82,29 @@ def _further(facts: Facts) -> dict[str, Any]:
     known = {"spread": facts.get("accuracy_std_trials"), "off": facts.get("expected_off_stderr")}
     known |= {"asked": facts.get("confidence") or None, "allowed": facts.get("late_allowed") or None}
     found: dict[str, Any] = {name: None if one is None else [one] for name, one in known.items()}
-    found |= {"ends": accuracy_interval(facts), "light": facts.get("illumination_mean", facts.get("illumination"))}
+    light, of = facts.get("illumination_mean", facts.get("illumination")), facts.get("figures_of", {})
+    # of an automaton's states it is not known which belonged to decisions that abstained
+    is_apart = facts.get("abstained") and of.get("illumination") != of.get("clicks_mean")
+    found |= {"ends": accuracy_interval(facts), "apart": [light] if is_apart else None}
+    found["together"] = None if is_apart or light is None else [light]
     found["share"] = {name: _share(facts, name) for name in _SHARES if f"{name}_ci" in facts}
     found["text"] = {}
+    found["turn"] = [quantile_words(facts["turn_us"])] if facts.get("turn_us") else None
     if "passages" in facts:
         found["text"]["aborted"] = ", ".join(f"{name} {n}" for name, n in facts["aborted"].items()) or "none"
     if "verdict" in facts:
         granted = ", ".join(f"{what}: {answer}" for what, answer in facts.get("realtime", {}).items())
         found["text"] |= {
-            "objects": "of objects that passed alone" if "passages" in facts else objects_words(facts),
+            "objects": objects_words(facts),
+            "lit": "" if is_apart else f", illumination {light:.1f}",
+            "every": f"of all {facts['decisions']:,} decisions" if facts["abstained"] else "",
             "latency": "not measured in virtual time" if _is_virtual(facts) else latency_words(facts),
             "exposures": exposure_words(facts.get("exposure_timing", {})),
             "realtime": granted or "virtual time: nothing asked for",
             "page_faults": fault_words(facts.get("page_faults", {})),
             "dark": dark_words(dark, calibrated=bool(facts.get("calibration"))),
         }
-        if facts["abstained"] and facts.get("accuracy") is not None and "passages" not in facts:
-            found["text"]["counted"] = "abstained decisions with a known truth count as not right"
-        if facts["lost"]:
-            found["text"]["gaps"] = "a mean over all decisions, those with missing exposures too"
+        found["text"]["counted"] = counted_words(facts)
     if dark.get("exposures"):
         found["dark_rate"] = dark["clicks"] / dark["exposures"]
     if stream.get("repeated"):
@@ -143,24 +149,55 @@ def _busy_words(facts: Facts) -> Iterator[str]:
 def objects_words(facts: Facts) -> str:
     """Return on how many objects how often was decided; objects that come again and again are no trials.
 
-    >>> objects_words({"objects": 200, "trials": 1, "decisions": 500})
+    >>> objects_words({"objects": 200, "trials": 1, "decisions": 700, "judged": 500, "abstained": 200})
     '200 objects, 2.5 decisions on each on average'
     """
-    objects, trials, decisions = facts["objects"], facts["trials"], facts["decisions"]
-    if objects * trials == decisions:
+    if "passages" in facts:
+        alone = facts["passages"]["alone"]
+        return f"{alone:,} objects passed alone" if alone else "true classes unknown"
+    objects, trials, judged = facts["objects"], facts["trials"], facts.get("judged", facts["decisions"])
+    if not objects:
+        return "true classes unknown" if facts["decisions"] > facts["abstained"] else "all abstained"
+    if objects * trials == judged:
         return f"{objects} objects × {trials} trials"
-    many = f"{objects} objects, {decisions / max(objects, 1):.1f} decisions on each on average"
-    return many if objects else "true classes unknown"
+    return f"{objects} objects, {judged / objects:.1f} decisions on each on average"
+
+
+def counted_words(facts: Facts) -> str:
+    """Return of which decisions accuracy, clicks and photons are; "" where they are of all."""
+    if "passages" in facts:
+        found = facts["passages"]["alone"] - facts["passages"]["missed"]
+        aborted = found - facts.get("judged", found)  # recordings of earlier versions have no `judged`
+        said = f"of {found:,} decisions about objects that passed alone" if found else ""
+        return said + (f", {aborted:,} of them aborted: not right" if aborted else "")
+    if "judged" not in facts:
+        return "abstained decisions with a known truth count as not right" if facts["abstained"] else ""
+    known, n = facts["photons_known"], facts[group_of(facts)]
+    partly = f"photons: of {known:,} of them, known from their marks" if 0 < known < n else ""
+    return "; ".join(filter(None, (group_words(facts), partly)))
 
 
 def latency_words(facts: Facts) -> str:
     """Return the quantiles of the time from exposure to decision; what the clock cannot resolve is said, not shown as 0."""
-    values = {name: facts["latency_us"][key] for name, key in QUANTILES.items()}
+    values = {key: us for key in QUANTILES.values() if (us := facts["latency_us"][key]) is not None}
+    if not values:
+        return "not measured: no decision"
     uncertainty_us = facts["clock"]["worst_uncertainty_us"]
-    seen = [f"{name} {value:.0f} us" for name, value in values.items() if not is_unresolved(value, uncertainty_us)]
-    if not is_unresolved(values["p50"], uncertainty_us):
+    seen = list(
+        filter(None, [quantile_words({k: us for k, us in values.items() if not is_unresolved(us, uncertainty_us)})])
+    )
+    if not is_unresolved(min(values.values()), uncertainty_us):
         return ", ".join(seen)
     return f"{', '.join([*seen, 'else'] if seen else [])} not resolved (clock uncertainty {uncertainty_us / 1000:.1f} ms)".strip()
+
+
+def quantile_words(values: Facts) -> str:
+    """Return quantiles and the largest of durations in us; one of too few durations is None and left out.
+
+    >>> quantile_words({"p50": 12.3, "p99": None, "p999": None, "max": 40.0})
+    'p50 12 us, max 40 us'
+    """
+    return ", ".join(f"{name} {values[key]:.0f} us" for name, key in QUANTILES.items() if values.get(key) is not None)
 
 
 def is_unresolved(latency_us: float, uncertainty_us: float) -> bool:
@@ -254,5 +291,6 @@ def stage_rows(facts: Facts) -> list[tuple[str, ...]]:
     for name, row in {"exposure end to decision": facts["latency_us"], **stages}.items():
         doubt_us = uncertainty_us if name in ("exposure end to decision", "link") else 0.0
         cells = (row[key] for key in QUANTILES.values())
-        rows.append((name, *("not resolved" if is_unresolved(us, doubt_us) else f"{us:.0f}" for us in cells)))
+        texts = ("–" if us is None else "not resolved" if is_unresolved(us, doubt_us) else f"{us:.0f}" for us in cells)
+        rows.append((name, *texts))
     return rows

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.intervals import QUANTILES, has_quantile
+
 I64 = NDArray[np.int64]
 
 SUB_BITS = 5  # 32 steps per octave: a quantile is at most 3.2 % above the true value
@@ -37,10 +39,21 @@ class LatencyHistogram:
         bucket = int(np.searchsorted(np.cumsum(self.counts), max(1, -int(-q * self.total // 1))))
         return min(upper_edge(bucket), self.max_ns)
 
-    def summary(self) -> dict[str, float]:
-        """Return {p50, p99, p999, max} in microseconds."""
-        edges = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-        return {name: self.quantile_ns(q) / 1000 for name, q in edges.items()} | {"max": self.max_ns / 1000}
+    def summary(self) -> dict[str, float | None]:
+        """Return {p50, p99, p999, max} in microseconds; None where there are fewer durations than `has_quantile` asks for."""
+        found = {
+            name: self.quantile_ns(q) / 1000 if has_quantile(self.total, q) else None for name, q in QUANTILES.items()
+        }
+        return found | {"max": self.max_ns / 1000 if self.total else None}
+
+
+def quantiles_us(durations_ns: I64) -> dict[str, float | None]:
+    """Return {p50_us, p99_us, p999_us} of single durations in ns, int64 (n,); None where n is too small."""
+    n = len(durations_ns)
+    return {
+        f"{name}_us": float(np.quantile(durations_ns, q)) / 1000 if has_quantile(n, q) else None
+        for name, q in QUANTILES.items()
+    }
 
 
 def count_each(histograms: Sequence[LatencyHistogram], durations_ns: I64, counts: I64) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from .ledger import quantiles_us
 from .realtime import (
     FIFO_PRIORITY,
     GRANTED,
@@ -60,7 +61,7 @@ class Turns:
     asked: dict[str, Any] = field(default_factory=dict)
     rounds_ns: list[list[int]] = field(default_factory=list)
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, float | None]:
         """Return {samples, p50_us, p99_us, p999_us, max_us} of all rounds."""
         return figures([late for one in self.rounds_ns for late in one])
 
@@ -142,12 +143,11 @@ def clock_gaps(seconds: float) -> list[int]:
     return gaps
 
 
-def figures(late_ns: Sequence[int]) -> dict[str, float]:
-    """Return {samples, p50_us, p99_us, p999_us, max_us} of times in ns; no quantile of nothing."""
+def figures(late_ns: Sequence[int]) -> dict[str, float | None]:
+    """Return {samples, p50_us, p99_us, p999_us, max_us} of times in ns; no quantile of nothing, None of too few."""
     if not len(late_ns):
         return {"samples": 0}
-    p50, p99, p999 = (float(value) / 1000 for value in np.quantile(late_ns, [0.5, 0.99, 0.999]))
-    return {"samples": len(late_ns), "p50_us": p50, "p99_us": p99, "p999_us": p999, "max_us": max(late_ns) / 1000}
+    return {"samples": len(late_ns), **quantiles_us(np.array(late_ns)), "max_us": max(late_ns) / 1000}
 
 
 def look_at_cores(seconds: float, granted: bool) -> list[dict[str, Any]]:
@@ -190,7 +190,7 @@ def pair_of(
     """
 
     def cost(row: dict[str, Any]) -> tuple[bool, float, float]:
-        return row["core"] not in isolated, row["away_ms_per_s"], row["sleep"].get("p99_us", 0.0)
+        return row["core"] not in isolated, row["away_ms_per_s"], row["sleep"].get("p99_us") or 0.0
 
     order = [row["core"] for row in sorted(cores, key=cost)]
     if not order:

@@ -102,7 +102,7 @@ class Collector:
         if "disk_free_bytes" in picture:  # a recording is written: an alert needs the figure to be there at all times
             picture = {"disk_left_s": math.inf} | picture
         for key, (name, counts, words) in FIGURES.items():
-            if key in picture:
+            if picture.get(key) is not None:
                 value = picture[key] * (1e-6 if key.endswith("_us") else 1)
                 yield (CounterMetricFamily if counts else GaugeMetricFamily)(name, words, value=value)
         for key, (name, counts, label, words) in LABELLED.items():

@@ -80,7 +80,16 @@ def test_samples_where_nothing_says_that_the_objects_are_the_same(runs: Path) ->
 
 def test_an_object_that_is_shown_again_is_the_same(tmp_path: Path) -> None:
     assert main([*fixed_run(230), "--out", str(tmp_path / "run")]) == 0
-    assert read_side(tmp_path / "run").decisions["object"].tolist() == [*range(200), *range(30)]
+    side = read_side(tmp_path / "run")
+    assert side.decisions["object"].tolist() == [*range(200), *range(30)]
+    # the figures are those that the run says, though 30 objects have two decisions
+    right = side.decisions["label"] == side.decisions["truth"]
+    once = np.mean([right[side.decisions["object"] == number].mean() for number in range(200)])
+    for pairing in ("same", "different"):
+        found = {one.name: one for one in compare(side, side, pairing).findings}
+        assert found["accuracy"].first == side.summary["accuracy"] == right.mean() != once
+        assert found["clicks_mean"].first == pytest.approx(side.summary["clicks_mean"], rel=1e-12)
+    assert f"A {once:.2%}, B {once:.2%}" in compare(side, side, "same").findings[0].method
 
 
 def test_summaries_are_compared_without_pairs(runs: Path, tmp_path: Path, pans: Pans) -> None:

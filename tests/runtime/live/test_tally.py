@@ -34,14 +34,26 @@ def test_spreads_over_trials_and_objects_are_different_things() -> None:
     assert tally.confusion.tolist() == [[0, 0], [6, 6]]
 
 
-def test_an_abstention_is_not_right_and_stands_in_no_column() -> None:
-    tally = RunTally(2, 1)
-    add(tally, decision(0, 0, 1, 1), NAN)
-    add(tally, decision(0, 1, NO_LABEL, 1, flags=int(DecisionFlag.ABSTAINED | DecisionFlag.GAP)), NAN)
-    assert tally.accuracy == 0.5
-    assert tally.abstained == 1
+def test_accuracy_and_light_are_of_the_same_decisions() -> None:
+    tally, abstained = RunTally(2, 1), int(DecisionFlag.ABSTAINED | DecisionFlag.GAP)
+    add(tally, decision(0, 0, 1, 1, clicks=6), 4.0)
+    add(tally, decision(0, 1, NO_LABEL, 1, clicks=1, flags=abstained), 100.0)
+    add(tally, decision(1, 0, 0, -1, clicks=9), 100.0)  # decided, of no known class
+    found = tally.figures()
+    assert (found.decisions, found.decided, found.judged, found.abstained) == (3, 2, 1, 1)
+    assert (found.accuracy, found.clicks_mean, found.photons_mean, found.photons_known) == (1.0, 6.0, 4.0, 1)
+    assert set(found.figures_of.values()) == {"judged"}
     assert tally.confusion.sum() == 1
-    assert tally.figures().photons_mean is None
+
+
+def test_without_a_known_class_the_light_is_that_of_what_was_decided() -> None:
+    tally, abstained = RunTally(2, 1), int(DecisionFlag.ABSTAINED)
+    add(tally, decision(0, 0, NO_LABEL, -1, clicks=1, flags=abstained), NAN)
+    assert (tally.figures().clicks_mean, tally.figures().figures_of["clicks_mean"]) == (1.0, "decisions")
+    add(tally, decision(1, 0, 1, -1, clicks=7), NAN)
+    found = tally.figures()
+    assert (found.accuracy, found.clicks_mean, found.photons_mean) == (None, 7.0, None)
+    assert found.figures_of["clicks_mean"] == "decided"
 
 
 def test_without_truth_there_is_no_accuracy() -> None:
@@ -101,14 +113,18 @@ def test_many_rows_count_as_one_by_one() -> None:
     for part in np.split(rows, [700, 701, 2000]):
         many.add_rows(part, photons.__getitem__)
     known = photons[rows["object"]]
-    assert many.figures().photons_mean == pytest.approx(shots * np.nanmean(known.astype(np.float64)), rel=1e-12)
+    some = (rows["label"] != NO_LABEL) & (rows["flags"] == 0) & (rows["truth"] >= 0) & (rows["truth"] < 4)
+    assert many.figures().photons_mean == pytest.approx(shots * np.nanmean(known[some].astype(np.float64)), rel=1e-12)
+    assert (many.judged, many.of["decided"].n) == (some.sum(), 3000 - many.abstained)
+    assert many.figures().clicks_mean == rows["clicks"][some].mean()
+    assert many.of["decisions"].clicks == rows["clicks"].sum()
     assert many.figures() == replace(one.figures(), photons_mean=pytest.approx(one.figures().photons_mean, rel=1e-12))
     assert many.confusion.tolist() == one.confusion.tolist()
-    assert (many.unsure, many.exposures, many.known, many.right) == (one.unsure, one.exposures, one.known, one.right)
+    assert (many.unsure, many.exposures, many.right) == (one.unsure, one.exposures, one.right)
 
 
 def test_an_ambiguous_decision_counts_as_abstained_and_as_unsure() -> None:
     tally = RunTally(2, 1)
     add(tally, decision(0, 0, NO_LABEL, 1, flags=int(DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED)), 1.0)
     add(tally, decision(0, 1, NO_LABEL, 1, flags=int(DecisionFlag.GAP | DecisionFlag.ABSTAINED)), 1.0)
-    assert (tally.figures().abstained, tally.unsure, tally.accuracy) == (2, 1, 0.0)
+    assert (tally.figures().abstained, tally.unsure, tally.accuracy) == (2, 1, None)

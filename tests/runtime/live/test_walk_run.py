@@ -13,6 +13,7 @@ from commands import Pans
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.runtime.bundle.model import Bundle, write_bundle
 from pans.runtime.cli import main
+from pans.runtime.compare import compare, read_side
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import build_plan
 from pans.runtime.decide.expectation import expected_walk
@@ -125,8 +126,14 @@ def test_a_walk_stops_when_it_is_sure_and_abstains_where_it_is_not(folder: Path,
     assert replays(path)
     facts, page = pans("info", path), Decisions({"tick_hz": 1e6}, len(walks))
     page.take(walks)
-    assert summary["accuracy"] == facts["accuracy"] == page.right / page.known < 1 - unsure.mean()
-    assert (summary["clicks_mean"], summary["abstained"]) == (facts["clicks_mean"], facts["abstained"])
+    labelled = walks[~unsure]
+    assert summary["accuracy"] == facts["accuracy"] == page.right / page.judged
+    assert summary["accuracy"] == (labelled["label"] == labelled["truth"]).mean()
+    assert summary["clicks_mean"] == facts["clicks_mean"] == labelled["clicks"].mean() != walks["clicks"].mean()
+    assert summary["judged"] == facts["judged"] == len(labelled) == len(walks) - facts["abstained"]
+    assert summary["figures_of"]["illumination"] == "decisions"  # of the states that were shown
+    one = read_side(path)
+    assert {f.name: f.first for f in compare(one, one).findings}["accuracy"] == summary["accuracy"]
 
 
 def test_a_host_that_is_held_up_leaves_slots_dark_and_guesses_nothing(folder: Path, tmp_path: Path, pans: Pans) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from browser import DEEP, browser, clipped, console, look, picture, serious, unreachable
 
+from pans.runtime.denominators import GROUPS
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.monitor.history import LEVELS, History
 
@@ -43,8 +44,10 @@ def messages(n: int = 30, step_s: float = 20.0, hot: range = range(0)) -> Iterat
         yield {
             **{"kind": "picture", "elapsed_s": step_s * k, "state": "running", "ended": "", "walk_light": 7e3 * k},
             **dict.fromkeys(("lost_exposures", "gaps", "reconnects", "contradictions"), 0),
-            **{name: 20 * k for name in ("decisions", "known", "objects", "photons_known")},
-            **{"abstained": k, "right": 15 * k, "clicks": 90 * k, "photons": 160.0 * k, "exposures": 600 * k},
+            **{"decisions": 21 * k, **{name: 20 * k for name in ("decided", "judged", "objects")}},
+            **{f"{of}_photons_known": 20 * k for of in GROUPS},
+            **{f"{of}_{what}": n * k for of in GROUPS for what, n in (("clicks", 90), ("photons", 160.0))},
+            **{"abstained": k, "right": 15 * k, "exposures": 600 * k},
             **{"late": k // 10, "last_error": NASTY, "events": [["note", NASTY, None]] if k == 5 else []},
             **{"latency": [[300_000 + 10_000 * (k % 5), 18], [900_000, 2]], "latency_max_us": 1500.0},
             **{"dark_exposures": 50 * k, "dark_clicks": dark, "dark_expected": 0.015, "dark_low": 0.014},
@@ -93,17 +96,17 @@ def page(*more: str) -> Iterator[Served]:
 
 def test_curves_are_those_of_the_decisions_that_a_point_takes() -> None:
     history, rng, level, least = History(), np.random.default_rng(5), LEVELS[0], 40
-    steps, sums = [], dict.fromkeys(("decisions", "known", "right", "dark_exposures", "dark_clicks"), 0)
+    steps, sums = [], dict.fromkeys(("decisions", "decided", "judged", "right", "dark_exposures", "dark_clicks"), 0)
     given = {"kind": "picture", "latency": [], "dark_low": 0.02, "dark_high": 0.03}
     for k in range(1, 101):
         made, dark, ns = int(rng.integers(0, 20)), int(rng.integers(0, 4)), int(rng.integers(1, 9)) * 100_000
-        grown = (made, made, int(rng.integers(0, made + 1)), 50, dark)
+        grown = (made, made, made, int(rng.integers(0, made + 1)), 50, dark)
         sums = {name: value + more for (name, value), more in zip(sums.items(), grown)}
         history.take(given | sums | {"elapsed_s": float(k), "latency": [[ns, made]] if made else []})
         steps.append((*grown, ns))
     found = live_page.columns(history, level, least)
     for at in range(len(found["s"])):
-        for wanted, of in ((least, 0), (live_page.LEAST_DARK, 4)):
+        for wanted, of in ((least, 0), (live_page.LEAST_DARK, 5)):
             first = at
             while first and sum(step[of] for step in steps[first : at + 1]) < wanted:
                 first -= 1
@@ -111,12 +114,13 @@ def test_curves_are_those_of_the_decisions_that_a_point_takes() -> None:
             if not steps[at][0]:
                 assert np.isnan(found["accuracy"][at])
             elif of == 0:
-                right, ns = sum(step[2] for step in some), sorted(step[5] for step in some for _ in range(step[0]))
+                right, ns = sum(step[3] for step in some), sorted(step[6] for step in some for _ in range(step[0]))
                 curves = [found[name][at] / 100 for name in ("accuracy", "accuracy_low", "accuracy_high")]
                 assert curves == pytest.approx([right / known, *wilson_interval(right, known)])
                 assert found["p50"][at] == ns[-(-len(ns) // 2) - 1] / 1000
+                assert np.isnan(found["p99"][at]) == (len(ns) < 100)
                 assert found["over"][at] == len(some)
-            elif dark := sum(step[4] for step in some):
+            elif dark := sum(step[5] for step in some):
                 assert found["dark"][at] == pytest.approx(dark / (50 * len(some)))
                 assert found["dark_high"][at] == pytest.approx(wilson_interval(dark, 50 * len(some))[1])
 

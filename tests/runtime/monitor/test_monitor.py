@@ -29,7 +29,7 @@ from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.monitor import History, Monitor
 from pans.runtime.monitor.alarms import Alarms
-from pans.runtime.monitor.figures import headline, health, latest_rows, rows_of
+from pans.runtime.monitor.figures import headline, health, latest_rows, rows_of, title_of
 from pans.runtime.monitor.history import BINS, LEVELS, SUMS, quantile_us
 from pans.runtime.monitor.monitor import NOTE_CHARACTERS
 from pans.runtime.monitor.snapshot import Snapshots
@@ -37,7 +37,7 @@ from pans.runtime.record import read_recording
 from pans.runtime.timing.ledger import LatencyHistogram, upper_edge
 
 NUMBERS = (
-    *("decisions", "abstained", "known", "right", "objects", "clicks", "photons", "photons_known", "lost_exposures"),
+    *(*SUMS, "abstained", "objects"),
     *("gaps", "late", "reconnects", "contradictions", "latency_max_us", "dark_exposures", "dark_clicks"),
     "clock_uncertainty_us",
 )
@@ -59,7 +59,7 @@ def picture(elapsed_s: float, **more: Any) -> dict[str, Any]:
 def test_a_month_takes_the_memory_of_an_hour_and_sums_are_exact() -> None:
     history, n = History(), 40_000
     for step in range(1, n + 1):
-        sums = {"decisions": 100 * step, "known": 100 * step, "right": 80 * step, "late": step // 1000}
+        sums = {"decisions": 100 * step, "judged": 100 * step, "right": 80 * step, "late": step // 1000}
         history.take(picture(65.0 * step, **sums, latency=[[200 + step % 2, 100]]))
     for level, bins in history.bins.items():
         assert len(bins) <= BINS
@@ -131,7 +131,7 @@ def test_an_alarm_has_a_beginning_an_end_and_a_cause() -> None:
 def test_health_is_a_sentence_with_a_number(facts: dict[str, Any], levels: list[str], words: str) -> None:
     history = History()
     history.take({"kind": "begin", "deadline_us": 100.0})
-    history.take(picture(1.0, decisions=10, latency=[[50_000, 10]], **facts))
+    history.take(picture(1.0, decisions=100, latency=[[50_000, 100]], **facts))
     found = health(history)
     assert [name for name, _, _ in found] == ["machine", "link", "detector"]
     assert [level for _, level, _ in found] == levels
@@ -150,30 +150,55 @@ def test_quantiles_are_those_of_the_loop_s_histogram() -> None:
 def test_trials_of_one_visit_do_not_narrow_the_interval() -> None:
     history = History()
     history.take({"kind": "begin", "trials": 5})
-    assert history.accuracy({"known": 500, "right": 400}) == (0.8, *wilson_interval(80, 100))
-    assert history.accuracy({"known": 500, "right": 400}, objects=20) == (0.8, *wilson_interval(16, 20))
-    assert np.isnan(history.accuracy({"known": 0})).all()
+    assert history.accuracy({"judged": 500, "right": 400}) == (0.8, *wilson_interval(80, 100))
+    assert history.accuracy({"judged": 500, "right": 400}, objects=20) == (0.8, *wilson_interval(16, 20))
+    assert np.isnan(history.accuracy({"judged": 0})).all()
 
 
 def test_what_is_wrong_is_marked_and_in_words() -> None:
     history = History()
     history.take({"kind": "begin", "deadline_us": 1000.0, "classes": ["a\x1b[2J", "b"], "expected": 100})
-    late = picture(10.0, decisions=50, known=50, right=25, objects=50, clicks=100, late=3, lost_exposures=7, gaps=2)
-    late |= {"disk_free_bytes": 1 << 20, "disk_left_s": 10, "latency": [[1_700_000, 50]]}
+    late = picture(10.0, decisions=100, decided=60, judged=50, right=25, objects=50, late=3, lost_exposures=7, gaps=2)
+    late |= {"abstained": 40, "decisions_clicks": 900, "decided_clicks": 300, "judged_clicks": 100}
+    late |= {"disk_free_bytes": 1 << 20, "disk_left_s": 10, "latency": [[1_700_000, 100]], "latency_max_us": 1650.0}
     late |= {"latest": [[49, 3, 0, 0.5, 2, 1, 0]]}
     history.take(late | {"last_error": "lost\n\x1b[31m", "dark_exposures": 100, "dark_clicks": 3})
     rows = {row.name: row for row in rows_of(history)}
     assert rows["late"].level == rows["lost"].level == rows["disk"].level == rows["latency"].level == "bad"
     assert rows["lost"].text == "7 exposures in 2 gaps"
-    history.begin["late_allowed"] = 0.06
+    history.begin["late_allowed"] = 0.03
     assert next(row.level for row in rows_of(history) if row.name == "late") == "note"
-    assert rows["accuracy"].text.startswith("50.0%, 95 % interval 36.6% to 63.4%")
+    of = "of the 50 decisions with a label and a known true class"
+    assert rows["accuracy"].text.startswith(f"50.0% {of}, 95 % interval 36.6% to 63.4%")
+    assert rows["light per decision"].text == f"2.00 clicks, photons unknown; {of}"
+    assert rows["latency"].text.startswith("p50 1,650 us, p99 1,650 us, longest 1,650 us;")  # no quantile above it
     assert "0.03 per exposure" in rows["dark counts"].text
     assert not any("\x1b" in row.text or "\n" in row.text for row in rows.values())
     assert latest_rows(history)[0]["level"] == "bad"
     assert latest_rows(history)[0]["decision"] == "a\\x1b[2J"
-    assert headline(history).startswith("50 of 100 decisions · accuracy 50.0% · 2.00 clicks each · p99")
-    assert headline(history).endswith("late 3 · lost 7")
+    said = f"100 of 100 decisions, 40 abstained · accuracy 50.0% · 2.00 clicks each ({of}) · p99 1.65 ms"
+    assert headline(history) == f"{said} · late 3 · lost 7"
+
+
+def test_latencies_are_told_of_enough_decisions_in_real_time_alone() -> None:
+    told = {}
+    for n, more in ((99, {}), (100, {}), (100, {"virtual_time": True})):
+        history = History()
+        history.take({"kind": "begin", "deadline_us": 1e6})
+        history.take(picture(1.0, decisions=n, decided=n, latency=[[50_000, n]], latency_max_us=50.0, **more))
+        rows = {row.name: row.text for row in rows_of(history)}
+        told[n, bool(more)] = rows.get("latency"), "p99" in headline(history), health(history)[0][2]
+    assert told[99, False] == ("p50 50 us, longest 50 us", False, "No decision was late in the last 60 s.")
+    assert told[100, False][0] == "p50 50 us, p99 50 us, longest 50 us; p99 takes 0% of 1,000,000 us"
+    assert told[100, False][1]
+    assert told[100, True] == (None, False, "Time is virtual: latencies are not measured.")
+
+
+def test_a_device_behind_a_socket_says_that_it_is_simulated() -> None:
+    history = History()
+    history.take({"kind": "begin", "title": "a bundle on a device", "simulated": False})
+    history.take(picture(1.0, simulated=True))
+    assert title_of(history) == "SIMULATED · a bundle on a device"
 
 
 @pytest.mark.parametrize(
@@ -273,7 +298,7 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
     run, history = watched.run, watched.history
     tally, last = run.tally, history.picture
     assert last["decisions"] == tally.decisions == 120
-    assert last["right"] / last["known"] == tally.accuracy == tally.confusion.trace() / 120
+    assert last["right"] / last["judged"] == tally.accuracy == tally.confusion.trace() / 120
     assert sum(history.latency.values()) == run.timing.total.total
     assert [row[0] for row in last["latest"]] == list(range(108, 120))
     bundle, _ = load_bundle(SHIPPED / "fashion10.pans")
@@ -287,7 +312,9 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
     text = " ".join(row.text for row in rows_of(history))
     assert f"{100 * tally.accuracy:.1f}%" in text
     assert "start +0 us, length +0 us at most, allowed 30 us" in text
-    assert f"{tally.clicks / 120:.2f} clicks, {tally.photons / 120:.2f} photons" in text
+    light = tally.of["judged"]
+    assert f"{light.clicks / 120:.2f} clicks, {light.photons / 120:.2f} photons" in text
+    assert (last["simulated"], last["virtual_time"]) == (True, True)
 
 
 @pytest.mark.parametrize("drive", ["device", "host"])
@@ -369,7 +396,7 @@ def test_a_panel_is_drawn_on_a_terminal_and_removed(tmp_path: Path) -> None:
     child = subprocess.Popen(
         words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=theirs, text=True, env=environment
     )
-    sums = {"decisions": 4, "known": 4, "right": 3, "objects": 4, "clicks": 8, "latest": [[3, 7, 0, 0.9, 2, 0, 0]]}
+    sums = {"decisions": 4, "decided": 4, "judged": 4, "right": 3, "objects": 4, "latest": [[3, 7, 0, 0.9, 2, 0, 0]]}
     begin = {"kind": "begin", "title": "a bundle on a device", "classes": ["shoe", "bag"], "deadline_us": 100.0}
     for message in (begin | {"expected": 10}, picture(3.0, **sums)):
         child.stdin.write(json.dumps(message) + "\n")

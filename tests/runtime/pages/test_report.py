@@ -102,7 +102,7 @@ def test_accuracy_over_time_counts_objects_once() -> None:
     found = Decisions({"tick_hz": 100.0}, 300, ("a", "b"))
     for part in (rows[:7], rows[7:120], rows[120:]):
         found.take(part)
-    assert (found.known, found.right) == (270, 134)
+    assert (found.judged, found.right) == (270, 134)
     assert found.confusion.tolist() == [[0, 0], [136, 134]]
     over = found.accuracy()
     assert over is not None

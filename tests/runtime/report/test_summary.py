@@ -125,15 +125,17 @@ def test_the_page_has_no_zero_that_was_not_measured(summary: Summary, tmp_path: 
 
 
 def test_objects_that_come_again_are_no_trials(summary: Summary, tmp_path: Path) -> None:
-    tally = replace(summary.tally, objects=200, trials=5, decisions=1000)
+    tally = replace(summary.tally, objects=200, trials=5, decisions=1000, decided=1000, judged=1000)
     said = closing_words(replace(summary, tally=tally), "r", "s")
     assert "1000 decisions (200 objects × 5 trials)" in said
-    again = replace(summary, tally=replace(tally, trials=1, decisions=88_334))
+    again = replace(summary, tally=replace(tally, trials=1, decisions=88_334, decided=88_334, judged=88_334))
     assert "88334 decisions (200 objects, 441.7 decisions on each on average)" in closing_words(again, "r", "s")
     write_markdown(tmp_path / "s.md", again, {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
     assert "200 objects, 441.7 decisions on each on average |" in (tmp_path / "s.md").read_text()
-    unknown = replace(summary, tally=replace(tally, objects=0, trials=0))
+    unknown = replace(summary, tally=replace(tally, objects=0, trials=0, judged=0))
     assert "1000 decisions (true classes unknown)" in closing_words(unknown, "r", "s")
+    partly = replace(summary, tally=replace(tally, trials=1, judged=500))  # the class of the others is not known
+    assert "1000 decisions (200 objects, 2.5 decisions on each on average)" in closing_words(partly, "r", "s")
 
 
 def test_late_decisions_say_how_sure_the_cause_is_and_where_they_began(summary: Summary, tmp_path: Path) -> None:
@@ -180,11 +182,31 @@ def test_dark_counts_of_a_run_are_judged_as_in_the_live_view(
     assert (f"dark counts   {words}" in said) == bool(words)
 
 
-def test_what_counts_as_not_right_and_what_is_incomplete_is_said(summary: Summary) -> None:
-    tally = replace(summary.tally, abstained=7, accuracy=0.5, objects=20)
-    said = closing_words(replace(summary, tally=tally, lost=3), "r", "s")
-    assert "abstained decisions with a known truth count as not right" in said
-    assert "abstained decisions" not in closing_words(replace(summary, tally=replace(tally, abstained=0)), "r", "s")
+def test_a_line_has_one_denominator_and_names_it(summary: Summary, tmp_path: Path) -> None:
+    of = dict.fromkeys(("accuracy", "clicks_mean", "photons_mean", "illumination"), "judged")
+    counts = {"decisions": 4686, "decided": 2525, "judged": 2500, "abstained": 2161, "photons_known": 2500}
+    tally = replace(summary.tally, accuracy=0.8016, clicks_mean=5.33, photons_mean=9.0, figures_of=of, **counts)
+    said = closing_words(replace(summary, tally=tally, illumination=51.2), "r", "s").splitlines()
+    assert "4686 decisions, 2161 abstained (" in said[0]
+    assert said[1] == "  accuracy      80.16% at 5.33 clicks, 9.00 photons, illumination 51.2 each"
+    assert said[2].strip() == "of the 2,500 decisions with a label and a known true class"
+    # an automaton's light is known of all decisions alone: it stands on a line of its own
+    walked = replace(tally, figures_of=of | {"illumination": "decisions"})
+    said = closing_words(replace(summary, tally=walked, illumination=51.2), "r", "s").splitlines()
+    assert said[1] == "  accuracy      80.16% at 5.33 clicks, 9.00 photons each"
+    assert said[3] == "  illumination  51.2 each, of all 4,686 decisions"
+    write_markdown(tmp_path / "s.md", replace(summary, tally=tally), {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
+    assert "| accuracy | 80.16% | of the 2,500 decisions with a label" in (tmp_path / "s.md").read_text()
+    whole = dict.fromkeys(("decided", "judged", "photons_known"), 4686)
+    assert "of the" not in closing_words(replace(summary, tally=replace(tally, abstained=0, **whole)), "r", "s")
+
+
+def test_a_quantile_of_too_few_decisions_is_not_printed(summary: Summary, tmp_path: Path) -> None:
+    row = {"p50": 120.0, "p99": None, "p999": None, "max": 900.0}
+    few = replace(summary, latency_us=row, stage_latency_us={"link": row})
+    assert "latency       p50 120 us, max 900 us; late" in closing_words(few, "r", "s")
+    write_markdown(tmp_path / "s.md", few, {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
+    assert "| link | 120 | – | – | 900 |" in (tmp_path / "s.md").read_text()
 
 
 def test_an_accuracy_has_an_interval_also_where_all_were_right() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pans.runtime.timing.ledger import LatencyHistogram, TimingLedger, upper_edge
+from pans.runtime.timing.ledger import LatencyHistogram, TimingLedger, quantiles_us, upper_edge
 
 
 def counted(*durations_ns: int) -> LatencyHistogram:
@@ -29,9 +29,17 @@ def test_quantiles_are_at_most_3_2_percent_high(low_high: tuple[int, int]) -> No
 
 
 def test_extreme_durations() -> None:
-    assert counted().summary() == {"p50": 0.0, "p99": 0.0, "p999": 0.0, "max": 0.0}
+    assert counted().summary() == {"p50": None, "p99": None, "p999": None, "max": None}
     histogram = counted(-5, 2**62)  # an arrival before its own exposure ended: clock uncertainty
     assert (histogram.quantile_ns(0.5), histogram.max_ns, histogram.total) == (0, 2**62, 2)
+
+
+def test_a_quantile_needs_a_sample_beyond_it() -> None:
+    for n, known in ((1, ()), (2, ("p50",)), (99, ("p50",)), (100, ("p50", "p99")), (1000, ("p50", "p99", "p999"))):
+        found = counted(*range(1, n + 1)).summary()
+        assert tuple(name for name, us in found.items() if us is not None) == (*known, "max")
+        single = quantiles_us(np.arange(n))
+        assert tuple(name for name, us in single.items() if us is not None) == tuple(f"{name}_us" for name in known)
 
 
 def judge(ledger: TimingLedger, marks: tuple[int, int, int, int, int], uncertainty_ns: int = 0, count: int = 1) -> bool:
