@@ -16,6 +16,9 @@ from .onnx_model import MODEL_MAX_BYTES
 
 HEAD_MAX_BYTES = MODEL_MAX_BYTES
 _BATCH_ROWS = 65536
+_TRIED_ROWS = 3
+# Of the largest score. A quantised head may round another way in another batch; one that mixes rows is off by whole scores.
+_MIXING = 0.02
 _BATCH_VALUES = 1 << 22  # of intermediate results at once: 16 MiB
 _REMEDY = (
     "export the head again: one float32 input (n, patterns), first output float32 (n, classes), weights inside the file, "
@@ -77,16 +80,32 @@ def _session(head_onnx: bytes, where: str) -> Any:
 
 
 def _try_out(head: OnnxHead, where: str) -> None:
-    """Run one row and, where the batch is free, three: a shape that only shows when it runs must show here."""
-    for rows in (1,) if head.cost.row_by_row else (1, 3):
-        means = np.zeros((rows, head.n_features), dtype=np.float32)
-        try:
-            found = np.asarray(head._run(means))
-        except Exception as error:
-            raise _damaged(where, f"onnxruntime cannot run it on {rows} rows: {_first_line(error)}") from error
-        if found.shape != (rows, head.n_classes) or found.dtype != np.float32:
-            allowed = f"({rows}, {head.n_classes}) float32"
-            raise _damaged(where, f"the output for {rows} rows is {found.shape} {found.dtype}, allowed: {allowed}")
+    """Run single rows and, where the batch is free, all together: what only shows when it runs must show here."""
+    means = np.random.default_rng(20250104).random((_TRIED_ROWS, head.n_features)).astype(np.float32)
+    alone = np.concatenate([_tried(head, row[None], where) for row in means])
+    if head.cost.row_by_row:
+        return
+    together = _tried(head, means, where)
+    off, allowed = np.abs(together - alone), _MIXING * np.abs(alone).max()
+    if (off > allowed).any():
+        row, label = np.unravel_index(int(off.argmax()), off.shape)
+        found = (
+            f"score {label} of row {row} is {alone[row, label]:.6g} alone and {together[row, label]:.6g} among others"
+        )
+        raise _damaged(where, f"it mixes rows: {found}, allowed: each row is decided by itself")
+
+
+def _tried(head: OnnxHead, means: NDArray[np.float32], where: str) -> NDArray[np.float32]:
+    """Return the scores of the rows `means`, of the right shape."""
+    rows = len(means)
+    try:
+        found = np.asarray(head._run(means))
+    except Exception as error:
+        raise _damaged(where, f"onnxruntime cannot run it on {rows} rows: {_first_line(error)}") from error
+    if found.shape != (rows, head.n_classes) or found.dtype != np.float32:
+        allowed = f"({rows}, {head.n_classes}) float32"
+        raise _damaged(where, f"the output for {rows} rows is {found.shape} {found.dtype}, allowed: {allowed}")
+    return found
 
 
 def _first_line(error: Exception) -> str:

@@ -283,6 +283,8 @@ def _slice(call: _Call) -> Tensor:
     axes, steps = call.integers("axes", 3) or range(len(starts)), call.integers("steps", 4) or (1,) * len(starts)
     for start, end, place, step in zip(starts, ends, axes, steps, strict=True):
         axis = range(values.ndim)[place]
+        if values.shape[axis] == ROWS and step != 1:  # one of all rows in reverse has the same shape
+            raise ValueError(f"takes the rows in steps of {step}, allowed: rows stay in their order")
         past = step < 0 and end < -values.shape[axis]
         values = values[(slice(None),) * axis + (slice(start, None if past else end, step),)]
     return values

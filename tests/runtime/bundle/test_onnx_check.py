@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from bundles import made_bundle
 from heads import affine_head, onnx_chain, random_layers
 from models import hostile_models, model, random_model
 from onnx import helper
@@ -36,6 +37,34 @@ def test_heads_that_would_run_away_are_refused_unrun(name: str, monkeypatch: pyt
     data, reason = HOSTILE[name]
     with pytest.raises(DamagedFileError, match=reason):
         open_head(data, {"foreign domain": 2, "convolution": 4096}.get(name, 4), 2, "here")
+
+
+MIXING = [  # of 2 patterns and 2 classes, and the reason
+    (
+        "int64[1] s = {-1}, int64[1] e = {-9223372036854775807}, int64[1] a = {0}, int64[1] m = {-1}",
+        "z = Slice(x, s, e, a, m)",
+        "rows in steps of -1",
+    ),
+    ("", "n = Shape(x) m = Cast<to = 1>(n) z = Div(x, m)", "mixes rows: score"),
+]
+
+
+@pytest.mark.parametrize(("constants", "nodes", "reason"), MIXING, ids=["backwards", "by how many there are"])
+def test_a_head_decides_each_row_by_itself(constants: str, nodes: str, reason: str) -> None:
+    graph = f"(float[n, 2] x) => (float[n, 2] y) <{constants}> {{ {nodes} y = Identity(z) }}"
+    data = parse_model(f'<ir_version: 8, opset_import: ["": 17]> head {graph}').SerializeToString()
+    with pytest.raises(DamagedFileError, match=reason):
+        open_head(data, 2, 2, "here")
+    # and not: "the table does not answer the golden vectors"
+    with pytest.raises(DamagedFileError, match=reason):
+        made_bundle(2, 2, head_onnx=data)
+
+
+def test_a_slice_of_all_rows_is_let_through() -> None:
+    constants = "int64[2] s = {0, 0}, int64[2] e = {9223372036854775807, 2}, int64[2] a = {0, 1}, int64[2] m = {1, 1}"
+    graph = f"(float[n, 3] x) => (float[n, 2] y) <{constants}> {{ y = Slice(x, s, e, a, m) }}"
+    data = parse_model(f'<ir_version: 8, opset_import: ["": 17]> head {graph}').SerializeToString()
+    assert open_head(data, 3, 2, "here").scores(np.eye(3, dtype=np.float32)).tolist() == [[1, 0], [0, 1], [0, 0]]
 
 
 AFFINE = affine_head(np.eye(2), np.zeros(2))
