@@ -234,18 +234,17 @@ def new_run_folder(name: str, root: Path = RUNS) -> Path:
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
+def locked(path: Path, what: str = "", remedy: str = "choose another folder with --out") -> Iterator[None]:
     """Hold the lock file `path` until the block ends; UsageError, which names the holder's process, if another run has it.
 
     The lock goes when its process dies, and the file goes with the lock. Systems without flock hold nothing: there exclusive creation
-    alone keeps two runs apart.
+    alone keeps two runs apart. `what` the lock is for is by default its folder.
     """
     try:
         import fcntl
     except ModuleNotFoundError:
         yield
         return
-    remedy = "choose another folder with --out"
     with ExitStack() as held:
         try:
             while True:
@@ -259,8 +258,8 @@ def locked(path: Path) -> Iterator[None]:
             file.write(f"{os.getpid()}\n".encode())
         except BlockingIOError as error:
             holder = file.read(20).decode("ascii", "replace").strip() or "unknown"
-            what = f"{path.parent}: another run writes here (process {holder})"
-            raise UsageError(what, remedy=remedy) from error
+            found = f"{what or path.parent}: another run writes here (process {holder})"
+            raise UsageError(found, remedy=remedy) from error
         except OSError as error:
             raise UsageError(f"{path}: cannot be locked: {error.strerror or error}", remedy=remedy) from error
         yield

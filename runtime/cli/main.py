@@ -42,6 +42,8 @@ _listening: list[Any] = []  # numba keeps listeners for good: one per process
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `pans` with `argv` (default: the process's arguments) and return the exit code of the contract."""
     words = list(sys.argv[1:] if argv is None else argv)
+    with suppress(AttributeError, ValueError):  # a terminal of ASCII alone gets the rest as escapes, as on stderr
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     begin(words)
     if argv is None:
         with _frozen():

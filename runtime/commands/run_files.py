@@ -102,6 +102,9 @@ def claimed(options: RunOptions) -> Iterator[RunOptions]:
         with ExitStack() as held:
             for lock in sorted(locks):
                 held.enter_context(locked(lock))
+            if (state := options.state) is not None:
+                remedy = "give each run a file of its own with --state"
+                held.enter_context(locked(state.with_name(f".{state.name}.lock"), str(state), remedy))
             yield options
     finally:
         for folder in reversed(made):

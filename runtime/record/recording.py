@@ -72,6 +72,13 @@ class Recording:
         return bool(self.header.get("simulated") or self.summary.get("simulated"))
 
     @property
+    def profile_toml(self) -> str:
+        """The hardware profile in the header as TOML; "" where the header has none that is a text."""
+        profile = self.header.get("profile")
+        text = profile.get("toml") if isinstance(profile, dict) else None
+        return text if isinstance(text, str) else ""
+
+    @property
     def virtual_time(self) -> bool:
         """Whether the run was in virtual time, in which nothing on the host takes any; of earlier recordings END alone tells."""
         device = self.summary.get("device")

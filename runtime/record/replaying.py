@@ -121,7 +121,7 @@ def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = Non
 
 
 def _exposure_timing(recording: Recording, core: Follower) -> dict[str, Any]:
-    toml = (recording.header.get("profile") or {}).get("toml")
+    toml = recording.profile_toml
     if not toml:
         return {}
     frames = (unpack_body(body) for _, body in recording.answers())

@@ -10,7 +10,6 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,9 +145,7 @@ def _verify_bundle(bundle: Bundle, verdict: FileVerdict) -> None:
         **{"table": bundle.table, "onnx": bundle.head_onnx, "int8": bundle.int8_head, "int8-onnx": bundle.int8_onnx},
         "automaton": bundle.automaton,
         # what a run may choose in place of these: where one refuses the bundle, the run does
-        **dict.fromkeys(
-            ("sparse", "float64", "count-table"), bundle.head_onnx if bundle.picture_shape is None else None
-        ),
+        **dict.fromkeys(("sparse", "count-table"), bundle.head_onnx if bundle.picture_shape is None else None),
     }
     for backend, part in parts.items():
         if part is not None:
@@ -276,9 +273,8 @@ def _verify_inner_bundle(recording: Recording, verdict: FileVerdict) -> int:
 
 
 def _verify_inner_profile(recording: Recording, verdict: FileVerdict) -> None:
-    profile: Any = recording.header.get("profile")
-    text = profile.get("toml") if isinstance(profile, dict) else None
-    if not isinstance(text, str):
+    text, profile = recording.profile_toml, recording.header.get("profile", {})
+    if not text:
         verdict.alerts.append("the recording holds no hardware profile")
         return
     if hashlib.sha256(text.encode()).hexdigest() != profile.get("sha256"):

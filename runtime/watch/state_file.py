@@ -6,8 +6,8 @@ each attempt.
 
 from __future__ import annotations
 
-import json
 import os
+import stat
 import threading
 import time
 from collections.abc import Callable
@@ -16,9 +16,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pans.runtime.container import canonical_json
+from pans.runtime.container import canonical_json, parse_json_object
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.live.journal import words_of
 from pans.runtime.outputs import replace_file
 
@@ -53,10 +53,10 @@ def is_stalled(run: LiveRun) -> bool:
 def read_state(path: Path) -> dict[str, Any] | None:
     """Return what the state file at `path` says; None where there is none, or another file."""
     try:
-        found = json.loads(path.read_bytes()) if path.stat().st_size <= MAX_BYTES else None
-    except (OSError, ValueError, RecursionError):
+        found = parse_json_object(path.read_bytes(), str(path)) if path.stat().st_size <= MAX_BYTES else {}
+    except (OSError, DamagedFileError):  # strict: what is no JSON, such as Infinity, could not be written again
         return None
-    return found if isinstance(found, dict) and found.get("format") == FORMAT else None
+    return found if found.get("format") == FORMAT else None
 
 
 def alarms_of(run: LiveRun) -> dict[str, dict[str, Any]]:
@@ -145,9 +145,13 @@ class StateFile:
         self._thread = Repeated("pans-state", EVERY_S, self._write)
 
     def close(self) -> None:
-        """Write once more and stop."""
+        """Write once more and stop; a file that cannot be written goes: it would say for ever that the run is running."""
         self._thread.close(GOODBYE_S)
+        self.trouble = ""
         self._write()
+        if self.trouble:
+            with suppress(OSError):
+                self._path.unlink()
 
     def leave(self, facts: dict[str, Any]) -> None:
         """Write once more, with `facts` in place of what the run says of itself; they stay."""
@@ -157,9 +161,22 @@ class StateFile:
     def _write(self) -> None:
         if not self._alone.acquire(timeout=OTHER_WRITER_S):
             return  # the other thread hangs in the file system
+        data = b""
         try:
-            replace_file(self._path, canonical_json(self._look() | self._left) + b"\n")
+            data = canonical_json(self._look() | self._left) + b"\n"
+            replace_file(self._path, data)
         except UsageError as error:  # a run does not end because nobody can watch it
-            self.trouble = error.message
+            if not self._overwrite(data):
+                self.trouble = error.message
         finally:
             self._alone.release()
+
+    def _overwrite(self, data: bytes) -> bool:
+        """Write in place of the bytes before: on a full disk these are the only room. Return whether that was possible."""
+        with suppress(OSError), open(self._path, "r+b") as file:
+            size = os.fstat(file.fileno()).st_size
+            if data and stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                file.write(data.rstrip().ljust(size - 1) + b"\n")  # one write; spaces at the end are no part of JSON
+                file.flush()
+                return True
+        return False

@@ -15,6 +15,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from pans.runtime.safe_text import one_line
+
 from .host import HostWatch
 from .repeated import Repeated
 from .state_file import StateFile, is_stalled, picture_of, read_state
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
 NOTIFY_EVERY_S = 1.0  # without WATCHDOG_USEC
 NOTIFICATIONS_PER_TIMEOUT = 3
+VERDICTS = ("PASS", "FAIL")
 MAX_FAULTS = 20  # of the state file; the recording has them all
 
 
@@ -59,7 +62,8 @@ class Watchers:
             if self._wanted.state is not None:
                 if (before := read_state(self._wanted.state)) is not None:  # one that was killed has no verdict
                     folder = Path(str(before.get("recording", ""))).parent.name
-                    self._outcome = {"last_verdict": before.get("verdict") or "cut", "last_folder": folder}
+                    verdict = before.get("verdict")
+                    self._outcome = {"last_verdict": verdict if verdict in VERDICTS else "cut", "last_folder": folder}
                 self._state = StateFile(self._wanted.state, self.look)
                 opening.callback(self._state.close)
             self._notifier = Notifier.of_environment()
@@ -80,8 +84,21 @@ class Watchers:
                 self.note_news(self._run)  # the recording is still open
                 if self._recorder is not None:
                     self._recorder.flush()  # the last state names all decisions
+            if error is not None:
+                self._end_by(error)
+        except BaseException as failure:
+            self._end_by(failure)
+            raise
         finally:
             self._open.close()
+
+    def _end_by(self, error: BaseException) -> None:
+        """State that the run has ended by an error: it did not come to a verdict, and is not running any more."""
+        why = one_line(str(error) or type(error).__name__, 300)
+        ended = {"state": "stopped", "ended": why}
+        if self._run is not None:
+            self.conclude("FAIL", [why])
+        self._outcome |= ended
 
     def prepared(self, run: LiveRun) -> None:
         """Watch `run` from here on."""

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import fixed_run
 
 from pans.runtime import __version__, cli
 from pans.runtime.cli import Command, finding, main, printing
@@ -204,3 +205,10 @@ def test_an_answer_that_cannot_be_written_is_an_error_without_a_traceback() -> N
         done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2
     assert done.stderr.startswith("pans: No space left on device\n  remedy: make room")
+
+
+def test_an_answer_with_letters_that_the_terminal_has_not_is_printed_with_escapes(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "pans", *fixed_run(3), "--out", str(tmp_path / "run"), "-q"]
+    ascii_alone = os.environ | {"PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(words, capture_output=True, env=ascii_alone, check=True)
+    assert done.stdout.startswith(b"SIMULATED \\xb7 PASS: 3 decisions (3 objects \\xd7 1 trials)")

@@ -1,5 +1,6 @@
 """Recordings decided again: whole, cut off at any byte, refused, or with blocks that say something else than the run."""
 
+import json
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from commands import json_of
 from small_files import blocks_of, record_flow, record_passive, record_run, sealed, use_file
 from small_runs import record_small
 
+from pans.runtime.cli import main
 from pans.runtime.errors import DeviceError
 from pans.runtime.live import LiveRun
 from pans.runtime.record import Recorder, Recording, read_recording
@@ -114,6 +116,20 @@ def without(*kinds: Kind) -> Change:
 
 def event(text: bytes) -> Change:
     return lambda blocks: [(kind, text if kind == Kind.EVENTS else payload) for kind, payload in blocks]
+
+
+@pytest.mark.parametrize("profile", [7, "ideal", [], {"toml": 5}, None])
+def test_a_header_with_a_profile_of_another_type_is_replayed(profile: object, whole: bytes, tmp_path: Path) -> None:
+    def change(blocks: list[tuple[Kind, bytes]]) -> list[tuple[Kind, bytes]]:
+        header = json.loads(blocks[0][1]) | {"profile": profile}
+        return [(blocks[0][0], json.dumps(header).encode()), *blocks[1:]]
+
+    path = tmp_path / "run.pansrec"
+    path.write_bytes(sealed(change(blocks_of(whole))))
+    recording = read_recording(path)
+    assert replay(recording, recording.bundle()).exposure_timing == {}
+    assert main(["replay", str(path)]) == 0
+    assert main(["export", str(path), "--format", "csv", "-o", str(tmp_path / "csv")]) == 0
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from commands import fixed_run
 
 from pans.firmware_sim.ports.virtual import VirtualLink
 from pans.firmware_sim.testing import small_setup
@@ -25,8 +26,10 @@ from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.commands.one_run import _exit_code
 from pans.runtime.core.decision import DECISION_DTYPE
+from pans.runtime.errors import RecordingError
 from pans.runtime.live.continuous import AGAIN_S, ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
 from pans.runtime.live.run_options import RunOptions
+from pans.runtime.outputs import locked
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_parts
@@ -48,9 +51,45 @@ def test_the_state_file_is_always_whole(tmp_path: Path, monkeypatch: pytest.Monk
     assert (found["n"] >= 2, found["ended"], state.trouble) == (True, "so", "")
     monkeypatch.setattr(os, "fsync", MagicMock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     state.leave({})
-    assert "No space left" in state.trouble
     assert list(tmp_path.iterdir()) == [path]  # what a full disk cut off does not stay
-    assert json.loads(path.read_text()) == found
+    assert (json.loads(path.read_text()), state.trouble) == ({"n": found["n"] + 1}, "")  # in place of the bytes before
+    monkeypatch.setattr(StateFile, "_overwrite", lambda self, data: False)
+    state.close()
+    assert "No space left" in state.trouble
+    assert not path.exists()  # what it said is not true any more
+
+
+def test_the_state_of_a_run_that_an_error_ended_is_stopped(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    with (
+        pytest.raises(RecordingError),
+        Watchers(RunOptions(state=path), None, None, Stop(continuous=True), None),
+    ):
+        raise RecordingError("run.pansrec: No space left on device")
+    found = json.loads(path.read_text())
+    assert (found["state"], found["ended"]) == ("stopped", "run.pansrec: No space left on device")
+
+
+def test_two_runs_do_not_share_a_state_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    state = tmp_path / "state.json"
+    with locked(tmp_path / ".state.json.lock"):
+        assert main([*fixed_run(3), "--state", str(state), "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert f"{state}: another run writes here (process {os.getpid()})" in said
+    assert "give each run a file of its own" in said
+    assert main([*fixed_run(3), "--state", str(state), "--out", str(tmp_path / "run")]) == 0
+    assert not (tmp_path / ".state.json.lock").exists()
+
+
+@pytest.mark.parametrize(
+    "before", [b'{"format":"pans-state 1","verdict":-Infinity}', b'{"format":"pans-state 1","verdict":[1]}']
+)
+def test_a_state_file_of_another_hand_does_not_keep_a_run_from_starting(before: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    path.write_bytes(before)
+    with Watchers(RunOptions(state=path), None, None, Stop(continuous=True), None) as seen:
+        assert seen.look().get("last_verdict") in (None, "cut")
+    assert json.loads(path.read_text())["state"] == "setting up"
 
 
 def test_a_state_file_that_cannot_be_written_does_not_end_the_run(tmp_path: Path) -> None:
