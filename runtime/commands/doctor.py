@@ -29,7 +29,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
 from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import UsageError
 from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
-from pans.runtime.timing.realtime import FIFO_PRIORITY, GRANTED, first_line, isolated_cores, lacking
+from pans.runtime.timing.realtime import FIFO_PRIORITY, GRANTED, first_line, isolated_cores, lacking, load_average
 
 if TYPE_CHECKING:
     from pans.runtime.timing.rehearsal import Rehearsal
@@ -295,6 +295,14 @@ def check_system() -> Iterator[Finding]:
     yield Finding("system", not missing, found, remedy if missing else "")
 
 
+def check_load() -> Iterator[Finding]:
+    """Other programs leave a processor to the loop, and one to a simulated instrument."""
+    load, cores = load_average(), os.cpu_count() or 1
+    ok = load < cores
+    remedy = "end other programs: decisions are late while more of them compute than there are cores"
+    yield Finding("load", ok, f"{load:.1f} on {cores} cores in the last minute", "" if ok else remedy)
+
+
 def check_governor() -> Iterator[Finding]:
     """The processor does not slow down between decisions."""
     governor = first_line(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"))
@@ -341,7 +349,7 @@ def check_others() -> Iterator[Finding]:
 
 Check = Callable[[], Iterator[Finding]]
 LIBRARIES: tuple[Check, ...] = (check_python, check_system, check_numba, check_libusb, check_clock, check_processor)
-CHECKS = (*LIBRARIES, check_share, check_governor, check_udev, check_ports, check_others)
+CHECKS = (*LIBRARIES, check_share, check_load, check_governor, check_udev, check_ports, check_others)
 
 
 def examine(checks: tuple[Check, ...] = CHECKS) -> list[Finding]:

@@ -72,12 +72,14 @@ class Outcome:
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the figures of the summary, and the files."""
         found = self.summary.as_json()
-        names = ("verdict", "faults", "ended", "decisions", "abstained", "judged")
-        names += ("accuracy", "clicks_mean", "photons_mean", "illumination")
+        counts, means = ("decisions", "abstained", "judged"), ("clicks_mean", "photons_mean", "illumination")
         latency = found.get("latency_us") or {}
         rows = {
             "clicks are": "SIMULATED" if found.get("simulated") else "",
-            **{name: found.get(name) for name in (*names, "late", "lost")},
+            **{
+                name: found.get(name)
+                for name in ("verdict", "faults", "ended", *counts, "accuracy", *means, "late", "lost")
+            },
             "latency p99 (us)": latency.get("p99"),
             "recording": self.recording,
         }
@@ -408,6 +410,7 @@ class _Run:
             walks=walks,
             registration=None if self.registration is None else self.registration.facts(),
             late_allowed=options.late_allowed,
+            may_be_busy=options.may_be_busy,
         )
         if recorder is None or (kept := recorder.keep_deleted()) is None:
             return options, summary

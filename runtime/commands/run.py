@@ -66,7 +66,8 @@ def _demo(args: argparse.Namespace) -> int:
 
     device = f"sim:{args.profile}?scene={DEMO_SCENE}&seed={args.seed}&pace={args.pace}"
     decisions = 0 if args.seconds else DEMO_OBJECTS * args.trials
-    return run_and_report(args, _options(args, bundle=SHIPPED / DEMO_BUNDLE, device=device, decisions=decisions))
+    shipped = {"bundle": SHIPPED / DEMO_BUNDLE, "device": device, "decisions": decisions}
+    return run_and_report(args, _options(args, **shipped, may_be_busy=True))
 
 
 def _options(args: argparse.Namespace, **others: object) -> RunOptions:

@@ -187,6 +187,7 @@ class RunOptions:
     command: str = ""  # the command line, for the recording and the page
     display: bool = True  # what happens, on stderr
     warns_uncalibrated: bool = False  # where a calibration is missing or old
+    may_be_busy: bool = False  # few decisions that a busy computer made late are no fault
     n_cycles: int = 0  # 0: until `seconds` have passed or the device stops
     lease_ms: int = 1000
     started_ns: int = 0  # time.perf_counter_ns from which "armed after" counts; 0: the call of run_live

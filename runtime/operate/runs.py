@@ -158,7 +158,8 @@ def _as_far_as(recordings: Sequence[Path]) -> dict[str, Any]:
     sums = np.zeros(3, np.int64)
     for rows in skim_decisions(recordings, LOG_MAX_BYTES):
         judged = is_judged(rows)
-        sums += len(rows), np.count_nonzero(judged), np.count_nonzero(judged & (rows["label"] == rows["truth"]))
+        right = judged & (rows["label"] == rows["truth"])
+        sums += len(rows), int(judged.sum()), int(right.sum())
     decisions, known, right = sums.tolist()
     found = {"decisions": decisions, "judged": known, "accuracy": right / known if known else None}
     return found if decisions else {}

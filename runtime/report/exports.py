@@ -131,7 +131,7 @@ def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
 def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
     unit_s = plan.exposure_us * 1e-6 / plan.exposure_ticks
     channels = plan.n_channels
-    profile = recording.header.get("profile") if recording.profile_toml else {}
+    profile: Mapping[str, Any] = recording.header["profile"] if recording.profile_toml else {}
     classes = recording.bundle().classes if recording.bundle_place else ()
     described = (
         f"{'SIMULATED. ' if recording.simulated else ''}Binary clicks of {plan.n_patterns} patterns, {plan.mode}, exposures of "

@@ -24,9 +24,8 @@ from pans.runtime.safe_text import markdown, one_line
 from pans.runtime.timing.ledger import STAGES
 from pans.runtime.timing.realtime import fault_words, load_average
 
-from .summary import Summary, singular
+from .summary import Summary, singular, was_busy
 
-BUSY = 0.05  # of the time: who waits longer for a processor shares it with other programs
 UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host takes
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 _SHARES = ("accuracy", "accuracy_labelled", "missed", "doubled", "yield", "purity")
@@ -41,7 +40,8 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
     last += [("recording", recording, ""), ("report", report, "")]
     simulated = "SIMULATED · " * facts["simulated"]
     abstained = f", {facts['abstained']} abstained" if facts["abstained"] else ""
-    head = f"{simulated}{facts['verdict']}: {facts['decisions']} decisions{abstained} ({objects_words(facts)})"
+    head = f"{facts['decisions']} decisions{abstained} ({objects_words(facts)})"
+    head = f"{simulated}{facts['verdict']}{_but(facts)}: {head}"
     return "\n".join([head, *lines_of(rows_of(facts, "closing", "flow", "walks") + last)])
 
 
@@ -127,18 +127,18 @@ def dark_words(dark: Facts, *, calibrated: bool) -> str:
     return words if level != "note" else "" if calibrated else off
 
 
+def _but(facts: Facts) -> str:
+    return f", but {facts['busy']}" if facts.get("busy") else ""
+
+
 def _is_virtual(facts: Facts) -> bool:
     return bool(facts["device"].get("virtual_time"))
 
 
 def _busy_words(facts: Facts) -> Iterator[str]:
-    """Yield how busy the computer was, if that made most decisions late, and what to do about it.
-
-    A simulated instrument shares the computer: what is late there looks like its link's or its own delay.
-    """
-    waited_ms = facts["page_faults"].get("waited_ms", 0)
-    waits = facts["simulated"] and waited_ms >= BUSY * 1000 * facts["seconds"]
-    if not facts["late"] or not (waits or 2 * facts["late_cause"].get("host", 0) >= facts["late"]):
+    """Yield how busy the computer was, if that made most decisions late, and what to do about it."""
+    waited_ms, causes = facts["page_faults"].get("waited_ms", 0), facts["late_cause"]
+    if not was_busy(facts["simulated"], facts["late"], causes, waited_ms, facts["seconds"]):
         return
     loop = f"; the loop waited {waited_ms} ms of {facts['seconds']:.1f} s for a processor" if waited_ms else ""
     yield f"other programs kept the computer busy: load {load_average():.1f} on {os.cpu_count()} cores{loop}"
@@ -263,7 +263,7 @@ def write_markdown(
     lines = [
         f"# Run of {markdown(run.get('bundle', 'a bundle'))}{' (SIMULATED)' if simulated else ''}",
         simulated,
-        f"**{facts['verdict']}**",
+        f"**{facts['verdict']}**{markdown(_but(facts))}",
         *(f"- {markdown(fault)}" for fault in facts["faults"]),
         *_table("Results", ("figure", "value", ""), rows_of(facts, "figures", "flow", "walks")),
         *_table("Timing", ("microseconds", *QUANTILES), [] if _is_virtual(facts) else stage_rows(facts)),

@@ -46,6 +46,15 @@ def test_what_is_needed_and_missing_is_an_alert(monkeypatch: pytest.MonkeyPatch,
     assert "cannot run: broken" in pans.said().out
 
 
+def test_a_busy_computer_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    for load, ok in ((0.4, True), (6.2, False)):
+        monkeypatch.setattr(os, "getloadavg", lambda load=load: (load, load, load))
+        (found,) = doctor.check_load()
+        assert (found.check, found.ok, found.found) == ("load", ok, f"{load} on 2 cores in the last minute")
+        assert ("end other programs" in found.remedy) != ok
+
+
 def test_the_udev_rule_is_printed(pans: Pans) -> None:
     assert main(["doctor", "--udev"]) == 0
     assert pans.said().out.strip() == (SHIPPED / doctor.RULE).read_text().strip()

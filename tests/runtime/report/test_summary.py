@@ -1,6 +1,7 @@
 """The summary of a seeded run, compared key by key with a stored one; latencies in words: what the clock cannot resolve is never 0."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 from commands import fixed_run, json_of
 from mutated_sessions import Stage
+from small_runs import record_small
 
 from pans.runtime.cli import main
-from pans.runtime.report.summary import Summary, late_words
+from pans.runtime.commands.one_run import _exit_code
+from pans.runtime.report.summary import Summary, late_words, summarise
 from pans.runtime.report.words import accuracy_interval, closing_words, dark_words, write_markdown
 
 MEASURED = ("armed_after_s", "realtime", "page_faults", "recording", "report")  # of this machine and this run
@@ -219,3 +222,32 @@ def test_an_accuracy_has_an_interval_also_where_all_were_right() -> None:
     errors = [(high - low) / 2 / 1.96 for low, high in filter(None, (sure, broken))]
     assert errors == pytest.approx([0.4 / 200**0.5, 0.4 / 1000**0.5], rel=0.01)
     assert accuracy_interval({"accuracy": None, "objects": 0}) is None
+
+
+@pytest.mark.parametrize(
+    ("late", "causes", "waited_ms", "lost", "may_be_busy", "busy"),
+    [
+        (6, {"link": 6}, 400, 0, True, True),
+        (6, {"host": 3, "link": 3}, 0, 0, True, True),
+        (6, {"link": 6}, 400, 0, False, False),  # a run that is no demo
+        (6, {"link": 6}, 0, 0, True, False),  # nothing shows that the host was busy
+        (11, {"host": 11}, 400, 0, True, False),  # too many
+        (6, {"host": 6}, 400, 1, True, False),  # and something else is wrong
+    ],
+)
+def test_a_demo_on_a_busy_computer_passes_and_says_so(
+    late: int, causes: dict[str, int], waited_ms: int, lost: int, may_be_busy: bool, busy: bool, tmp_path: Path
+) -> None:
+    result = record_small(tmp_path / "run.pansrec", 200)
+    result.timing.late, result.late_cause, result.page_faults = late, causes, {"waited_ms": waited_ms}
+    result.stream["lost_exposures"], result.seconds = lost, 6.0
+    found = summarise(result, illumination=1.0, expected_decisions=200, may_be_busy=may_be_busy)
+    assert (found.verdict, bool(found.busy), found.too_late) == (
+        ("PASS", True, False) if busy else ("FAIL", False, True)
+    )
+    assert (_exit_code(found) == 0) == busy
+    words = closing_words(replace(found, device=found.device | {"virtual_time": False}), "r", "s")
+    said = re.match(
+        r"SIMULATED · PASS, but 6 of 200 late: this computer is busy \(load [\d.]+ on \d+ cores\): 200", words
+    )
+    assert (said is not None) == busy
