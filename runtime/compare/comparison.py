@@ -278,7 +278,7 @@ def _accuracy(sides: Sides, paired: bool) -> Finding | None:
         values = [float(one.mean()) if len(one) else None for one in right]
         shares = [_of_objects(rows, lambda rows: rows["label"] == rows["truth"]) for rows in both]
         if paired and None not in values and shares[0].keys() & shares[1].keys():
-            return _paired_accuracy(*shares, *values)
+            return _paired_accuracy((shares[0], shares[1]), (values[0], values[1]))
         sizes = [len(one) for one in shares]
     if None in values or not all(sizes):
         return None
@@ -299,14 +299,16 @@ def _pairs(first: dict[int, float], second: dict[int, float]) -> tuple[NDArray[n
     return np.array([first[number] for number in common]), np.array([second[number] for number in common])
 
 
-def _paired_accuracy(first: dict[int, float], second: dict[int, float], *values: float | None) -> Finding:
+def _paired_accuracy(
+    shares: tuple[dict[int, float], dict[int, float]], values: tuple[float | None, float | None]
+) -> Finding:
     """The accuracies of the runs, `values`; their difference is that of the objects in both, each of which counts once."""
-    one, two = _pairs(first, second)
+    one, two = _pairs(*shares)
     better, worse = int((one > two).sum()), int((one < two).sum())
     method = f"pairs of {len(one)} objects, each counts once (A {one.mean():.2%}, B {two.mean():.2%})"
     method += f": {better} better in A, {worse} better in B, McNemar exact"
     between, p = statistics.paired_difference(one, two, 1.0), statistics.mcnemar_exact(better, worse)
-    return Finding("accuracy", "share", *values, *between, False, p, method)
+    return Finding("accuracy", "share", values[0], values[1], *between, False, p, method)
 
 
 def _abstained(sides: Sides) -> Iterator[Finding]:
@@ -334,7 +336,7 @@ def _clicks(sides: Sides, paired: bool) -> Finding:
         between = statistics.mean_difference(one, two)
         method = f"{len(one)} and {len(two)} objects, each counts once (A {one.mean():.4g}, B {two.mean():.4g})"
     method += "; interval by the spread of their differences" if paired else "; interval by their spread"
-    return Finding("clicks_mean", unit, *values, *between, False, None, method)
+    return Finding("clicks_mean", unit, values[0], values[1], *between, False, None, method)
 
 
 def _latencies(sides: Sides) -> Iterator[Finding]:

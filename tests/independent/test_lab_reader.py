@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -158,8 +158,13 @@ def test_frames_hold_what_the_lab_reads(tmp_path: Path) -> None:
     assert frame.probability.isna().tolist() == (~decided).tolist()
     times = np.array(lab.timings)
     timed = np.isin(lab.rows["index"], times[:, 0])  # one that an outage ended may have no times
-    assert frame.latency_us.isna().tolist() == frame.index.isna().tolist() == (~timed).tolist()
-    assert frame.latency_us[timed].to_numpy() == pytest.approx((times[:, 3] - times[:, 1]) / 1000, abs=6e-4)
+    assert ours.virtual_time
+    assert frame.latency_us.isna().all()  # there is none in virtual time
+    assert np.isnan(data.latency_us.values).all()
+    # the same file, as one of a run in real time
+    real = replace(ours, header={**ours.header, "virtual_time": False}, summary={}).to_frame()
+    assert real.latency_us.isna().tolist() == frame.index.isna().tolist() == (~timed).tolist()
+    assert real.latency_us[timed].to_numpy() == pytest.approx((times[:, 3] - times[:, 1]) / 1000, abs=6e-4)
     zero_ns = min(sent for sent, _ in lab.commands)
     begun = np.datetime64(lab.header["created_utc"].removesuffix("+00:00"), "ns")
     shown = frame.index.tz_localize(None).values

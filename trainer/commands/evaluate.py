@@ -262,7 +262,8 @@ def words_of(
         lines.append(f"  {_reaching_words(more)}")
     lines += class_words(figures.get("by_class"))
     if figures.get("abstained"):
-        lines.append(f"  abstained {100 * figures['abstained']:.2f} %; the accuracy is that of what was decided")
+        of = "the accuracy is that of what was decided, clicks and light are those of all"
+        lines.append(f"  abstained {100 * figures['abstained']:.2f} %; {of}")
     for name, first in more.items():
         if name.startswith("first_") and first is not None:
             lines.append(f"  the first {first['objects']}: {_percent(first['accuracy_mean'])} %\n{_light_words(first)}")

@@ -157,7 +157,7 @@ def test_a_bound_that_cannot_be_kept_is_refused(words: list[str], said: str, pan
 
 def made(name: str, days: float, size: int, *, is_locked: bool = False) -> Run:
     started = NOW - timedelta(days=days)
-    return Run(Path(name), started, "b", "PASS", 1, None, None, size, True, is_locked, "", (), ())
+    return Run(Path(name), started, "b", "PASS", 1, None, None, None, size, True, is_locked, "", (), ())
 
 
 def test_all_conditions_hold_and_the_newest_are_kept() -> None:
