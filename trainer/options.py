@@ -53,6 +53,7 @@ PIXELS = Range(0, 65536, whole=True)
 BATCH = Range(2, 1 << 20, whole=True)
 OUTCOMES = Range(2, OUTCOMES_MAX, whole=True)
 PATTERNS = Range(1, 4096, whole=True)
+FIELDS = Range(0, 1024, whole=True)  # per class: as many as the binned pixels of model/field_basis.py
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +75,8 @@ class Options:
     head: str = option("mlp", "digital back end (default mlp; picture where the task asks for it)", choices=HEADS)
     hidden: int = option(512, "hidden units of the head (default 512)", range=Range(1, 65536, whole=True))
     batch: int = option(512, "objects per step (default 512; of an automaton 250)", range=BATCH)
-    front_rate: float = 1e-2
-    head_rate: float = 1e-3
+    front_rate: float = option(1e-2, "learning rate of patterns or W, at its peak (default 0.01)", range=SHARE)
+    head_rate: float = option(1e-3, "learning rate of the head, at its peak (default 0.001)", range=SHARE)
     constant: bool = False  # learning rates as in the paper, instead of one cycle per estimator
     # of the light at the start; rises or falls to 1 within stage 1
     slope: float = option(1.0, "slope annealing: light at the start times N", range=Range(1e-9, 1e6))
@@ -98,7 +99,7 @@ class Options:
         "how strictly --photons, --clicks and --illumination hold during training (default firm)",
         choices=tuple(BUDGETS),
     )
-    light: float = 1.0  # of the initial patterns, times the paper's
+    light: float = option(1.0, "light of the initial patterns or W, times the paper's (default 1)", range=LIGHT)
     mix: float = option(0.0, "share of the loss of several shots, for patterns too (default 0)", range=SHARE)
     shots: int = option(1, "fit the head to 1 to N shots (default 1)", range=Range(1, 64, whole=True))
     shift_px: int = option(0, "move training images by up to N pixels along the rows (default 0)", range=PIXELS)
@@ -130,6 +131,15 @@ class Options:
     )
     illumination: float | None = option(
         None, "photoelectrons to send per decision, summed over all pixels of all patterns", range=LIGHT
+    )
+    fields: int = option(
+        0,
+        "train a coherent encoder as sums of N discriminant fields per class: for scenes with a bright background (default 0: of pixels)",
+        range=FIELDS,
+    )
+    search: bool = option(
+        False,
+        "with --fields, of two classes in square scenes without an up: search --restarts encoders at once, over all click words",
     )
 
 
@@ -287,8 +297,6 @@ def check_options(options: Options, profile: Profile) -> None:
     check_ranges(options)
     if options.encoder not in ENCODERS:
         raise UsageError(f"--encoder is {options.encoder!r}, allowed: {', '.join(ENCODERS)}")
-    if not LIGHT.holds(options.light):
-        raise UsageError(f"light is {options.light:g}, allowed: {LIGHT.allowed}")
     _check_together(options)
     _check_fits(options, profile)
 
@@ -336,6 +344,24 @@ def _check_together(options: Options) -> None:
         )
     if options.mix > 0 and options.shots < 2:
         raise UsageError(f"--mix is {options.mix} with --shots {options.shots}", remedy="--shots 2, or more")
+    if options.fields and (options.encoder != "coherent" or options.complex_field or options.head in PICTURE_HEADS):
+        what = "--fields is for a coherent encoder with a real W, and for classes"
+        raise UsageError(what, remedy="add --encoder coherent without --complex-field, or leave --fields out")
+    if options.search:
+        _check_search(options)
+
+
+def _check_search(options: Options) -> None:
+    """Refuse what train/exact_search.py does not know: it has no estimator, no stages and one budget, that of clicks."""
+    if not options.fields or options.clicks is None or options.conserving:
+        what = "--search is for a coherent encoder within a budget of clicks, whose W is not limited"
+        raise UsageError(what, remedy="add --fields N, --clicks C and --unconstrained, or leave --search out")
+    unused = Options(features=options.features)
+    names = ("photons", "polish", "starts", "mix", "copies", "shift_px", "offset_px")
+    others = [flag_of(name) for name in names if getattr(options, name) != getattr(unused, name)]
+    if others or options.estimator != "exact":
+        what = f"{(others or ['--estimator ' + options.estimator])[0]} has no effect with --search"
+        raise UsageError(what, remedy=f"leave it out; --search takes at most {EXACT_FEATURES_MAX} patterns")
 
 
 def check_order(order: str | None, options: Options) -> None:

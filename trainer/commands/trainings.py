@@ -36,6 +36,7 @@ from pans.trainer.options import (
     stated_tolerance,
 )
 from pans.trainer.tasks.registry import Task, physical_encoder
+from pans.trainer.train.exact_search import search
 from pans.trainer.train.history import History, write_course
 from pans.trainer.train.loop import EpochReport, Trained, train
 
@@ -77,6 +78,9 @@ class FixedTraining:
             if self.history is not None:
                 self.history.add(epoch)
 
+        if options.search:
+            self.trained = search(self.varied, self.profile, options)
+            return
         resume = self.args.resume
         self.trained = train(self.varied, self.profile, options, checkpoint=checkpoint, resume=resume, report=report)
 

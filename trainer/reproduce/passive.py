@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pans.runtime.bundle.optics import incident_field, scatter
+from pans.runtime.bundle.optics import scatter
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.npz_file import npz_bytes
 from pans.runtime.outputs import replace_file
@@ -31,7 +31,6 @@ from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.export.writer import analyser_of, export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination
-from pans.trainer.model.field_basis import discriminant_basis
 from pans.trainer.model.heads import Heads
 from pans.trainer.model.ssim import ssim
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
@@ -65,7 +64,6 @@ SAMPLE_SEED = 2  # of pictures that are drawn: not the clicks that the table is 
 SHOWN_CELLS = ((4, 0.01), (32, 0.01), (64, 0.01), (64, 0.05))  # the paper draws the last three
 SPECKLE_LEVELS = (10.0, 20.0, 30.0, 50.0, 100.0, 200.0, 300.0, 600.0, 1000.0)  # photons of direct imaging
 FIELD = "mmf-mnist-field"
-BASIS_SIZE = 60  # fields per class
 FLOOR = 5e-3  # of the mean light, by which the posterior lifts every pixel
 PRINTED = 0.005  # points: of two exact figures, those that differ by no printed digit are level
 
@@ -103,13 +101,6 @@ def release_intensity(images: NDArray[np.uint8], batch: int = RELEASE_BATCH) -> 
 
 def _speckle(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.rint(255 * release_intensity(images)).astype(np.uint8)
-
-
-@functools.lru_cache(maxsize=1)
-def basis_of(task: Task) -> Tensor:
-    """Return the fields (pixels, size) in which the encoder of a scene with a bright background is trained."""
-    x = torch.from_numpy(incident_field(task.train.images, task.light, task.optics)).flatten(1)
-    return discriminant_basis(x, torch.from_numpy(task.train.labels), task.image_shape, BASIS_SIZE)
 
 
 # ---- measuring ----
@@ -234,12 +225,10 @@ def take_samples(head: Heads, p: Tensor, objects: Objects) -> plots.Samples:
 
 
 def _trained(name: str, task: Task, options: Options) -> Trained:
-    facts, profile = recipe_facts(name), load_profile(PROFILE)
+    profile = load_profile(PROFILE)
     if name == "barcode":
         return solve(options, profile)
-    if "search" in facts:
-        return search(task, profile, options, facts["search"])
-    return train(task, profile, options, basis=basis_of(task) if facts.get("fields") else None)
+    return search(task, profile, options) if options.search else train(task, profile, options)
 
 
 def beside_paper(name: str, row: PassiveRow, dark: float, figures: Row) -> Row:

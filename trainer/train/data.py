@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 
 from pans.runtime.bundle.optics import incident_field, incident_intensity
+from pans.runtime.errors import UsageError
 from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import here
+from pans.trainer.model.field_basis import discriminant_basis
 from pans.trainer.model.imaging import DrawnOptics
 from pans.trainer.options import Options
 from pans.trainer.tasks.changes import shifted, with_copies
@@ -23,17 +25,18 @@ class TrainingData:
     """Training objects as tensors: `shown` is what the encoder gets, (n, inputs); `target` a label, or an image in [0, 1].
 
     Active: float32 transmission with a perfect black, `floor` being the real one. Passive: incident field or intensity;
-    with `basis` (inputs, size) of a field, its coordinates there (field_basis.py).
+    with `Options.fields` its coordinates in `basis` (inputs, size), else None.
     """
 
-    def __init__(self, task: Task, profile: Profile, options: Options, basis: Tensor | None = None) -> None:
+    def __init__(self, task: Task, profile: Profile, options: Options) -> None:
         self.floor = profile.min_transmission if options.encoder == "active" else 0.0
         n_validation = task.kept or max(1, len(task.train) // VALIDATION_PART)
         objects = with_copies(task.train, n_validation, options.copies, options.seed, task.imaged)
         placed = shifted(objects, options.shift_px, options.offset_px, options.seed)
         self.shown = encoder_input(task, placed, profile, options)
-        if basis is not None:
-            self.shown = self.shown @ basis
+        self.basis = discriminant_fields(task, options) if options.fields else None
+        if self.basis is not None:
+            self.shown = self.shown @ self.basis
         self.labels = torch.from_numpy(placed.labels)
         self.image_shape = task.image_shape
         self.is_image = task.target == "image"
@@ -56,6 +59,19 @@ class TrainingData:
         if self.optics is None:
             return self.shown, floor
         return self.optics.through((1.0 - floor) * self.shown + floor, number), 0.0
+
+
+def discriminant_fields(task: Task, options: Options, *, turned: bool = False) -> Tensor:
+    """Return the fields (pixels, classes * `options.fields`) in which a coherent encoder is trained (model/field_basis.py).
+
+    Orthonormal where light is conserved, so that the encoder's limit is that of its coefficients. UsageError for complex fields.
+    """
+    field = torch.from_numpy(incident_field(task.train.images, task.light, task.optics)).flatten(1)
+    if field.is_complex():
+        raise UsageError(f"--fields: the field of {task.name} is complex, allowed: real", remedy="leave --fields out")
+    labels = torch.from_numpy(task.train.labels)
+    basis = discriminant_basis(field, labels, task.image_shape, options.fields, turned=turned)
+    return torch.linalg.qr(basis).Q if options.conserving else basis
 
 
 def encoder_input(task: Task, objects: Objects, profile: Profile, options: Options) -> Tensor:

@@ -28,20 +28,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pans.runtime.bundle.quantise import quantise_patterns
-from pans.runtime.errors import as_usage_error
+from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.instrument.click_law import ClickLaw, click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.detection import Law, click_probability, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination, CoherentField
 from pans.trainer.model.estimators import cross_entropy
 from pans.trainer.model.exposure import exposure_us_of, top_limits
-from pans.trainer.model.field_basis import discriminant_basis, in_pixels, turns
+from pans.trainer.model.field_basis import in_pixels, turns
 from pans.trainer.model.heads import new_head
 from pans.trainer.options import Options
 from pans.trainer.tasks.barcode import N_BARS, all_strings, weights
 from pans.trainer.tasks.registry import Task
 
-from .data import VALIDATION_PART, encoder_input
+from .data import VALIDATION_PART, discriminant_fields, encoder_input
 from .head_fit import fit_head
 from .loop import Trained
 
@@ -191,22 +191,30 @@ def solve(options: Options, profile: Profile) -> Trained:
     return Trained(shown, encoder, head, p.mean(dim=0), law, losses, options)
 
 
-def search(task: Task, profile: Profile, options: Options, size: int) -> Trained:
-    """Return the best of `options.restarts` encoders of `size` fields, with a head fitted to its click words.
+def search(task: Task, profile: Profile, options: Options) -> Trained:
+    """Return the best of `options.restarts` encoders of `options.fields` fields, with a head fitted to its click words.
 
     The task has two classes, and square images. `epochs` are passes over all turned objects in batches of `batch`, `front_rate` the peak
-    rate of Adam, `light` the mean photoelectrons per detector at the start, `clicks` the budget.
+    rate of Adam, `light` the mean photoelectrons per detector at the start, `clicks` the budget. UsageError for another task.
     """
-    assert options.clicks is not None
-    x, labels = encoder_input(task, task.train, profile, options), torch.from_numpy(task.train.labels)
-    fields = discriminant_basis(x, labels, task.image_shape, size, turned=True)[:, size:]
+    height, width = task.image_shape
+    if len(task.classes) != 2 or height != width:
+        what = f"--search: {task.name} has {len(task.classes)} classes, images of {height} x {width} pixels"
+        raise UsageError(f"{what}, allowed: 2 classes, square images", remedy="leave --search out")
+    x, labels, size = (
+        encoder_input(task, task.train, profile, options),
+        torch.from_numpy(task.train.labels),
+        options.fields,
+    )
+    fields = discriminant_fields(task, options, turned=True)[:, size:]
     n_fit = len(x) - max(1, len(x) // VALIDATION_PART)
     views = [x @ fields[turn] for turn in turns(task.image_shape)]
     law = _law(profile, 0.0, options)
     shown, target = torch.cat([view[:n_fit] for view in views]), labels[:n_fit].repeat(len(views))
     weights = descend(shown, target, law, options)
+    assert options.clicks is not None
     wrong = judge(weights, views[0][n_fit:], labels[n_fit:], law, options.clicks)
-    encoder = CoherentField(options.features, size, torch.Generator())
+    encoder = CoherentField(options.features, fields.shape[1], torch.Generator())
     with torch.no_grad():
         encoder.weight.copy_(weights[wrong.argmin()].unsqueeze(0))
         p = click_probability(torch.cat([encoder(view) for view in views]).double(), law)

@@ -152,19 +152,18 @@ def train(
     resume: bool = False,
     report: Callable[[EpochReport], None] = lambda _: None,
     law: Law | None = None,
-    basis: Tensor | None = None,
 ) -> Trained:
     """Train `task` through `profile`; the same options, machine and number of threads give the same result.
 
     `law` replaces the click law of the profile (thermal light, or any differentiable function from photoelectrons to p); what
-    is exported is still judged by the profile's. A checkpoint does not know of it, nor of `basis` (inputs, size): a coherent encoder
-    is then trained as coefficients of these fields (field_basis.py), and the one returned is W = coefficients @ basis.T.
+    is exported is still judged by the profile's. A checkpoint does not know of it. With `Options.fields` the encoder is trained as
+    coefficients of fields (model/field_basis.py), and the one returned is W = coefficients @ basis.T.
 
     After every epoch the state goes to `checkpoint`; with `resume` a run continues from there. KeyboardInterrupt passes
     through, with the state of the last whole epoch on disk.
     """
     check_options(options, profile)
-    data = TrainingData(task, profile, options, basis)
+    data = TrainingData(task, profile, options)
     saved = read_checkpoint(checkpoint, options, task.sha256) if resume and checkpoint else {}
     best: dict[str, Any] | None = saved.get("best")
     losses: list[float] = saved.get("losses", [])
@@ -194,7 +193,7 @@ def train(
     if best is not None:
         run.restore(best)
     trained = run.finish(tuple(losses))
-    return trained if basis is None else replace(trained, encoder=in_pixels(trained.encoder, basis))
+    return trained if data.basis is None else replace(trained, encoder=in_pixels(trained.encoder, data.basis.cpu()))
 
 
 class Run:
