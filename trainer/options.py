@@ -139,7 +139,7 @@ class Options:
     )
     search: bool = option(
         False,
-        "with --fields, of two classes in square scenes without an up: search --restarts encoders at once, over all click words",
+        "with --fields, of two classes in square scenes without an up: --restarts encoders at once, exactly over all click words",
     )
 
 

@@ -42,6 +42,22 @@ def columns_task(n_train: int, n_test: int, n_classes: int, side: int, name: str
     return Task(name, tuple("abcdefghij"[:n_classes]), train, test, "0" * 64, "made here")
 
 
+def spots_task(n_train: int, n_test: int) -> Task:
+    """A bright round field of any power on 12 x 12 pixels; half of them with a bright or dark spot somewhere near the middle."""
+    return Task("spots", ("clean", "spot"), _spots(n_train, 0), _spots(n_test, 1), "0" * 64, "", light="field")
+
+
+def _spots(n: int, seed: int, side: int = 12) -> Objects:
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, 2, n)
+    y, x = np.mgrid[:side, :side] - (side - 1) / 2
+    field = np.exp(-(x**2 + y**2) / 30) * rng.uniform(0.5, 0.8, (n, 1, 1))
+    cy, cx = rng.uniform(-2, 2, (2, n, 1, 1))
+    spot = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 4) * rng.choice([-0.6, 0.4], (n, 1, 1))
+    field = field * (1 + spot * labels[:, None, None]) + 0.004 * rng.normal(size=field.shape)
+    return Objects(np.rint(255 * field.clip(0, 1)).astype(np.uint8), labels)
+
+
 def kept_task(path: Path, task: Task) -> Path:
     """Write both parts of `task` as a .npz file and return its path."""
     arrays = {"train_images": task.train.images, "train_labels": task.train.labels}

@@ -63,6 +63,7 @@ class Measurement:
     brightness: str
     image_shape: tuple[int, int] | None  # of a frame; None when the m values are no picture
     mean: float  # what the mean test object gives at unit light
+    sends: bool = True  # False: the light is the scene's own, nothing is sent
 
     def photoelectrons(self, rows: NDArray[Any], photons: float, floor: float = 0.0) -> F32:
         """Return expected photoelectrons, float32 (n, m), of `rows` at `photons` per object; `floor` lifts every transmission.
@@ -77,7 +78,12 @@ class Measurement:
         return light
 
     def sent(self, rows: NDArray[Any], photons: float) -> F64:
-        """Return the sum of all pattern intensities for each of `rows` at `photons`, in photoelectrons per unit transmission, (n,)."""
+        """Return the sum of all pattern intensities for each of `rows` at `photons`, in photoelectrons per unit transmission, (n,).
+
+        0 of a scene whose light is its own.
+        """
+        if not self.sends:
+            return np.zeros(len(rows))
         scale = self._scale(rows.astype(np.float32) * np.float32(self.unit), photons)
         return np.broadcast_to(np.ravel(scale), len(rows)) * self.full.sum(dtype=np.float64)
 
@@ -112,8 +118,8 @@ def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str =
     flat: list[NDArray[Any]] = [part.images.reshape(len(part), n_pixels) for part in (task.train, task.test)]
     train, test = flat
     full, unit = np.ones(n_pixels, np.float32), 1.0
-    # a camera sees the intensity of a field, not its amplitude
-    if task.light != "transmission" or task.optics != "none":
+    sends = sends_light(task)
+    if not sends:  # a camera sees the intensity of a field, not its amplitude
         if patterns is not None:
             raise ValueError(f"{task.name} is light that reaches us: it takes no patterns, only a direct image")
         lit = (incident_intensity(part.images, task.light, task.optics) for part in (task.train, task.test))
@@ -129,7 +135,12 @@ def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str =
         full = weights.sum(axis=0)
     labels, n_classes = (task.train.labels, task.test.labels), len(task.classes)
     mean = float(test.sum(dtype=np.float64)) * unit / len(test)
-    return Measurement(train, labels[0], test, labels[1], n_classes, full, unit, brightness, shape, mean)
+    return Measurement(train, labels[0], test, labels[1], n_classes, full, unit, brightness, shape, mean, sends)
+
+
+def sends_light(task: Task) -> bool:
+    """Return whether the objects of `task` are lit by us, and not by light of their own."""
+    return task.light == "transmission" and task.optics == "none"
 
 
 def _features(images: NDArray[np.uint8], weights: F32) -> F32:

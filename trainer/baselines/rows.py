@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from pans.runtime.errors import UsageError
 from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.evaluate.walks import FIRST_OBJECTS
 from pans.trainer.options import LEAST_PHOTONS, BaselineOptions
 from pans.trainer.tasks.registry import Task
 
-from .common import Decide, Light, Measurement, Report, Trials, detect, measure, run_trials
+from .common import Decide, Light, Measurement, Report, Trials, detect, measure, run_trials, sends_light
 
 EQUAL_TRIALS, EQUAL_DECISIONS = 10, 5000  # readouts per object of a comparison, fewer where all would be more than that
 
@@ -29,12 +30,18 @@ AtLevel = Callable[[Light], tuple[Measurement, Decide, dict[str, Any]]]  # the s
 
 
 def baseline_rows(
-    task: Task, options: BaselineOptions, levels: Iterable[Light], report: Report
+    task: Task, options: BaselineOptions, levels: Sequence[Light], report: Report
 ) -> Iterator[dict[str, Any]]:
     """Yield one row of figures per level of light, in the order of `levels`.
 
-    Of `stopping` levels out of reach are left out.
+    Of `stopping` levels out of reach are left out. UsageError for light sent to a scene whose light is its own.
     """
+    asked = [level.amount for level in levels if level.of == "illumination"]
+    if asked and not sends_light(task):
+        raise UsageError(
+            f"--illumination {asked[0]:g}: the light of {task.name} is its own, nothing is sent",
+            remedy="ask for --photons alone",
+        )
     walk = _stopping if options.method == "stopping" else _by_level
     started = time.perf_counter()
     for level, n_readouts, done, extra in walk(task, options, levels, report):
@@ -80,7 +87,7 @@ def at_equal_light(
     return {
         name: done
         for name, level in levels.items()
-        if level.photons(camera) >= LEAST_PHOTONS
+        if level.amount > 0 and level.photons(camera) >= LEAST_PHOTONS
         for _, _, done, _ in _by_level(task, options, [level], report)
     }
 
@@ -206,4 +213,4 @@ def _end_to_end(task: Task, options: BaselineOptions, report: Report) -> tuple[M
         task, options.features, seed=options.seed, bits=bits, epochs=options.epochs or EPOCHS, report=report
     )
     measurement, of_level = patterns_measured(model, task, options.brightness)
-    return measurement, lambda photons: (of_level(photons, options.detector), {"bits": bits})
+    return measurement, lambda photons: (of_level(photons, options.detector), {"quantiser_bits": bits})

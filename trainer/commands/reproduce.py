@@ -29,7 +29,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help=words)
     words = "of the frontier: seeds per row (default 5)"
     parser.add_argument("--seeds", type=SEEDS.option, default=5, metavar="N", help=words)
-    words = "of the frontier: measure only these ways; the others stand as in NAME.json of -o"
+    words = "of the frontier, and of direct imaging beside scenes: measure only these ways; all else stands as in NAME.json of -o"
     parser.add_argument("--ways", nargs="+", metavar="WAY", help=words)
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
     words = "write NAME.json, the pictures and the tables of the Markdown page there; its text around the tables stays"
@@ -101,8 +101,9 @@ def _check(args: argparse.Namespace) -> None:
     if args.ways is not None:
         from pans.trainer.reproduce.ways import ways_of
 
-        if name != "frontier" or args.out is None:
-            raise UsageError("--ways is for the frontier, with -o", remedy="pans reproduce frontier --ways ... -o DIR")
+        if (name != "frontier" and name not in PASSIVE) or not ways_of(name) or args.out is None:
+            what = "--ways is for the frontier and for scenes beside a camera, with -o"
+            raise UsageError(what, remedy="pans reproduce frontier --ways ... -o DIR")
         if unknown := [way for way in args.ways if way not in ways_of(name)]:
             raise UsageError(f"--ways {unknown}", remedy=f"allowed: {', '.join(ways_of(name))}")
     drawn = table is not None and recipe_facts(name).get("task", name) in GENERATORS and name != "barcode"

@@ -128,7 +128,8 @@ def _train(args: argparse.Namespace) -> int:
         ):
             training.run(show, checkpoint)
     except KeyboardInterrupt:
-        say(f"interrupted; the last whole step is in {checkpoint}\n  continue with the same command and --resume")
+        resumes = f"the last whole step is in {checkpoint}\n  continue with the same command and --resume"
+        say(f"interrupted; {resumes if checkpoint.exists() else 'nothing was kept'}")
         return EXIT_INTERRUPTED
     with as_usage_error(), computing_on(args.device if automaton else "cpu"):
         digest, answer, lines = training.export(_provenance(args, reading, watch.seconds()) | facts)

@@ -59,6 +59,12 @@ class FixedTraining:
         self.options = fixed_options(args, task, profile)
         check_order(args.order, self.options)
         check_options(self.options, profile)
+        given = {"--resume": args.resume, "--history": args.history, "--device cuda": args.device == "cuda"}
+        if self.options.search and any(given.values()):
+            what = (
+                f"{next(flag for flag, value in given.items() if value)}: a search has no epochs to continue or to draw"
+            )
+            raise UsageError(f"{what}, and computes on the processor", remedy="leave it out, or leave --search out")
         self.history: History | None = None
 
     def run(self, show: Show, checkpoint: Path) -> None:

@@ -30,7 +30,7 @@ from .active import OTHER_SEEDS, PROFILE, finished_row, shot_figures
 from .page import FIRST_OBJECTS, Asked, Made, Row, Rows, against, beside_curve, by_epoch, flat, sampling_error
 from .passive import measure as judged_as_trained
 from .printed import ACTIVE, DIRECT, recipe
-from .ways import BY_SENT, measured_points, points
+from .ways import BY_SENT, best_of, measured_points, points
 
 TASK = "fashion-mnist"
 PANS, ENVELOPE = "PANS", "end-to-end, envelope"
@@ -71,9 +71,7 @@ def curve_rows(asked: Asked, page: str) -> Rows:
 
 def envelope(rows: Rows) -> Rows:
     """Return the best of all rows at each photon level, as rows of the way `ENVELOPE`; chosen by all test objects."""
-    levels = sorted({row["level"] for row in rows})
-    best = [max((r for r in rows if r["level"] == n), key=lambda r: float(r["value"])) for n in levels]
-    return [row | {"way": ENVELOPE, "table": "envelope"} for row in best]
+    return [row | {"table": "envelope"} for row in best_of(rows, ENVELOPE)]
 
 
 def fig_2e_page(asked: Asked) -> Made:

@@ -54,14 +54,17 @@ from .page import (
     check_cached_bundle,
     finished,
     flat,
+    of_table,
     sampling_error,
 )
 from .printed import PASSIVE, PassiveRow, recipe, recipe_facts
+from .ways import best_of, measured_points, ways_of
 
 RELEASE_BATCH = 128
 TRIALS = 5
 SAMPLE_SEED = 2  # of pictures that are drawn: not the clicks that the table is made of
 SHOWN_CELLS = ((4, 0.01), (32, 0.01), (64, 0.01), (64, 0.05))  # the paper draws the last three
+CAMERA = "direct, best of these"
 SPECKLE_LEVELS = (10.0, 20.0, 30.0, 50.0, 100.0, 200.0, 300.0, 600.0, 1000.0)  # photons of direct imaging
 FIELD = "mmf-mnist-field"
 FLOOR = 5e-3  # of the mean light, by which the posterior lifts every pixel
@@ -249,8 +252,12 @@ def beside_paper(name: str, row: PassiveRow, dark: float, figures: Row) -> Row:
 
 
 def passive_page(asked: Asked) -> Made:
-    """Return one row per number of patterns and dark count, then direct imaging for the task of which the paper draws it."""
-    name, table, direct, rows = asked.name, PASSIVE[asked.name], speckle_rows(asked), []
+    """Return one row per number of patterns and dark count, then direct imaging for the tasks of which the paper draws it."""
+    name, table, direct, rows = asked.name, PASSIVE[asked.name], [*speckle_rows(asked), *camera_rows(asked)], []
+    if asked.ways is not None:
+        return Made(
+            [row | beside_direct(name, row, row["dark"], direct) for row in of_table([*asked.known], name)] + direct
+        )
     samples = []
     for row in table.rows:
         for dark in table.dark:
@@ -273,7 +280,7 @@ def passive_page(asked: Asked) -> Made:
     return Made(rows + direct, pictures)
 
 
-# ---- direct imaging (paper, Fig. 4E and 5B) ----
+# ---- direct imaging (paper, Fig. 4E, 5B and 5E to H) ----
 
 
 def speckle_rows(asked: Asked) -> Rows:
@@ -295,8 +302,7 @@ def _speckle_figures(data_dir: str | None, photons: float) -> Row:
     frames = measure_frames(load_task("mmf-mnist", data_dir), None)
     decide, _ = bayes(frames, photons, "counting", seed=0, floor=FLOOR)
     done = run_trials(frames, photons, "counting", decide, trials=1, seed=0)
-    found = flat(row_of(done.measured()), row_of(done.measured(FIRST_OBJECTS)))
-    return found | {"illumination": 0.0}
+    return flat(row_of(done.measured()), row_of(done.measured(FIRST_OBJECTS)))
 
 
 def beside_direct(name: str, figures: Row, dark: float, direct: Rows) -> Row:
@@ -310,7 +316,26 @@ def beside_direct(name: str, figures: Row, dark: float, direct: Rows) -> Row:
             found["clicks_there"] = as_many["value"]
             found |= against(figures["value"], as_many["value"], PRINTED, prefix="clicks_")
         return found
+    if ways_of(name):
+        return beside_camera(figures, [row for row in direct if row["way"] == CAMERA])
     return beside_curve(figures, direct, "photons", "direct_")
+
+
+def camera_rows(asked: Asked) -> Rows:
+    """Return direct imaging of a scene whose light is its own (paper, Fig. 5E to H): a row per way and level, and the best of them."""
+    if not ways_of(asked.name):
+        return []
+    rows = [row | {"table": "direct"} for row in measured_points(asked, asked.name)]
+    return rows + best_of(rows, CAMERA)
+
+
+def beside_camera(figures: Row, camera: Rows) -> Row:
+    """Return a row beside a camera with the photons that it detects, and with the light that must reach its optics."""
+    line: Row = {}
+    for prefix, photons in (("direct_", figures["photons"]), ("optics_", figures["reaching"])):
+        place = min([photons, *(row["photons"] for row in camera[-1:])])  # more photons tell nothing more
+        line |= beside_curve(figures, camera, "photons", prefix, place)
+    return line
 
 
 # ---- digits behind a fibre as a field ----
@@ -337,7 +362,4 @@ def field_page(asked: Asked) -> Made:
 def field_row(row: PassiveRow, found: Row, direct: Rows) -> Row:
     """Return the figures of one number of detectors beside direct imaging."""
     line: Row = {"table": "field", "features": row.features, "paper": row.values[0], "paper_clicks": row.clicks} | found
-    for prefix, photons in (("direct_", found["photons"]), ("optics_", found["reaching"])):
-        place = min(photons, SPECKLE_LEVELS[-1])  # more photons tell nothing more
-        line |= beside_curve(found, direct, "photons", prefix, place)
-    return line
+    return line | beside_camera(found, direct)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pans.trainer.figures import new_figure, save_figure, use_files_alone
 
-from .page import FIRST_OBJECTS, Row, Rows, of_table
+from .page import FIRST_OBJECTS, Column, Row, Rows, of_table
 
 FRAME_TRIALS, PIPELINE_TRIALS = 5, 6
 SHAPES = {16: (4, 4), 32: (4, 8)}  # rows and columns of a frame of clicks
@@ -79,19 +79,20 @@ def _family(label: str, families: dict[str, list[str]]) -> list[str]:
 def _lines(axis: Any, rows: Rows, numbers: dict[str, int], line: Row, families: dict[str, list[str]]) -> None:
     """Draw one line per label: `y` over `x` of the rows of a table, with error bars and notes where they are asked for.
 
-    A label that contains a word of `families` has that one's colour, and its name in the legend.
+    A label that contains a word of `families` has that one's colour, and its name in the legend. Rows that lack a key of the label, or a
+    value, are left out.
     """
-    x, y = line["x"], line["y"]
+    x, y, label = line["x"], line["y"], Column("", line["label"])
     groups: dict[str, Rows] = {}
     for row in of_table(rows, line["of"]) if "of" in line else rows:
         wanted = all(row.get(key) == value for key, value in line.get("where", {}).items())
-        if wanted and row.get(x) is not None and row.get(y) is not None:
-            groups.setdefault(line["label"].format(**row), []).append(row)
-    for label, mine in groups.items():
-        number = numbers.setdefault(label, len(numbers))
+        if wanted and all(row.get(key) is not None for key in (x, y, *label.keys)):
+            groups.setdefault(label.cell(row), []).append(row)
+    for name, mine in groups.items():
+        number = numbers.setdefault(name, len(numbers))
         mine.sort(key=lambda row: float(row[x]))
         errors = [row.get(line["bars"]) or 0.0 for row in mine] if "bars" in line else None
-        colour, family, _ = _family(label, families)
+        colour, family, _ = _family(name, families)
         line_style = {
             "fmt": f"{'os^DvP*X<>'[number % 10 if colour else number // 10 % 4]}-",
             "color": colour or f"C{number % 10}",

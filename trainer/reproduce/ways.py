@@ -25,6 +25,7 @@ from .active import PROFILE
 from .page import FIRST_OBJECTS, Asked, Row, Rows, check_cached_bundle, flat, read_toml
 
 WAYS: list[Row] = read_toml("ways.toml")["way"]
+OF_TASKS = "of each task"
 SENT = " sent"  # of a level in ways.toml: light sent, not photons detected
 BY_SENT = ", sent"  # of the way's name in a row
 START_AT = "start_at"  # the level of the automaton that it starts from, where that is another
@@ -68,13 +69,20 @@ class Point:
 
 def ways_of(page: str) -> list[str]:
     """Return the names of the ways of a page."""
-    return [way["name"] for way in WAYS if way.get("page", "frontier") == page]
+    return [way["name"] for way in _of_page(page)]
+
+
+def _of_page(page: str) -> Rows:
+    """Return the ways of a page; those of `OF_TASKS` stand on the page of each of their tasks, with its levels alone."""
+    own = [way for way in WAYS if way.get("page", "frontier") == page]
+    shared = [way for way in WAYS if way.get("page") == OF_TASKS and page in way["levels"]]
+    return own + [way | {"levels": {page: way["levels"][page]}} for way in shared]
 
 
 def points(page: str) -> Iterator[Point]:
     """Yield all points of a page, way by way."""
     known: dict[tuple[str, str, str], Point] = {}
-    for way in (way for way in WAYS if way.get("page", "frontier") == page):
+    for way in _of_page(page):
         for task, levels in way["levels"].items():
             for text, more in levels.items():
                 start = known[task, way["start"], more.get(START_AT, text)] if "start" in way else None
@@ -105,6 +113,13 @@ def measured_points(asked: Asked, page: str, seeds: int = 1) -> Rows:
             if found is not None:
                 rows.append({"task": point.task, "way": point.named, "level": point.level} | found)
     return rows
+
+
+def best_of(rows: Rows, way: str) -> Rows:
+    """Return the best of all rows at each level, as rows of the way `way`; chosen by all test objects."""
+    levels = sorted({row["level"] for row in rows})
+    best = [max((r for r in rows if r["level"] == n), key=lambda r: float(r["value"])) for n in levels]
+    return [row | {"way": way} for row in best]
 
 
 def point_row(asked: Asked, point: Point, seed: int) -> Row | None:

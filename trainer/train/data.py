@@ -70,7 +70,8 @@ def discriminant_fields(task: Task, options: Options, *, turned: bool = False) -
     if field.is_complex():
         raise UsageError(f"--fields: the field of {task.name} is complex, allowed: real", remedy="leave --fields out")
     labels = torch.from_numpy(task.train.labels)
-    basis = discriminant_basis(field, labels, task.image_shape, options.fields, turned=turned)
+    with torch.device("cpu"):
+        basis = discriminant_basis(field, labels, task.image_shape, options.fields, turned=turned)
     return torch.linalg.qr(basis).Q if options.conserving else basis
 
 

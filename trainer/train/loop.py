@@ -193,7 +193,10 @@ def train(
     if best is not None:
         run.restore(best)
     trained = run.finish(tuple(losses))
-    return trained if data.basis is None else replace(trained, encoder=in_pixels(trained.encoder, data.basis.cpu()))
+    if data.basis is None:
+        return trained
+    with torch.device("cpu"):  # as all of a finished model
+        return replace(trained, encoder=in_pixels(trained.encoder, data.basis))
 
 
 class Run:

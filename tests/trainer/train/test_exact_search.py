@@ -1,5 +1,6 @@
 """The barcode solved exactly: counts against plain Python, one bar per pattern, descent within the clicks, a head that decides as Bayes."""
 
+import dataclasses
 import itertools
 from functools import partial
 
@@ -7,12 +8,14 @@ import numpy as np
 import pytest
 import torch
 
+from trainings import spots_task
+
+from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.model.detection import click_probability, click_words, word_probabilities
-from pans.trainer.options import Options
+from pans.trainer.options import Options, check_options
 from pans.trainer.reproduce.passive import measure
 from pans.trainer.tasks.barcode import all_strings
-from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train import exact_search
 from pans.trainer.train.exact_search import count, joint, search, search_bars, solve
 
@@ -53,24 +56,9 @@ def test_a_solved_task_decides_as_bayes_does(monkeypatch):
     assert len(trained.validation_losses) == 1
 
 
-SIDE = 12
-
-
-def spots(n, seed):
-    """A bright round background of any power; half of them with a bright or dark spot somewhere near the middle."""
-    rng = np.random.default_rng(seed)
-    labels = rng.integers(0, 2, n)
-    y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
-    field = np.exp(-(x**2 + y**2) / 30) * rng.uniform(0.5, 0.8, (n, 1, 1))
-    cy, cx = rng.uniform(-2, 2, (2, n, 1, 1))
-    spot = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 4) * rng.choice([-0.6, 0.4], (n, 1, 1))
-    field = field * (1 + spot * labels[:, None, None]) + 0.004 * rng.normal(size=field.shape)
-    return Objects(np.rint(255 * field.clip(0, 1)).astype(np.uint8), labels)
-
-
 @pytest.fixture(scope="module")
 def task():
-    return Task("spots", ("clean", "spot"), spots(1200, 0), spots(600, 1), "0" * 64, "", light="field")
+    return spots_task(1200, 600)
 
 
 @pytest.mark.parametrize("d_f", [1, 2, 3, 5])
@@ -89,13 +77,24 @@ def test_words_and_classes_by_their_definition(d_f):
 def test_two_detectors_find_spots_within_their_clicks(task):
     options = Options(
         features=2, alpha=0.0, clicks=0.9, encoder="coherent", dark=0.01, restarts=3, epochs=3, batch=100,
-        front_rate=5e-2, light=16.0, hidden=16, head_rate=3e-3,
+        front_rate=5e-2, light=16.0, hidden=16, head_rate=3e-3, fields=20, search=True,
     )  # fmt: skip
     profile = load_profile("ideal")
-    trained = search(task, profile, options, 20)
-    assert trained.encoder.matrix().shape == (2, SIDE**2)
+    trained = search(task, profile, options)
+    assert trained.encoder.matrix().shape == (2, 144)
     assert len(trained.validation_losses) == 3
     found = measure("spots", task, trained)
     assert found["value"] > 85  # by chance a half
     assert found["value"] / 100 == pytest.approx(1 - min(trained.validation_losses), abs=0.05)
     assert found["clicks"] < 0.97
+
+
+def test_what_a_search_does_not_know_is_refused(task):
+    options = Options(features=2, clicks=0.9, encoder="coherent", fields=20, search=True)
+    others = ({"fields": 0}, {"clicks": None}, {"conserving": True}, {"polish": 0.4}, {"estimator": "ste"})
+    for changed in others:
+        with pytest.raises(UsageError, match="--search"):
+            check_options(dataclasses.replace(options, **changed), load_profile("ideal"))
+    three = dataclasses.replace(task, classes=("clean", "spot", "scratch"))
+    with pytest.raises(UsageError, match="3 classes, images of 12 x 12 pixels, allowed: 2 classes, square images"):
+        search(three, load_profile("ideal"), options)

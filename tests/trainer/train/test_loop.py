@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from bundles import made_bundle
-from trainings import bars_task, short_fits  # noqa: F401 - a fixture
+from trainings import bars_task, columns_task, short_fits, spots_task  # noqa: F401 - a fixture
 
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.imaging import Bleaching
@@ -21,6 +21,7 @@ from pans.trainer.model.detection import sample_clicks
 from pans.trainer.model.encoders import ActiveIllumination, new_encoder
 from pans.trainer.model.heads import MlpHead
 from pans.trainer.options import Options, check_options
+from pans.trainer.reproduce.passive import measure as measure_cell
 from pans.trainer.tasks.registry import Objects, load_task
 from pans.trainer.train import head_fit
 from pans.trainer.train.data import encoder_input
@@ -166,6 +167,35 @@ def test_passive_encoders_learn_bars_without_creating_light(task, encoder, given
     assert right > 0.5  # by chance 0.25
 
 
+def test_a_scene_with_a_bright_background_is_learned_in_discriminant_fields():
+    """In pixels nothing is learned: two detectors always click. In fields the background is cancelled from the start."""
+    scene, ideal = spots_task(1200, 600), load_profile("ideal")
+    right = {}
+    for name, changed in {
+        "pixels": {},
+        "fields": {"fields": 10},
+        "fields, light conserved": {"fields": 10, "conserving": True, "input_photons": 2000.0},
+    }.items():
+        options = Options(
+            2, alpha=0.0, clicks=0.9, encoder="coherent", dark=0.01, epochs=6, batch=100, front_rate=3e-2, hidden=16,
+            head_rate=3e-3, **changed,
+        )  # fmt: skip
+        trained = train(scene, ideal, options)
+        right[name] = measure_cell("spots", scene, trained)["value"]
+        assert trained.encoder.matrix().shape == (2, 144)
+    assert float(torch.linalg.matrix_norm(trained.encoder.matrix(), ord=2)) <= 1.0001
+    assert right["pixels"] < 65
+    assert right["fields"] > 90
+    assert right["fields, light conserved"] > 90
+
+
+def test_fields_of_a_complex_field_are_refused():
+    digits = replace(columns_task(40, 20, 2, 28), light="field", optics="mmf")
+    options = Options(2, encoder="coherent", fields=3)
+    with pytest.raises(UsageError, match="the field of columns is complex"):
+        train(digits, load_profile("ideal"), options)
+
+
 @pytest.mark.usefixtures("short_fits")
 def test_a_checkpoint_of_another_training_or_none_is_refused_and_never_runs_code(task, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -201,6 +231,8 @@ def test_a_checkpoint_of_another_training_or_none_is_refused_and_never_runs_code
         ({"polish": 1.5}, "--polish"),
         ({"similarity": -0.1}, "--similarity"),
         ({"seed": -1}, "--seed"),
+        ({"fields": 3}, "--fields is for a coherent encoder"),
+        ({"front_rate": 2.0}, "--front-rate"),
     ],
 )
 def test_impossible_options_are_refused(changed, said):
