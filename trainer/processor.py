@@ -2,7 +2,8 @@
 
 A processor's flags are no proof: a virtual machine may announce AMX and refuse it, and then every bfloat16 product and every convolution
 of oneDNN fails, or ends the process by SIGILL. So each candidate is tried once, checked and timed; the answer is kept in the user's cache
-folder, by machine and torch version. Start with `settle`. Nothing here loads torch into this process.
+folder, by machine, processor and torch version. A virtual machine may move to another processor, so a kept answer is tried before each
+use. Start with `settle`. Nothing here loads torch into this process.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from pans.runtime.cli import note, say
 from pans.runtime.errors import UsageError
@@ -46,6 +48,8 @@ FASTER = 1.2  # bfloat16 is coarser, so it must bring something
 PATIENCE_S = 300.0  # loading torch on a busy machine takes tens of seconds
 SHAPE = (512, 784, 256)  # images by states: the products of an automaton
 REPEATS = 5
+# lines of /proc/cpuinfo that tell processors apart; a model may come with other microcode, and so grant less
+CPU_FACTS = ("vendor_id", "cpu family", "model", "stepping", "microcode", "CPU ", "flags", "Features")
 TOLERANCE = {"float32": 1e-4, "bfloat16": 2e-2}  # of the largest value; bfloat16 keeps 8 bits
 
 
@@ -81,12 +85,14 @@ class Choice:
 def settle() -> Choice | None:
     """Set the environment that torch needs here and return what was chosen; None where torch is not installed.
 
-    It must come before torch's first operation. The first call on a machine tries the candidates, which takes a few seconds.
+    It must come before torch's first operation. The first call on a machine tries the candidates, which takes a few seconds; later ones
+    try the answer alone, and all candidates again where it fails.
     """
     try:
         choice = _kept()
-        if choice is None:
-            say("pans: trying which products this processor computes: once per machine and torch version")
+        if choice is None or not holds(choice):
+            what = "trying which products this processor computes: once per machine and torch version"
+            say(f"pans: {what if choice is None else 'the products found here before fail now; trying which work'}")
             trials = [attempt(LIMITS[0])]
             while trials[-1].failed and len(trials) < len(LIMITS):
                 trials.append(attempt(LIMITS[len(trials)]))
@@ -132,6 +138,43 @@ def attempt(limits: dict[str, str]) -> Trial:
         except ValueError:
             failed[products] = answer
     return Trial(limits, gflops, failed)
+
+
+def holds(choice: Choice) -> bool:
+    """Return whether the products of `choice` still work, by computing them in a forked child: it may die. True where there is no fork."""
+    if sys.platform != "linux":
+        return True
+    sys.stdout.flush()  # what is buffered would be written twice
+    sys.stderr.flush()
+    with warnings.catch_warnings():  # Python 3.12 warns of threads: the child takes none of their locks
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        _compute_and_exit(choice)
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            return status == 0
+        time.sleep(0.005)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return False
+
+
+def _compute_and_exit(choice: Choice) -> NoReturn:
+    """End this process with 0 if what `choice` takes is computed correctly in its environment; nothing of the parent is cleaned up."""
+    code = 1
+    try:
+        os.environ.update(choice.limits)
+        import torch
+
+        torch.set_num_threads(1)
+        for products in {"float32", choice.products}:  # convolutions are of float32 in any case
+            _rate(products)
+        code = 0
+    finally:
+        os._exit(code)
 
 
 def compute_all() -> None:
@@ -217,12 +260,12 @@ def _rates(gflops: dict[str, float]) -> str:
 def _cpu() -> str:
     with suppress(OSError):
         block = Path("/proc/cpuinfo").read_text().split("\n\n")[0]
-        return "\n".join(line for line in block.splitlines() if line.startswith(("model name", "flags")))
+        return "\n".join(line for line in block.splitlines() if line.startswith(CPU_FACTS))
     return platform.processor()
 
 
 def _file() -> Path:
-    """Where the answer for this machine, torch and environment is kept."""
+    """Where the answer for this machine, processor, torch and environment is kept."""
     limits = [f"{name}={os.environ.get(name, '')}" for name in LIMITS[-1]]
     facts = "\n".join([version("torch"), platform.node(), platform.release(), _cpu(), *limits])
     return user_cache() / f"products-{hashlib.sha256(facts.encode()).hexdigest()[:16]}.json"

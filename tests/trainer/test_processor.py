@@ -96,6 +96,28 @@ def test_refused_products_and_convolutions_are_found_out_once(tmp_path, how, mon
     assert processor._kept() is None
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a kept answer is tried by fork")
+@pytest.mark.parametrize("how", ["die", "raise"])
+def test_an_answer_that_no_longer_holds_is_found_anew(tmp_path, how):
+    """As on a virtual machine that moved: what was kept where everything worked fails now."""
+    before = ran(refusing(tmp_path, ""), "-c", SETTLE)
+    assert before.stdout.strip().endswith("[]")
+    moved = refusing(tmp_path, how)
+    found = ran(moved, "-c", SETTLE)
+    assert found.stdout.strip() == "float32 ['AVX512_CORE_BF16']"
+    assert "the products found here before fail now" in found.stderr
+    again = ran(moved, "-c", SETTLE)
+    assert again.stdout == found.stdout
+    assert "fail now" not in again.stderr
+
+
+def test_the_answer_is_kept_by_processor(monkeypatch):
+    monkeypatch.setattr(processor, "_cpu", lambda: "model name: one, microcode: 0x1")
+    here = processor._file()
+    monkeypatch.setattr(processor, "_cpu", lambda: "model name: one, microcode: 0x2")
+    assert processor._file() != here
+
+
 def test_training_and_convolutions_run_where_torch_refuses(tmp_path):
     env = refusing(tmp_path, "raise-unlimited")
     out = tmp_path / "strings.pans"

@@ -314,8 +314,11 @@ def _checked(task: Task, where: Path) -> Task:
     n_classes = len(task.classes)
     if task.test.images.shape[1:] != task.train.images.shape[1:]:
         raise UsageError(f"{where}: training and test images differ in size")
-    if n_classes < 2 or labels.min() < 0 or labels.max() >= n_classes:
+    if labels.min() < 0 or labels.max() >= n_classes:
         raise UsageError(f"{where}: labels from {labels.min()} to {labels.max()} for {n_classes} classes")
+    if n_classes < 2:
+        what = f"{where}: {len(labels)} images of one class ({task.classes[0]!r}), needed are 2 classes or more"
+        raise UsageError(what, remedy="add another class, for example images without what the first one shows")
     return task
 
 

@@ -134,6 +134,12 @@ def test_unfit_own_files_are_refused(tmp_path, arrays):
         load_task(str(tmp_path / "own.npz"))
 
 
+def test_images_of_one_class_are_refused_with_its_name(tmp_path):
+    np.savez(tmp_path / "own.npz", images=np.zeros((20, 3, 4), np.uint8), labels=np.zeros(20, int), classes=["cat"])
+    with pytest.raises(UsageError, match=r"own\.npz: 20 images of one class \('cat'\), needed are 2 classes or more"):
+        load_task(str(tmp_path / "own.npz"))
+
+
 def test_objects_that_would_run_code_are_refused(tmp_path):
     np.savez(tmp_path / "own.npz", images=np.array([{}], dtype=object), labels=np.zeros(1, int))
     with pytest.raises(DamagedFileError):

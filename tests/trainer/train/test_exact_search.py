@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-
 from trainings import spots_task
 
 from pans.runtime.errors import UsageError
