@@ -32,6 +32,7 @@ Draw = Callable[[Path], None]
 
 VERDICTS = ("above", "level", "below")
 UNITS = {"photons": "photon", "illumination": "illumination"}  # of light, of which there are bits
+RELEASE = "https://doi.org/10.5281/zenodo.19210131"  # data and code of the paper's authors, as the paper cites them
 ERRORS = 2.0  # combined standard errors that a difference must exceed
 
 
@@ -206,7 +207,9 @@ class Table:
     def keys(self) -> list[str]:
         """The keys of a row that the table needs."""
         every = (*self.columns, Column("", self.cell), *((self.across,) if self.across else ()))
-        return [key for column in every for key in column.keys] + [key for *_, key in self.claims]
+        return [key for column in every for key in column.keys] + [
+            key for *_, verdict in self.claims for key in (verdict, _ahead(verdict))
+        ]
 
     def rows(self, rows: Rows) -> Rows:
         """Return the rows of a page that the table shows."""
@@ -235,10 +238,21 @@ class Table:
         ]
 
 
+def _ahead(verdict: str) -> str:
+    """Return the key of the difference that the key `verdict` judges."""
+    return verdict.replace("verdict", "ahead")
+
+
 def _counted(ours: str, theirs: str, key: str, rows: Rows) -> str:
-    found = [row[key] for row in rows if row.get(key)]
+    """Return the verdicts by number, and in how many rows ours are higher: differences that are level may all have one sign."""
+    judged = [row for row in rows if row.get(key)]
+    found, ahead = (
+        [row[key] for row in judged],
+        [row[_ahead(key)] for row in judged if row.get(_ahead(key)) is not None],
+    )
     counts = ", ".join(f"{found.count(one)} {one}" for one in VERDICTS)
-    return f"{ours} against {theirs}: {counts}, of {len(found)}."
+    higher = f"; higher in {sum(one > 0 for one in ahead)}" if len(ahead) == len(found) else ""
+    return f"{ours} against {theirs}: {counts}, of {len(found)}{higher}."
 
 
 def _columns(parts: Iterable[Any]) -> tuple[Column, ...]:
@@ -254,7 +268,8 @@ def _columns(parts: Iterable[Any]) -> tuple[Column, ...]:
 class Page:
     """An entry of pages.toml: title, module:function that measures it, tables, captions of pictures, and its Markdown file if not NAME.md.
 
-    `plots` names the [plots] entry of each picture that is drawn from the rows alone; the others are drawn by the module.
+    `plots` names the [plots] entry of each picture that is drawn from the rows alone; the others are drawn by the module. `paper` says
+    where the paper's figures are from: its text, a figure, or the authors' release.
     """
 
     name: str
@@ -265,6 +280,7 @@ class Page:
     pictures: Mapping[str, str] = field(default_factory=dict)
     plots: Mapping[str, str] = field(default_factory=dict)
     file: str = ""
+    paper: str = ""
 
     def measure(self, asked: Asked) -> Made:
         """Measure the page, or collect what is finished."""
@@ -291,7 +307,10 @@ class Page:
 
     def block(self, rows: Rows, pictures: Iterable[str]) -> str:
         """Return what is generated: command, tables and pictures, between the markers."""
-        lines = [f"SIMULATED. Command: `pans reproduce {self.name}`. Trainings: {self.trainings}.", ""]
+        source = (
+            f" The paper's figures: {self.paper}.".replace("release", f"[release]({RELEASE})") if self.paper else ""
+        )
+        lines = [f"SIMULATED. Command: `pans reproduce {self.name}`. Trainings: {self.trainings}.{source}", ""]
         for table in self.tables:
             lines += table.lines(rows)
         for ending in pictures:

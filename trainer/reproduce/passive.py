@@ -1,4 +1,4 @@
-"""The paper's tables of the other tasks: accuracy or SSIM over patterns and dark counts, ours beside the paper's and direct imaging.
+"""The paper's other tasks: accuracy or SSIM over patterns and dark counts, ours beside the paper's and direct imaging.
 
 One model per row and dark count is trained with that dark count in the click law, on the profile `ideal`. `mmf-mnist` and
 `mmf-mnist-image` use the release's input (`release_intensity` says what is unphysical in it); `mmf-mnist-field` is what an instrument could

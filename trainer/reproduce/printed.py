@@ -1,4 +1,4 @@
-"""The paper's printed figures (printed.toml) as rows, and the recipes of our trainings (recipes.toml) as options."""
+"""The paper's figures (printed.toml) as rows, and the recipes of our trainings (recipes.toml) as options."""
 
 from __future__ import annotations
 

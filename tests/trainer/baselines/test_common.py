@@ -1,5 +1,6 @@
 """The alternatives to PANS: equal photons, exact posteriors against loops and closed forms, networks that learn, the command."""
 
+import dataclasses
 import json
 import math
 import re
@@ -14,14 +15,16 @@ from commands import Pans
 from trainings import kept_task
 
 from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_USAGE, main
+from pans.runtime.errors import UsageError
 from pans.trainer.baselines import bayes as baseline_bayes
 from pans.trainer.baselines import common as baselines
 from pans.trainer.baselines import rows as baseline_rows
 from pans.trainer.baselines.bayes import bayes, log_joint
-from pans.trainer.baselines.common import Trials, detect, measure, run_trials
+from pans.trainer.baselines.common import Light, Trials, detect, measure, run_trials, silent
 from pans.trainer.baselines.end_to_end import patterns_measured, train_conventionally
 from pans.trainer.baselines.networks import aware_net, clean_cnn, patterns, walsh
 from pans.trainer.evaluate.accuracy import Measured
+from pans.trainer.options import BaselineOptions
 from pans.trainer.tasks.registry import Objects, Task
 
 SIDE = 8
@@ -238,6 +241,9 @@ def test_every_way_answers_with_the_keys_of_evaluate(words: tuple[object, ...], 
     assert rows[0]["illumination"] < rows[1]["illumination"]
     assert rows[0]["clicks_mean"] < rows[1]["clicks_mean"]
     assert (rows[0]["objects"], rows[0]["first_200"]["objects"], rows[0]["trials"]) == (240, 200, 2)
+    # what is known of three classes, measured: below 0 where a decision claims too much
+    assert all(row["bits"] <= math.log2(3) for row in rows)
+    assert answer.get("quantiser_bits") == (4 if words[0] == "e2e" and "plain" not in words else None)
     assert answer["simulated"] is True
 
 
@@ -294,3 +300,14 @@ def test_frames_of_a_field_are_intensities_and_take_no_patterns():
     assert lifted.sum() == pytest.approx(300)  # 200 of the objects, and half of their mean light on every pixel
     with pytest.raises(ValueError, match="light that reaches us"):
         measure(task, np.ones((2, 4)))
+
+
+def test_nothing_is_sent_to_a_scene_whose_light_is_its_own(task: Task) -> None:
+    scene = dataclasses.replace(task, light="field")
+    options = BaselineOptions("direct", "bayes", trials=1)
+    (row,) = baseline_rows.baseline_rows(scene, options, [Light("photons", 20.0)], silent)
+    assert (row["photons_mean"], row["illumination"]) == (pytest.approx(20.0, rel=1e-5), 0.0)
+    assert row["bits_per_illumination"] is None
+    assert baseline_rows.at_equal_light(scene, 20.0, 0.0, silent).keys() == {"direct_imaging"}
+    with pytest.raises(UsageError, match="--illumination 9: the light of bars is its own, nothing is sent"):
+        list(baseline_rows.baseline_rows(scene, options, [Light("illumination", 9.0)], silent))

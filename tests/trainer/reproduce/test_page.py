@@ -28,8 +28,8 @@ from pans.trainer.reproduce.page import (
 RESULTS = ROOT / "docs" / "results"
 COLUMNS = (Column("d_f", "{features}"), Column("all", "{value:.2f}"), Column("clicks", "{clicks:.1f}"))
 ROWS = [
-    {"table": "a", "features": 3, "value": 50.0, "unused": 1, "verdict": "above"},
-    {"table": "a", "features": 4, "value": 60.0, "clicks": 2.0, "verdict": "level"},
+    {"table": "a", "features": 3, "value": 50.0, "unused": 1, "verdict": "above", "ahead": 3.0},
+    {"table": "a", "features": 4, "value": 60.0, "clicks": 2.0, "verdict": "level", "ahead": 0.5},
     {"table": "b", "way": "x", "photons": 5, "value": 10.0},
     {"table": "b", "way": "x", "photons": 9, "value": 20.0},
     {"table": "b", "way": "y", "photons": 9, "value": 30.0},
@@ -39,8 +39,10 @@ TABLES = (
     Table("b", (Column("way", "{way}"),), "", (), Column("photons", "{photons}"), "{value:.0f}"),
     Table("a", COLUMNS[:1], "With clicks", needs="clicks"),
 )
-PAGE = Page("name", "A page", "", "one", TABLES, {"-x": "a picture"}, file="file")
-TEXT = """SIMULATED. Command: `pans reproduce name`. Trainings: one.
+PAPER = "from the release"
+PAGE = Page("name", "A page", "", "one", TABLES, {"-x": "a picture"}, file="file", paper=PAPER)
+TEXT = """SIMULATED. Command: `pans reproduce name`. Trainings: one. \
+The paper's figures: from the [release](https://doi.org/10.5281/zenodo.19210131).
 
 ### Rows
 
@@ -49,7 +51,7 @@ d_f|all|clicks
 3|50.00|-
 4|60.00|2.0
 
-Ours against theirs: 1 above, 1 level, 0 below, of 2.
+Ours against theirs: 1 above, 1 level, 0 below, of 2; higher in 2.
 
 way|5|9
 ---|---|---
@@ -76,9 +78,9 @@ def test_a_new_page_has_a_title_its_command_tables_and_pictures_and_nothing_else
     assert (tmp_path / "file.md").read_text() == f"# A page\n\n{begin}\n\n{TEXT}\n{end}\n"
     assert {path.name for path in tmp_path.iterdir()} == {"name.json", "file.md", "name-x.png"}
     found = json.loads((tmp_path / "name.json").read_text())
-    shown = ["features", "value", "verdict", "clicks"]  # what no table shows is left out
+    shown = ["features", "value", "verdict", "ahead", "clicks"]  # what no table shows is left out
     assert found["tables"]["a"]["columns"] == shown
-    assert read_rows(tmp_path, "name")[0] == {"table": "a"} | dict(zip(shown, (3, 50.0, "above", None)))
+    assert read_rows(tmp_path, "name")[0] == {"table": "a"} | dict(zip(shown, (3, 50.0, "above", 3.0, None)))
     assert generated(tmp_path, PAGE) == f"{begin}\n\n{TEXT}\n{end}"
 
 

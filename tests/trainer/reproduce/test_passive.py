@@ -1,15 +1,21 @@
 """The tables over dark counts: cells judged and kept, pictures given back, other draws of the generator, direct imaging beside a cell."""
 
 import dataclasses
+import re
+import shlex
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from trainings import columns_task
+from tree import ROOT
 
 from pans.runtime.cli import main
+from pans.runtime.cli.command import parser_of
 from pans.runtime.instrument.profile import load_profile
+from pans.trainer.commands.train import TRAIN
+from pans.trainer.commands.trainings import fixed_options
 from pans.trainer.device import one_thread
 from pans.trainer.model.heads import MlpHead
 from pans.trainer.options import Options
@@ -154,3 +160,40 @@ def test_samples_are_single_shots_of_the_first_object_of_every_class():
     first, again = (passive.take_samples(head, torch.full((3, 5), 0.5).double(), chosen) for _ in range(2))
     assert np.array_equal(first.given_back, again.given_back)
     assert len({picture.tobytes() for picture in first.given_back.reshape(-1, 36)}) > 2
+
+
+@pytest.mark.parametrize("name", ["transient", "fiber", "tissue", "nebula"])
+def test_the_command_of_a_page_trains_the_page_s_model(name):
+    """Same options, hence the same patterns and head as the row of the page."""
+    text = (ROOT / "docs" / "results" / f"{name}.md").read_text(encoding="utf-8")
+    words = shlex.split(re.search(rf"^\$ pans train ({name} .*)$", text, re.MULTILINE)[1])
+    args, ideal = parser_of("train", TRAIN).parse_args(words), load_profile("ideal")
+    assert args.profile == "ideal"
+    row = PASSIVE[name].rows[0]
+    options = fixed_options(args, draw_task(name, 0, 4, 4), ideal)
+    wanted = recipe(name, row, args.dark)
+    assert dataclasses.replace(options, clicks=round(options.clicks, 9)) == dataclasses.replace(
+        wanted, clicks=round(wanted.clicks, 9)
+    )
+    assert f"\n{row.features}|{args.dark:g}|" in text
+
+
+def test_a_scene_stands_beside_the_best_camera_and_its_cells_stay_as_they_are(tmp_path, monkeypatch):
+    """`--ways` measures direct imaging alone; the cells are those of the page."""
+    known = [{"table": "fiber", "features": 2, "dark": 0.01, "value": 90.0, "error_objects": 0.4, "photons": 20.0}]
+    known[0]["reaching"] = 5e5
+    levels = {"a": {10.0: 50.0, 40.0: 60.0}, "b": {10.0: 40.0, 40.0: 70.0, 1e5: 99.0}}
+    rows = [
+        {"task": "fiber", "way": way, "level": level, "photons": level, "value": value, "error_objects": 0.3}
+        for way, values in levels.items()
+        for level, value in values.items()
+    ]
+    monkeypatch.setattr(passive, "measured_points", lambda *_: rows)
+    made = passive.passive_page(quiet("fiber", tmp_path, ways=("a", "b"), known=tuple(known)))
+    cell, *direct = made.rows
+    assert cell["value"] == 90.0
+    assert (cell["direct_there"], cell["direct_verdict"]) == (pytest.approx(60), "above")  # half way from 50 to 70
+    assert (cell["optics_there"], cell["optics_verdict"]) == (pytest.approx(99), "below")  # no more than its last level
+    best = [row["value"] for row in direct if row["way"] == passive.CAMERA]
+    assert best == [50.0, 70.0, 99.0]
+    assert "camera" in "".join(line for table in page_of("fiber").tables for line in table.lines(made.rows))
