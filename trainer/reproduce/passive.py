@@ -54,17 +54,14 @@ from .page import (
     check_cached_bundle,
     finished,
     flat,
-    of_table,
     sampling_error,
 )
 from .printed import PASSIVE, PassiveRow, recipe, recipe_facts
-from .ways import best_of, measured_points, ways_of
 
 RELEASE_BATCH = 128
 TRIALS = 5
 SAMPLE_SEED = 2  # of pictures that are drawn: not the clicks that the table is made of
 SHOWN_CELLS = ((4, 0.01), (32, 0.01), (64, 0.01), (64, 0.05))  # the paper draws the last three
-CAMERA = "direct, best of these"
 SPECKLE_LEVELS = (10.0, 20.0, 30.0, 50.0, 100.0, 200.0, 300.0, 600.0, 1000.0)  # photons of direct imaging
 FIELD = "mmf-mnist-field"
 FLOOR = 5e-3  # of the mean light, by which the posterior lifts every pixel
@@ -252,12 +249,8 @@ def beside_paper(name: str, row: PassiveRow, dark: float, figures: Row) -> Row:
 
 
 def passive_page(asked: Asked) -> Made:
-    """Return one row per number of patterns and dark count, then direct imaging for the tasks of which the paper draws it."""
-    name, table, direct, rows = asked.name, PASSIVE[asked.name], [*speckle_rows(asked), *camera_rows(asked)], []
-    if asked.ways is not None:
-        return Made(
-            [row | beside_direct(name, row, row["dark"], direct) for row in of_table([*asked.known], name)] + direct
-        )
+    """Return one row per number of patterns and dark count, then direct imaging for the task of which the paper draws it."""
+    name, table, direct, rows = asked.name, PASSIVE[asked.name], speckle_rows(asked), []
     samples = []
     for row in table.rows:
         for dark in table.dark:
@@ -280,7 +273,7 @@ def passive_page(asked: Asked) -> Made:
     return Made(rows + direct, pictures)
 
 
-# ---- direct imaging (paper, Fig. 4E, 5B and 5E to H) ----
+# ---- direct imaging (paper, Fig. 4E and 5B; of scenes in scenes.py) ----
 
 
 def speckle_rows(asked: Asked) -> Rows:
@@ -316,17 +309,7 @@ def beside_direct(name: str, figures: Row, dark: float, direct: Rows) -> Row:
             found["clicks_there"] = as_many["value"]
             found |= against(figures["value"], as_many["value"], PRINTED, prefix="clicks_")
         return found
-    if ways_of(name):
-        return beside_camera(figures, [row for row in direct if row["way"] == CAMERA])
     return beside_curve(figures, direct, "photons", "direct_")
-
-
-def camera_rows(asked: Asked) -> Rows:
-    """Return direct imaging of a scene whose light is its own (paper, Fig. 5E to H): a row per way and level, and the best of them."""
-    if not ways_of(asked.name):
-        return []
-    rows = [row | {"table": "direct"} for row in measured_points(asked, asked.name)]
-    return rows + best_of(rows, CAMERA)
 
 
 def beside_camera(figures: Row, camera: Rows) -> Row:

@@ -19,7 +19,7 @@ from pans.trainer.commands.trainings import fixed_options
 from pans.trainer.device import one_thread
 from pans.trainer.model.heads import MlpHead
 from pans.trainer.options import Options
-from pans.trainer.reproduce import passive
+from pans.trainer.reproduce import passive, scenes
 from pans.trainer.reproduce.page import Asked, page_of, write_page
 from pans.trainer.reproduce.printed import PASSIVE, recipe
 from pans.trainer.tasks.registry import Objects, Task, draw_task
@@ -188,12 +188,12 @@ def test_a_scene_stands_beside_the_best_camera_and_its_cells_stay_as_they_are(tm
         for way, values in levels.items()
         for level, value in values.items()
     ]
-    monkeypatch.setattr(passive, "measured_points", lambda *_: rows)
-    made = passive.passive_page(quiet("fiber", tmp_path, ways=("a", "b"), known=tuple(known)))
+    monkeypatch.setattr(scenes, "measured_points", lambda *_: rows)
+    made = scenes.scene_page(quiet("fiber", tmp_path, ways=("a", "b"), known=tuple(known)))
     cell, *direct = made.rows
     assert cell["value"] == 90.0
     assert (cell["direct_there"], cell["direct_verdict"]) == (pytest.approx(60), "above")  # half way from 50 to 70
     assert (cell["optics_there"], cell["optics_verdict"]) == (pytest.approx(99), "below")  # no more than its last level
-    best = [row["value"] for row in direct if row["way"] == passive.CAMERA]
+    best = [row["value"] for row in direct if row["way"] == scenes.CAMERA]
     assert best == [50.0, 70.0, 99.0]
     assert "camera" in "".join(line for table in page_of("fiber").tables for line in table.lines(made.rows))
