@@ -14,11 +14,12 @@ from __future__ import annotations
 import hashlib
 import io
 import math
+import os
 import struct
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import resources
@@ -39,7 +40,17 @@ C1, C2 = 1e-4, 9e-4
 F64 = NDArray[np.float64]
 FULL_SCALE_16 = 65535
 LABELLED_MAX_BYTES = 1024 * MIB
-PICTURE_PIXELS_MAX = 1 << 26  # of one picture, 67 million: a larger one would fill the memory as it is unpacked
+PICTURE_PIXELS_MAX = 1 << 26  # of one picture, 67 million
+PICTURE_BYTES_MAX = 256 * MIB  # to unpack one and make it grey; with torch, training then stays below 600 MiB
+STRIP_ROWS = 64  # rows that are converted at a time, where a copy of the whole picture would double the memory
+# What is opened, by content: Pillow knows some forty more formats, of which one starts another program and several have decoders that
+# take damaged files for sound ones. BMP, GIF, PNG and PPM are unpacked row by row; for the others see `_bytes_to_unpack`.
+FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
+WEBP_BYTES, PROGRESSIVE_BYTES = (
+    12,
+    6,
+)  # per pixel beside the picture: three canvases of RGBA; all coefficients, 16 bits of 3 colours
+TIFF_BITS, TIFF_STRIP_ROWS, TIFF_TILE_WIDTH, TIFF_TILE_ROWS = 258, 278, 322, 323  # tags
 SIDE_PX = 32  # longer side of images that are made from photos, unless another is asked for
 LEAST_CUT = 0.01  # of the area: less is rounding to whole pixels, and is not told
 SMALL_SIDE_PX = 64  # pictures of one size that is no larger stay as they are
@@ -253,7 +264,7 @@ class _Found:
         sizes: Counter[tuple[int, int]] = Counter()
         for path, _ in files:
             try:
-                with _opened(path) as picture:
+                with _opened(path, shrinks=True) as picture:
                     sizes[_turned_size(picture)] += 1
             except PansError as error:
                 if error.remedy == PILLOW_REMEDY:
@@ -308,19 +319,38 @@ _Done = dict[str, float]  # what was done to a picture; of a cut the share of it
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Yield the picture of Pillow at `path`, its pixels not yet unpacked; errors of the decoders become ours."""
+def _opened(path: Path, *, shrinks: bool) -> Iterator[Any]:
+    """Yield the picture of Pillow at `path`, its pixels not yet unpacked; errors of the decoders become ours.
+
+    UsageError, before anything is unpacked, for one that takes too much memory; a JPEG that `shrinks` is unpacked as grey.
+    """
     Image = _pillow(f"{path}: pictures need")
     try:
         with open_regular(path) as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is lower
-            with Image.open(file) as picture:
+            if (size := os.fstat(file.fileno()).st_size) > PICTURE_BYTES_MAX:  # some decoders read the file at once
+                found = f"{path}: {size >> 20} MiB, allowed: {PICTURE_BYTES_MAX >> 20} MiB"
+                raise UsageError(found, remedy="make the image smaller, or compress it")
+            warnings.simplefilter(
+                "ignore"
+            )  # of damage, with Pillow's own lines of code; and of size, where the limit here is lower
+            with Image.open(file, formats=FORMATS) as picture:
+                _demand_small(path, picture, shrinks)
                 yield picture
+    except PansError:
+        raise
+    except Image.UnidentifiedImageError as error:
+        what, remedy = (
+            f"not a picture, or cut; allowed: {', '.join(FORMATS)}",
+            "convert or repair it, or move it elsewhere",
+        )
+        raise DamagedFileError(f"{path}: {what}", remedy=remedy) from error
     except Image.DecompressionBombError as error:
         raise UsageError(f"{path}: {error}", remedy="make the image smaller") from error
-    except (OSError, SyntaxError, ValueError) as error:  # what damaged files make the decoders raise
-        remedy = "repair it, or move it elsewhere"
-        raise DamagedFileError(f"{path}: not an image that can be read: {error}", remedy=remedy) from error
+    except (
+        Exception
+    ) as error:  # a damaged file makes the decoders raise anything: IndexError, struct.error, RuntimeError, MemoryError
+        what, remedy = str(error) or type(error).__name__, "repair it, or move it elsewhere"
+        raise DamagedFileError(f"{path}: not an image that can be read: {what}", remedy=remedy) from error
 
 
 def _pillow(what: str = "a picture needs") -> Any:
@@ -341,45 +371,97 @@ def _read(
     path: Path, pixels_max: int, target: tuple[int, int] | None, reading: Reading | None
 ) -> tuple[NDArray[np.uint8], bytes, _Done]:
     """Return a picture as 8-bit grey of the size `target` (height, width; None: as it is), the digest of its content, and what was done."""
-    most = min(pixels_max, PICTURE_PIXELS_MAX) if target is None else PICTURE_PIXELS_MAX
-    with _opened(path) as picture:
-        if picture.width * picture.height > most:
-            size = f"{picture.width} x {picture.height} pixels, more than the {most} allowed"
-            raise UsageError(f"{path}: {size}", remedy="make the images smaller, or fewer")
+    with _opened(path, shrinks=target is not None) as picture:
+        if picture.width * picture.height > pixels_max and target is None:
+            raise _too_large(path, picture, f"more than the {pixels_max} allowed", "make the images smaller, or fewer")
         frames = getattr(picture, "n_frames", 1)
         if frames != 1:
             raise UsageError(f"{path}: {frames} frames", remedy="one picture per file: save the frames apart")
         done: _Done = {}
-        grey = _turned(picture.getexif().get(EXIF_ORIENTATION, 1), _grey(path, picture, target, done), done)
-        digest = hashlib.sha256(f"{grey.mode} {grey.size}".encode() + grey.tobytes()).digest()
+        if target is not None and picture.mode == "RGB":
+            # a JPEG is then unpacked as grey, at a part of its size that is still larger
+            picture.draft("L", (4 * target[1], 4 * target[0]))
+            done |= {GREYED: 0.0} if picture.mode == "L" else {}
+        grey = _turned(picture.getexif().get(EXIF_ORIENTATION, 1), _grey(path, picture, done), done)
+        digest = hashlib.sha256(f"{grey.mode} {grey.size}".encode())
+        for _, strip in _strips(grey):
+            digest.update(strip)
         if target is not None and grey.size != target[::-1]:
             if target[0] * target[1] > pixels_max:
                 raise UsageError(
                     f"{path}: too many images for the memory allowed", remedy="a smaller --resize, or fewer"
                 )
             grey = _fitted(grey, target, pad=reading is not None and reading.pad, done=done)
-        return np.asarray(np.rint(np.asarray(grey)), dtype=np.uint8), digest, done
+        image = np.empty(grey.size[::-1], np.uint8)
+        for top, strip in _strips(grey):
+            image[top : top + len(strip)] = np.rint(strip)
+        return image, digest.digest(), done
 
 
-def _grey(path: Path, picture: Any, target: tuple[int, int] | None, done: _Done) -> Any:
+def _too_large(path: Path, picture: Any, more: str, remedy: str) -> UsageError:
+    return UsageError(f"{path}: {picture.width} x {picture.height} pixels, {more}", remedy=remedy)
+
+
+def _demand_small(path: Path, picture: Any, shrinks: bool) -> None:
+    """Raise UsageError for a picture of Pillow that takes too much memory to unpack."""
+    pixels = picture.width * picture.height
+    if pixels > PICTURE_PIXELS_MAX:
+        raise _too_large(path, picture, f"more than the {PICTURE_PIXELS_MAX} allowed", "make the images smaller")
+    each = 2 if shrinks and (picture.format, picture.mode) == ("JPEG", "RGB") else _bytes_per_pixel(picture)
+    needed = pixels * each + _bytes_beside(picture)
+    if needed > PICTURE_BYTES_MAX:
+        more = f"of {picture.format} {picture.mode} take {needed >> 20} MiB, allowed: {PICTURE_BYTES_MAX >> 20}"
+        raise _too_large(path, picture, more, "make it smaller, or save it as PNG of 8-bit grey")
+
+
+def _bytes_beside(picture: Any) -> int:
+    """Most bytes that the decoder of a picture of Pillow holds beside the picture itself."""
+    pixels = picture.width * picture.height
+    if picture.format == "WEBP":
+        return pixels * WEBP_BYTES
+    if picture.format == "JPEG" and picture.info.get("progressive"):
+        return pixels * PROGRESSIVE_BYTES
+    if picture.format == "TIFF":  # one strip or tile, which may be larger than the picture
+        tags = picture.tag_v2
+        rows, width = min(picture.height, tags.get(TIFF_STRIP_ROWS, picture.height)), picture.width
+        if TIFF_TILE_ROWS in tags:
+            rows, width = tags[TIFF_TILE_ROWS], tags.get(TIFF_TILE_WIDTH, width)
+        return int(rows) * int(width) * max(1, sum(tags.get(TIFF_BITS, (1,))) // 8)
+    return 0
+
+
+def _bytes_per_pixel(picture: Any) -> int:
+    """Bytes per pixel of a picture as Pillow keeps it, and of what `_grey` makes of it."""
+    if picture.mode.startswith("I") or picture.mode == "F":
+        return (2 if picture.mode.startswith("I;16") else 4) + 4
+    kept = 1 if picture.mode in ("1", "L", "P") else 4
+    return kept + (kept < 4) * 4 + 3 if picture.has_transparency_data else kept + 1
+
+
+def _strips(picture: Any) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Yield a picture of Pillow as arrays of some rows, with the first row of each."""
+    for top in range(0, picture.height, STRIP_ROWS):
+        yield top, np.asarray(picture.crop((0, top, picture.width, min(top + STRIP_ROWS, picture.height))))
+
+
+def _grey(path: Path, picture: Any, done: _Done) -> Any:
     """A picture of Pillow as grey, 0 to 255: of mode L, or F where it has more levels."""
     from PIL import Image, ImageChops
 
     if picture.mode.startswith("I") or picture.mode == "F":
         full_scale = 1.0 if picture.mode == "F" else float(FULL_SCALE_16)
-        values = np.asarray(picture)
-        _demand_within(path, values, full_scale)
+        _demand_within(path, (values for _, values in _strips(picture)), full_scale)
         done[SCALED] = 0.0
-        return Image.fromarray((values * (255 / full_scale)).astype(np.float32))
+        grey = Image.new("F", picture.size)
+        for top, values in _strips(picture):
+            grey.paste(Image.fromarray((values * (255 / full_scale)).astype(np.float32)), (0, top))
+        return grey
     if picture.mode not in ("1", "L", "LA", "La"):
         done[GREYED] = 0.0
-    if (
-        target is not None and picture.mode == "RGB"
-    ):  # a JPEG is then unpacked as grey, at a part of its size that is still larger
-        picture.draft("L", (4 * target[1], 4 * target[0]))
     if not picture.has_transparency_data:
         return picture.convert("L")
-    grey, clear = picture.convert("RGBA").convert("LA").split()
+    whole = picture if picture.mode == "RGBA" else picture.convert("RGBA")
+    grey, clear = whole.convert("L"), whole.getchannel("A")
     if clear.getextrema()[0] == 255:
         return grey
     done[BLACKENED] = 0.0
@@ -429,9 +511,10 @@ def _fitted(grey: Any, target: tuple[int, int], *, pad: bool, done: _Done) -> An
     return fitted
 
 
-def _demand_within(where: Path, values: NDArray[Any], full_scale: float) -> None:
+def _demand_within(where: Path, parts: Iterable[NDArray[Any]], full_scale: float) -> None:
     """Raise UsageError for values beyond 0 to `full_scale`, or not finite."""
-    low, high = float(values.min()), float(values.max())
+    ends = np.array([(values.min(), values.max()) for values in parts], np.float64)
+    low, high = ends[:, 0].min(), ends[:, 1].max()  # NaN where one is
     if not (low >= 0 and high <= full_scale):  # NaN fails it too
         found = f"{where}: values from {low:g} to {high:g}, allowed: 0 to {full_scale:g}"
         raise UsageError(found, remedy="scale them, or save 8 bits")
@@ -439,7 +522,7 @@ def _demand_within(where: Path, values: NDArray[Any], full_scale: float) -> None
 
 def to_8_bits(where: Path, values: NDArray[Any], full_scale: float) -> NDArray[np.uint8]:
     """Return `values` (any shape), 0 to `full_scale`, as nearest of 256 grey levels; UsageError for any beyond, or not finite."""
-    _demand_within(where, values, full_scale)
+    _demand_within(where, [values], full_scale)
     return np.asarray(np.rint(values.astype(np.float64) * (255 / full_scale)), dtype=np.uint8)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -18,12 +19,16 @@ from numpy.typing import NDArray
 
 from .container import open_regular
 
+SMALL_BYTES, EXPANSION = 64 << 20, 100  # arrays that a short file may hold, and of a longer one how many times its size
 # RuntimeError: an encrypted member; NotImplementedError: an unknown compression
 _UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 def read_arrays(path: str | Path, wanted: Sequence[str] | None, max_bytes: int) -> dict[str, NDArray[Any]]:
-    """Return those of the `wanted` arrays (None: all) that the file holds, after their sizes were checked in directory and headers."""
+    """Return those of the `wanted` arrays (None: all) that the file holds, after their sizes were checked in directory and headers.
+
+    At most `max_bytes` are unpacked, and of a file that was made to fill the memory, a thousand times its size, far less.
+    """
     with open_regular(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
@@ -33,6 +38,9 @@ def read_arrays(path: str | Path, wanted: Sequence[str] | None, max_bytes: int) 
                 total = sum(sizes[f"{name}.npy"] for name in present)
                 if total > max_bytes:
                     raise ValueError(f"holds {total} bytes of arrays, allowed are {max_bytes}")
+                if total > max(SMALL_BYTES, EXPANSION * os.fstat(file.fileno()).st_size):
+                    found = f"{total >> 20} MiB of arrays, {EXPANSION} times the file or more, allowed are {SMALL_BYTES >> 20} MiB"
+                    raise ValueError(f"unpacks to {found}; numpy.savez, which does not compress, can store any")
                 for name in present:
                     with archive.open(f"{name}.npy") as member:
                         _check_header(name, member, sizes[f"{name}.npy"])

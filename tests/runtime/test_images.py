@@ -1,5 +1,7 @@
 """A user's pictures: every pixel format keeps its grey levels, and what cannot be kept is refused."""
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -196,3 +198,51 @@ def test_all_faults_of_a_folder_are_listed_at_once(tmp_path):
     for name, why in faults.items():
         assert any(name in line and why in line for line in lines[1:]), name
     assert caught.value.remedy
+
+
+def test_formats_that_are_not_listed_are_not_opened_whatever_they_are_called(tmp_path):
+    picture = Image.fromarray(np.dstack([RAMP] * 3))
+    for form in ("EPS", "DDS", "ICO"):  # the first starts Ghostscript
+        picture.save(tmp_path / "a.png", form)
+        with pytest.raises(DamagedFileError, match=r"a\.png: not a picture, or cut; allowed: BMP, GIF, JPEG, PNG"):
+            read_grey(tmp_path / "a.png", 1000)
+
+
+def test_whatever_a_decoder_raises_is_a_damaged_picture(tmp_path):
+    Image.fromarray(RAMP).save(tmp_path / "a.tiff")
+    whole = (tmp_path / "a.tiff").read_bytes()
+    for place in range(len(whole)):
+        for byte in (0, 255):
+            (tmp_path / "a.tiff").write_bytes(whole[:place] + bytes([byte]) + whole[place + 1 :])
+            try:
+                assert read_grey(tmp_path / "a.tiff", 1000).ndim == 2
+            except (DamagedFileError, UsageError) as error:
+                assert "a.tiff: " in error.message  # noqa: PT017
+
+
+LARGE = {
+    "f.tiff": ("F", {"compression": "tiff_deflate"}),
+    "rgb.png": ("RGB", {}),
+    "rgba.webp": ("RGBA", {}),
+    "progressive.jpg": ("RGB", {"progressive": True}),
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_a_picture_that_takes_too_much_memory_is_refused_before_it_is_unpacked(tmp_path, monkeypatch, name):
+    mode, way = LARGE[name]
+    Image.new(mode, (200, 100)).save(tmp_path / name, **way)
+    read_grey(tmp_path / name, 20_000)
+    monkeypatch.setattr(images, "PICTURE_BYTES_MAX", 200 * 100 * 5 - 1)
+    monkeypatch.setattr(Image.Image, "load", lambda picture: pytest.fail("unpacked"))
+    with pytest.raises(UsageError, match=r"200 x 100 pixels, of .* allowed: 0"):
+        read_grey(tmp_path / name, 20_000)
+
+
+def test_tiles_larger_than_their_picture_are_counted(tmp_path):
+    sizes = {256: 16, 257: 4, 322: 1 << 15, 323: 1 << 15}  # of the picture, and of a tile: 1 GiB of 8 bits
+    rows = sorted((sizes | {258: 8, 259: 8, 262: 1, 277: 1, 324: 8, 325: 100}).items())
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in rows)
+    (tmp_path / "a.tiff").write_bytes(struct.pack("<2sHIH", b"II", 42, 8, len(rows)) + entries + bytes(4))
+    with pytest.raises(UsageError, match=r"take 1024 MiB, allowed: 256"):
+        read_grey(tmp_path / "a.tiff", 1000)

@@ -90,3 +90,11 @@ def test_good_arrays_are_read(tmp_path: Path) -> None:
     assert set(read_arrays(tmp_path / "a.npz", ("images", "labels", "more"), 1 << 20)) == {"images", "labels"}
     with pytest.raises(ValueError, match="allowed are 10"):
         read_arrays(tmp_path / "a.npz", ("images",), 10)
+
+
+def test_an_archive_that_unpacks_to_far_more_than_itself_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "a.npz", images=np.zeros((65, 1024, 1024), np.uint8))  # 65 MiB in 70 kB
+    with pytest.raises(ValueError, match=r"unpacks to 65 MiB of arrays.*allowed are 64 MiB; numpy\.savez"):
+        read_arrays(tmp_path / "a.npz", None, 1 << 30)
+    np.savez(tmp_path / "a.npz", images=np.zeros((65, 1024, 1024), np.uint8))
+    assert read_arrays(tmp_path / "a.npz", None, 1 << 30)["images"].nbytes == 65 << 20
