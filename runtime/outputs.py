@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
+from io import FileIO
 from itertools import count
 from pathlib import Path
 
@@ -23,6 +24,7 @@ RUNS = Path("pans-runs")
 LATEST = "latest"
 NAME_CHARACTERS = 60
 FORCE_REMEDY = "choose another name, or replace it with --force"
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
 
 
@@ -34,6 +36,44 @@ def user_cache() -> Path:
     home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
     habit = "Library/Caches" if sys.platform == "darwin" else ".cache"
     return (Path(home) if home else Path.home() / habit) / "pans"
+
+
+def own_folder(folder: Path) -> Path:
+    """Return `folder`, made if need be, the links above it resolved: what lies there may be run.
+
+    PermissionError where others could put something: another user's folder, or one that others can write to; also below a folder that
+    neither this user nor root owns, or that others can write to without the sticky bit. A group of this user's own name is nobody else.
+    """
+    parent = folder.parent
+    parent.mkdir(parents=True, exist_ok=True)
+    folder = parent.resolve() / folder.name
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if os.name == "posix":
+        found = folder.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & _OTHERS_WRITE:
+            raise PermissionError(f"{folder} is another user's, or others can write to it")
+        for above in folder.parents:
+            found = above.stat()
+            others = found.st_mode & _OTHERS_WRITE and not found.st_mode & stat.S_ISVTX and not _only_own_group(found)
+            if others or found.st_uid not in (0, os.geteuid()):
+                raise PermissionError(
+                    f"{folder} could be replaced by others: {above} is another user's, or others can write to it"
+                )
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} cannot be written to")
+    return folder
+
+
+def _only_own_group(found: os.stat_result) -> bool:
+    """Return whether nobody but the group may write, and that is the group of this user's own name, as umask 002 goes with."""
+    import grp
+    import pwd
+
+    try:
+        own = grp.getgrgid(found.st_gid)
+        return not found.st_mode & stat.S_IWOTH and own.gr_name == pwd.getpwuid(os.geteuid()).pw_name and not own.gr_mem
+    except KeyError:  # ids without a name
+        return False
 
 
 def check_outputs(
@@ -248,18 +288,47 @@ def locked(path: Path, what: str = "", remedy: str = "choose another folder with
     with ExitStack() as held:
         try:
             while True:
-                file = held.enter_context(open(os.open(path, os.O_CREAT | os.O_RDWR, 0o666), "r+b", buffering=0))
+                file = held.enter_context(_open_lock(path, os.O_CREAT | os.O_RDWR))
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 with suppress(FileNotFoundError):  # the holder before removed it between our two calls
-                    if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
+                    if os.path.samestat(os.fstat(file.fileno()), os.lstat(path)):
                         break
             held.callback(path.unlink, missing_ok=True)
             file.truncate(0)
             file.write(f"{os.getpid()}\n".encode())
         except BlockingIOError as error:
-            holder = file.read(20).decode("ascii", "replace").strip() or "unknown"
+            holder = (file.read(20) or b"").decode("ascii", "replace").strip() or "unknown"
             found = f"{what or path.parent}: another run writes here (process {holder})"
             raise UsageError(found, remedy=remedy) from error
         except OSError as error:
             raise UsageError(f"{path}: cannot be locked: {error.strerror or error}", remedy=remedy) from error
         yield
+
+
+def lock_is_held(path: Path) -> bool:
+    """Return whether a run holds the lock file `path`; what is there and is no lock file counts as one that is held."""
+    if not os.path.lexists(path):
+        return False
+    try:
+        import fcntl
+    except ModuleNotFoundError:
+        return True  # the file goes with its run there
+    try:
+        with _open_lock(path, os.O_RDONLY) as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return False
+    except OSError:
+        return True
+
+
+def _open_lock(path: Path, flags: int) -> FileIO:
+    """Open a lock file; OSError for a link or another name of a file, which would be truncated, and for what is no file."""
+    if path.is_symlink():  # O_NOFOLLOW refuses one that is put there meanwhile, in words of its own
+        raise OSError(errno.ELOOP, "is a link, allowed: a file of its own")
+    handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    file = FileIO(handle, "rb" if flags == os.O_RDONLY else "r+b")
+    found = os.fstat(handle)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+        file.close()
+        raise OSError(errno.EINVAL, "is no lock file of pans, or has another name: remove it")
+    return file

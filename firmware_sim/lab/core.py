@@ -27,7 +27,7 @@ from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, MAX_SLOTS, MAX_UPLOAD_BYTES, Refused
 from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.outputs import user_cache
+from pans.runtime.outputs import own_folder, user_cache
 from pans.runtime.wire.commands import PatternChunk
 from pans.runtime.wire.messages import MAX_PAYLOAD_BYTES, AckStatus
 
@@ -314,13 +314,20 @@ def core_sources(folder: Path = FOLDER) -> list[Path]:
 
 
 def build_library(folder: Path = FOLDER, cache: Path | None = None, flags: tuple[str, ...] = FLAGS) -> Path:
-    """Return the core as a shared library; it is compiled where no build of these sources is in `cache`, by default the user's."""
+    """Return the core as a shared library; it is compiled where no build of these sources is in `cache`, by default the user's.
+
+    ConfigError where others could put a library of their own there: it is loaded.
+    """
     compiler, place = find_compiler(), "-fPIC" if os.name == "posix" else "-Wl,--export-all-symbols"
     digest = hashlib.sha256(" ".join((sys.platform, *flags)).encode())
     for path in sorted(folder.glob("*.[ch]")):
         digest.update(path.read_bytes())
-    cache = cache or user_cache()
-    cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        cache = own_folder(cache or user_cache() / "core")
+    except (OSError, RuntimeError) as error:  # RuntimeError: a user without a home
+        raise ConfigError(
+            f"the C core cannot be kept: {error}", remedy="name a folder of your own: XDG_CACHE_HOME"
+        ) from error
     target = cache / f"pans-core-{digest.hexdigest()[:20]}.{'so' if os.name == 'posix' else 'dll'}"
     if target.is_file():
         return target

@@ -32,7 +32,7 @@ from pans.runtime.container import (
 )
 from pans.runtime.core.decision import is_judged
 from pans.runtime.errors import PansError, UsageError
-from pans.runtime.outputs import LATEST, RUNS, locked
+from pans.runtime.outputs import LATEST, RUNS, lock_is_held, locked
 from pans.runtime.ranges import Range
 from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
 from pans.runtime.record.log import skim_decisions
@@ -106,7 +106,7 @@ def run_of(folder: Path) -> Run | None:
     started = datetime.fromtimestamp(recordings[0].stat().st_mtime, UTC)
     with suppress(ValueError):
         started = datetime.fromisoformat(str(header.get("created_utc", "")))
-    is_locked = _is_locked(folder / RUN_LOCK)
+    is_locked = lock_is_held(folder / RUN_LOCK)
     far = summary if summary or is_locked else _as_far_as(recordings)
     return Run(
         folder=folder,
@@ -175,21 +175,6 @@ def _object_at(data: bytes, start: int) -> dict[str, Any]:
 
 def _number(value: Any) -> Any:
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-def _is_locked(path: Path) -> bool:
-    if not path.exists():
-        return False
-    try:
-        import fcntl
-    except ModuleNotFoundError:
-        return True  # the file goes with its run there
-    try:
-        with open(path, "rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            return False
-    except OSError:
-        return True
 
 
 # ---- which may go ----

@@ -46,7 +46,10 @@ START_S = 180  # kernels are compiled once, on a slow machine for a minute
 STOP_S = 45  # the watchdog ends a stuck run within 5 s; a slow disk has 30 s to sync
 SYSTEM_ONLY = ("# what only the system's manager", "[Install]")  # left out between these in a user's own unit
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}")
-ESCAPES = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "%": "%%"})
+USER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@-]{0,254}\$?")
+_SURROGATES = re.compile("[\ud800-\udfff]")  # bytes of a file's name that are no UTF-8
+_CONTROLS = (*range(1, 32), *range(127, 160))
+ESCAPES = str.maketrans({"\\": "\\\\", '"': '\\"', "%": "%%"} | {chr(c): rf"\{c:03o}" for c in _CONTROLS if c < 128})
 POLL_S = 0.05
 NOT_THE_SERVICES = ("INVOCATION_ID", "JOURNAL_STREAM", "MAINPID")
 WATCHDOG = Range(16, 3600)  # a run that looks for its lost device may be silent for 15 s
@@ -81,13 +84,13 @@ def unit_text(
     return template.format(
         name=name,
         command=command_line(command),
-        folder=_escaped(str(folder)),
-        user=user,
+        folder=_bare(folder),
+        user=_checked_user(user),
         watchdog_s=watchdog_s,
         start_s=START_S,
         stop_s=STOP_S,
         priority=FIFO_PRIORITY,
-        writes="\n".join(f'ReadWritePaths="{_escaped(str(path))}"' for path in sorted({folder, *writes})),
+        writes="\n".join(f"ReadWritePaths={_in_quotes(path)}" for path in sorted({folder, *writes})),
         target="multi-user" if user else "default",
     )
 
@@ -105,19 +108,54 @@ def command_of(text: str) -> tuple[list[str], Path]:
     """Return the command and the working directory of the unit `text`, which is one of ours; UsageError if they are not there."""
     values = {key: value for key, _, value in (line.partition("=") for line in text.split("\n"))}
     words = [_unescaped(found) for found in re.findall(r'"((?:[^"\\]|\\.)*)"', values.get("ExecStart", ""))]
-    folder = _unescaped(values.get("WorkingDirectory", ""))
+    folder = values.get("WorkingDirectory", "").replace("%%", "%")
     if not words or not folder:
         raise UsageError("the unit has no ExecStart or no WorkingDirectory", remedy="install it again")
     return [word.replace("$$", "$") for word in words], Path(folder)
 
 
 def _escaped(text: str) -> str:
+    if _SURROGATES.search(text):
+        raise UsageError(f"{text}: a unit cannot name it: bytes that are no UTF-8", remedy="rename the file")
     return text.translate(ESCAPES)
 
 
 def _unescaped(text: str) -> str:
-    letters = {"n": "\n", "t": "\t", "r": "\r"}
-    return re.sub(r"\\(.)", lambda found: letters.get(found[1], found[1]), text.replace("%%", "%"))
+    def one(found: re.Match[str]) -> str:
+        return chr(int(found[1], 8)) if found[1].isdigit() else found[1]
+
+    return re.sub(r"\\([0-7]{3}|.)", one, text.replace("%%", "%"))
+
+
+def _bare(path: Path) -> str:
+    """Return a path as systemd reads a value that it neither unquotes nor unescapes; UsageError for one that cannot be written so."""
+    text = str(path)
+    if (
+        any(ord(letter) in _CONTROLS for letter in text)
+        or _SURROGATES.search(text)
+        or text.strip().rstrip("\\") != text
+    ):
+        what = "a unit cannot name it: control characters, bytes that are no UTF-8, or a backslash or space at its end"
+        raise UsageError(f"{path}: {what}", remedy="rename the folder")
+    return text.replace("%", "%%")
+
+
+def _in_quotes(path: Path) -> str:
+    """Return a path for ReadWritePaths, which has quotes but keeps backslashes."""
+    text = _bare(path)
+    quote = next((one for one in "\"'" if one not in text), None)
+    if quote is None:
+        raise UsageError(f"{path}: a unit cannot name it: both kinds of quotes", remedy="rename the folder")
+    return f"{quote}{text}{quote}"
+
+
+def _checked_user(user: str) -> str:
+    if user and not USER_NAME.fullmatch(user):
+        allowed = "allowed are letters, digits, dot, dash, underscore and @, at most 255"
+        raise UsageError(
+            f"--run-as {user!r} is no name of a user: {allowed}", remedy="name one that `getent passwd` lists"
+        )
+    return user
 
 
 def check_name(name: str) -> str:

@@ -22,7 +22,6 @@ import hashlib
 import os
 import re
 import shutil
-import stat
 import tempfile
 import time
 from contextlib import suppress
@@ -40,7 +39,7 @@ from numba.core.runtime import rtsys
 
 from pans.runtime import __version__
 from pans.runtime.cli.printing import warn
-from pans.runtime.outputs import user_cache
+from pans.runtime.outputs import own_folder, user_cache
 
 TRIED = ((0, 68),)  # versions of numba
 # Packages whose files hold kernels, or constants that are compiled into them: of runtime for all kernels, of the others for their own.
@@ -149,35 +148,23 @@ caching.CacheImpl._locator_classes.insert(0, _Place)
 def kernel_folder() -> Path:
     """Return the folder of what is compiled of these sources: in NUMBA_CACHE_DIR or the user's cache; else one for this process alone.
 
-    What lies there is run: a folder that another user owns or can write to is not used.
+    What lies there is run: a folder that another user owns, or could change or replace, is not used.
     """
     facts = (numba.__version__, llvmlite.__version__, digest_of(Path(__file__).parents[1], SOURCES))
     name = f"pans-kernels-{__version__}-{hashlib.sha256(repr(facts).encode()).hexdigest()[:16]}"
     try:
-        parent = Path(numba.config.CACHE_DIR or user_cache())
-        return own_folder(parent / name)
+        place = Path(numba.config.CACHE_DIR or user_cache()) / name
+        is_new = not place.exists()
+        folder = own_folder(place)
+        os.utime(folder)  # in use
+        if is_new:
+            _prune(folder)
+        return folder
     except (OSError, RuntimeError) as error:  # RuntimeError: a user without a home
         warn(f"kernels are compiled at each start, for some ten seconds: {error}; NUMBA_CACHE_DIR names another folder")
-    folder = tempfile.mkdtemp(prefix="pans-kernels-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
-
-
-def own_folder(folder: Path) -> Path:
-    """Return `folder`, made if need be, marked as used and tried; PermissionError where others could have put something there."""
-    is_new = not folder.exists()
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    found = folder.lstat()
-    if os.name == "posix" and (
-        not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    ):
-        raise PermissionError(f"{folder} is another user's, or others can write to it")
-    os.utime(folder)
-    if is_new:
-        _prune(folder)
-    if not os.access(folder, os.W_OK):
-        raise PermissionError(f"{folder} cannot be written to")
-    return folder
+    made = tempfile.mkdtemp(prefix="pans-kernels-")
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return Path(made)
 
 
 def _prune(folder: Path) -> None:

@@ -1,13 +1,24 @@
 """No output ever destroys a file: checks before a command begins, exclusive creation, whole files or none."""
 
 import os
+import stat
 from pathlib import Path
 
 import pytest
 
 from pans.runtime import outputs
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import check_outputs, file_identity, locked, new_run_folder, place_new, whole_file, write_file
+from pans.runtime.outputs import (
+    check_outputs,
+    file_identity,
+    lock_is_held,
+    locked,
+    new_run_folder,
+    own_folder,
+    place_new,
+    whole_file,
+    write_file,
+)
 
 
 @pytest.fixture
@@ -140,3 +151,67 @@ def test_a_lock_names_its_holder_and_is_free_afterwards(tmp_path: Path) -> None:
     with locked(path):
         pass
     assert listing(tmp_path) == []
+
+
+@pytest.mark.parametrize("make", [Path.symlink_to, Path.hardlink_to])
+def test_a_lock_is_never_another_file(make, tmp_path):
+    precious, lock = tmp_path / "precious", tmp_path / ".pans-run.lock"
+    precious.write_text("kept")
+    make(lock, precious)
+    with pytest.raises(UsageError, match=r"lock: cannot be locked: (is a link|is no lock file)"), locked(lock):
+        pass
+    assert precious.read_text() == "kept"
+    assert lock_is_held(lock)
+
+
+def test_a_link_to_nowhere_makes_no_file(tmp_path):
+    (tmp_path / "lock").symlink_to(tmp_path / "new")
+    with pytest.raises(UsageError, match="is a link"), locked(tmp_path / "lock"):
+        pass
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_pipe_in_place_of_a_lock_holds_nobody_up(tmp_path):
+    os.mkfifo(tmp_path / "lock")
+    with pytest.raises(UsageError, match="is no lock file"), locked(tmp_path / "lock"):
+        pass
+    assert lock_is_held(tmp_path / "lock")
+
+
+def test_whose_lock_is_held_is_known(tmp_path):
+    assert not lock_is_held(tmp_path / "lock")
+    (tmp_path / "lock").touch()
+    assert not lock_is_held(tmp_path / "lock")
+    with locked(tmp_path / "lock"):
+        assert lock_is_held(tmp_path / "lock")
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o757])
+@pytest.mark.parametrize("above", [".", ".."])
+def test_a_folder_that_others_could_replace_is_not_ones_own(above, mode, tmp_path):
+    folder = tmp_path / "cache" / "pans" / "core"
+    assert own_folder(folder) == folder
+    assert folder.stat().st_mode & 0o777 == 0o700
+    parent = (folder.parent / above).resolve()
+    parent.chmod(mode)
+    with pytest.raises(PermissionError, match=f"could be replaced by others: {parent} "):
+        own_folder(folder)
+    parent.chmod(mode | stat.S_ISVTX)  # as /tmp
+    assert own_folder(folder) == folder
+
+
+def test_links_above_ones_own_folder_are_followed_first(tmp_path):
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    (tmp_path / "open" / "cache").mkdir()
+    (tmp_path / "cache").symlink_to(tmp_path / "open" / "cache")
+    with pytest.raises(PermissionError, match="could be replaced"):
+        own_folder(tmp_path / "cache" / "core")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="a folder is given away by root alone")
+def test_a_folder_below_that_of_another_user_is_not_ones_own(tmp_path):
+    (tmp_path / "theirs").mkdir()
+    os.chown(tmp_path / "theirs", 12345, -1)
+    with pytest.raises(PermissionError, match="is another user's"):
+        own_folder(tmp_path / "theirs" / "core")

@@ -26,6 +26,7 @@ from tree import ROOT
 from pans.firmware_sim.lab import core
 from pans.firmware_sim.testing import small_automaton_bundle
 from pans.runtime.bundle.model import load_bundle, write_bundle
+from pans.runtime.errors import ConfigError
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_command
 
@@ -249,3 +250,13 @@ def test_the_stand_in_is_called_like_the_library(name: str, monkeypatch: pytest.
             assert list(ours.parameters) == list(theirs.parameters) or "args" in theirs.parameters, (key, method)
     for key, one in vars(stand_in).items():
         assert not inspect.isfunction(one) or callable(getattr(real, key))
+
+
+def test_a_core_that_others_could_have_put_there_is_not_loaded(tmp_path: Path) -> None:
+    library = core.build_library(cache=tmp_path / "shared" / "core")
+    assert core.build_library(cache=tmp_path / "shared" / "core") == library
+    for open_to_all in (library.parent, tmp_path / "shared"):
+        open_to_all.chmod(0o777)
+        with pytest.raises(ConfigError, match=r"the C core cannot be kept: .* others can write to it"):
+            core.build_library(cache=tmp_path / "shared" / "core")
+        open_to_all.chmod(0o700)

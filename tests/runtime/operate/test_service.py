@@ -31,7 +31,7 @@ NASTY = ["/a b/pans", "50%.pans", "$HOME", 'say "hi"', "a\\b", "tab\tend", "Grö
 
 
 def test_every_word_comes_back_from_a_unit() -> None:
-    folder = Path('/data/50% of "it" \\')
+    folder = Path('/data/50% of "it" \\ there')
     assert command_of(unit_text("lab", NASTY, folder, [], 20.0, "lab")) == (NASTY, folder)
     assert "\n" not in command_line(NASTY)
 
@@ -187,3 +187,42 @@ def test_monitoring_files_are_written_once(tmp_path: Path, pans: Pans) -> None:
     assert [Path(path).name for path in found["files"]] == names
     assert all(Path(path).read_bytes() == (SHIPPED / Path(path).name).read_bytes() for path in found["files"])
     assert main(["service", "monitoring", "--out", str(out)]) == 2
+
+
+@pytest.mark.parametrize(
+    "user", ["lab\nExecStartPre=/bin/sh", "lab\n", "a b", "%u", "lab\\", "-x", "\x1b[2J", "a:b", "../x"]
+)
+def test_a_user_s_name_adds_nothing_to_the_unit(user, tmp_path):
+    with pytest.raises(UsageError, match=r"--run-as .* is no name of a user: allowed"):
+        unit_text("lab", ["/bin/pans"], tmp_path, [], 20.0, user)
+
+
+@pytest.mark.parametrize("name", ["it's", 'say "hi"', "50%", "a\\b", "Größe", "a b", "$HOME", "#x", ";"])
+def test_folders_stand_in_the_unit_as_systemd_reads_them(name):
+    """WorkingDirectory is neither unquoted nor unescaped, ReadWritePaths is unquoted alone; specifiers are expanded in both."""
+    folder = Path("/srv") / name
+    text = unit_text("lab", ["/bin/pans"], folder, [], 20.0, "lab")
+    lines = dict(
+        line.split("=", 1) for line in text.splitlines() if line.startswith(("WorkingDirectory", "ReadWritePaths"))
+    )
+    assert lines["WorkingDirectory"].replace("%%", "%") == str(folder)
+    quoted = lines["ReadWritePaths"]
+    assert quoted[0] == quoted[-1]
+    assert quoted[0] not in quoted[1:-1]
+    assert quoted[1:-1].replace("%%", "%") == str(folder)
+    assert command_of(text)[1] == folder
+
+
+@pytest.mark.parametrize("name", ["a\nUser=root", "bell\x07", "end\\", "end ", "\x85", "\udce4", "both '\""])
+def test_a_folder_that_a_unit_cannot_name_is_refused(name):
+    with pytest.raises(UsageError, match="a unit cannot name it"):
+        unit_text("lab", ["/bin/pans"], Path("/srv") / name, [], 20.0, "lab")
+
+
+def test_control_bytes_are_never_raw_in_the_unit():
+    words = ["/bin/pans", "".join(map(chr, range(1, 128)))]
+    line = command_line(words)
+    assert line.isprintable()
+    assert command_of(f"ExecStart={line}\nWorkingDirectory=/srv")[0] == words
+    with pytest.raises(UsageError, match="no UTF-8"):
+        command_line(["/bin/pans", "\udce4.toml"])
