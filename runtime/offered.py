@@ -1,6 +1,7 @@
-"""An entry point of another package in (command, device, actuator, back end, task, bench); its value, or an error that names the package.
+"""What other packages bring: how those of an extra are installed (`install`), and their entry points.
 
-What the value must be is checked by those that use it.
+`load_offered`: an entry point of another package in (command, device, actuator, back end, task, bench),
+as its value, or an error that names the package. What the value must be is checked by those that use it.
 """
 
 from __future__ import annotations
@@ -9,6 +10,35 @@ from importlib.metadata import EntryPoint
 from typing import Any
 
 from .errors import UsageError
+
+# What `pip` installs for each extra of pyproject.toml: the packages themselves, since this one may be on no index, where its name is free.
+INSTALLS = {
+    "train": "'torch==2.13.0' onnx pillow",
+    "sweep": "optuna",
+    "plot": "matplotlib scikit-learn jinja2",
+    "ui": "bokeh matplotlib jinja2",
+    "sklearn": "'torch==2.13.0' onnx pillow scikit-learn",
+    "frames": "pandas xarray",
+    "export": "h5py",
+    "parquet": "pyarrow",
+    "dask": "dask distributed",
+    "postgres": "optuna 'psycopg[binary]'",
+    "metrics": "prometheus-client",
+    "usb": "libusb-package",
+    "ophyd": "'ophyd-async>=0.21,<0.22' bluesky",
+    "alp": "ALP4lib",
+    "tagger": "Swabian-TimeTagger",
+    "compiler": "ziglang",
+}
+
+
+def install(extra: str) -> str:
+    """Return the command that installs what an extra needs.
+
+    >>> install("export")
+    'pip install h5py'
+    """
+    return f"pip install {INSTALLS[extra]}"
 
 
 def load_offered(point: EntryPoint) -> Any:

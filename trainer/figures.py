@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.errors import UsageError
+from pans.runtime.cli.finding import needed
 from pans.runtime.html_card import html_card
 from pans.runtime.outputs import whole_file
 
@@ -34,12 +34,7 @@ class Result:
 
     def to_frame(self) -> Any:
         """Return `rows` as a pandas.DataFrame; UsageError where pandas is not installed."""
-        try:
-            import pandas
-        except ModuleNotFoundError as error:
-            what = "to_frame needs the package pandas, which is not installed"
-            raise UsageError(what, remedy="pip install 'pans-runtime[frames]'") from error
-        return pandas.DataFrame.from_dict(self.rows(), orient="index")
+        return needed("pandas", "to_frame", "frames").DataFrame.from_dict(self.rows(), orient="index")
 
     def _repr_html_(self) -> str:
         return "".join(html_card(f"{name} (SIMULATED)", _in_words(row)) for name, row in self.rows().items())

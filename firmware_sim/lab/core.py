@@ -27,6 +27,7 @@ from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, MAX_SLOTS, MAX_UPLOAD_BYTES, Refused
 from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.offered import install
 from pans.runtime.outputs import own_folder, user_cache
 from pans.runtime.wire.commands import PatternChunk
 from pans.runtime.wire.messages import MAX_PAYLOAD_BYTES, AckStatus
@@ -332,7 +333,7 @@ def build_library(folder: Path = FOLDER, cache: Path | None = None, flags: tuple
     if target.is_file():
         return target
     if not compiler:
-        raise ConfigError("no C compiler was found, and the core is C", remedy="pip install 'pans-runtime[compiler]'")
+        raise ConfigError("no C compiler was found, and the core is C", remedy=install("compiler"))
     with tempfile.TemporaryDirectory(dir=cache) as made:
         library = Path(made) / target.name
         words = [*compiler, *flags, "-shared", place, *map(str, core_sources(folder)), "-o", str(library)]

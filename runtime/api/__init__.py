@@ -14,6 +14,7 @@ rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.tra
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime import __version__ as __version__
 from pans.runtime.errors import UsageError, as_usage_error, in_python_words
+from pans.runtime.offered import install
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -84,6 +86,18 @@ __all__ = [
 ]
 
 
+_trained = {name for name, (module, _) in _HOMES.items() if module.startswith("pans.trainer")}
+_lacks = {package for package in ("torch", "onnx", "sklearn") if find_spec(package) is None}
+for _name in _trained if _lacks - {"sklearn"} else {"PansClassifier"} if _lacks else ():
+    __all__.remove(
+        _name
+    )  # `from pans import *`, `help(pans)` and `inspect` load each, and would end at one whose extra is not installed
+
+
+class MissingExtraError(UsageError, AttributeError):
+    """A name of `pans` whose extra is not installed: there is no such attribute, and the remedy says how to get it."""
+
+
 def __getattr__(name: str) -> object:
     """Load a name when it is first used, since its package loads numba or torch (PEP 562)."""
     if name not in _HOMES:
@@ -96,17 +110,15 @@ def __getattr__(name: str) -> object:
             raise
         package, extra = (error.name or "").partition(".")[0], "sklearn" if name == "PansClassifier" else "train"
         what = f"pans.{name} needs the package {package}, which is not installed"
-        remedy = f"in the checkout of pans: pip install -c constraints.txt '.[{extra}]'"
-        raise UsageError(what, remedy=remedy) from error
+        if sys._getframe(1).f_globals.get("__name__") == "importlib._bootstrap":
+            # `from pans import NAME`: of an AttributeError Python would say that it cannot import the name, and no more
+            raise ImportError(f"{what}: {install(extra)}", name=package) from error
+        raise MissingExtraError(what, remedy=install(extra)) from error
     return globals()[name]
 
 
 def __dir__() -> list[str]:
-    """The names that can be loaded: `help(pans)` and `inspect` load each, and would end at one whose extra is not installed."""
-    lacks = {package for package in ("torch", "onnx", "sklearn") if find_spec(package) is None}
-    trained = {name for name, (module, _) in _HOMES.items() if module.startswith("pans.trainer")}
-    hidden = trained if lacks - {"sklearn"} else {"PansClassifier"} if lacks else set()
-    return sorted({*__all__} - hidden)
+    return sorted(__all__)
 
 
 def load_bundle(path: str | Path) -> Bundle:

@@ -21,12 +21,13 @@ from pans.runtime.errors import LinkError, PansError, UsageError
 from pans.runtime.link.connection import Connection
 from pans.runtime.live import LiveRun, Observers, RunOptions
 from pans.runtime.live.continuous import Stop
+from pans.runtime.offered import install
 
 try:
     from bluesky.protocols import Triggerable
     from ophyd_async.core import AsyncStatus, StandardReadable, StandardReadableFormat, soft_signal_r_and_setter
 except ImportError as error:
-    raise ImportError(f"pans.ophyd needs {error.name}: pip install 'pans-runtime[ophyd]'", name=error.name) from error
+    raise ImportError(f"pans.ophyd needs {error.name}: {install('ophyd')}", name=error.name) from error
 
 CONFIGURATION = {"bundle": (str, None), "device": (str, None), "simulated": (bool, None), "tick_hz": (int, "Hz")}
 HINTED = {

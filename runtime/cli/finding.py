@@ -12,7 +12,7 @@ from typing import Any
 
 from pans.runtime import __version__
 from pans.runtime.errors import UsageError
-from pans.runtime.offered import load_offered
+from pans.runtime.offered import install, load_offered
 
 from .command import Command
 
@@ -50,8 +50,7 @@ def load_command(point: EntryPoint) -> Command:
 
 def missing_extra(what: str, package: str, extra: str) -> UsageError:
     """Return the error for a package that `what` needs and that is not installed."""
-    remedy = f"pip install 'pans-runtime[{extra}]'"
-    return UsageError(f"{what} needs the package {package}, which is not installed", remedy=remedy)
+    return UsageError(f"{what} needs the package {package}, which is not installed", remedy=install(extra))
 
 
 def needed(module: str, what: str = "a page", extra: str = "plot") -> Any:

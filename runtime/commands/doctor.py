@@ -29,6 +29,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
 from pans.runtime.cli.reading_bar import progress_bar
 from pans.runtime.errors import UsageError
 from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
+from pans.runtime.offered import install
 from pans.runtime.timing.realtime import FIFO_PRIORITY, GRANTED, first_line, isolated_cores, lacking, load_average
 
 if TYPE_CHECKING:
@@ -159,7 +160,7 @@ def check_libusb() -> Iterator[Finding]:
     import usb.backend.libusb1
 
     ok = usb.backend.libusb1.get_backend() is not None
-    remedy = "only for usb: devices: pip install 'pans-runtime[usb]', or install libusb-1.0"
+    remedy = f"only for usb: devices: {install('usb')}, or install libusb-1.0"
     yield Finding("libusb", ok, "found" if ok else "not found", "" if ok else remedy)
 
 
@@ -360,7 +361,7 @@ def examine(checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
         try:
             findings += check()
         except ImportError as error:
-            remedy = "pip install --force-reinstall pans-runtime"
+            remedy = "install pans again, from where it came"
             findings.append(Finding(name, False, f"cannot be loaded: {error}", remedy, needed=True))
         except Exception as error:
             findings.append(Finding(name, False, f"the check itself failed: {error!r}", "report this with its text"))

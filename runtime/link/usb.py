@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any
 
 from pans.runtime.errors import LinkError
+from pans.runtime.offered import install
 
 from .serial import not_opened, usb_target
 
@@ -36,7 +37,7 @@ class UsbLink:
             self._claim(usb.util)
         except usb.core.NoBackendError as error:
             raise LinkError(
-                f"cannot open {self.name}: no libusb", remedy="pip install 'pans-runtime[usb]', or install libusb-1.0"
+                f"cannot open {self.name}: no libusb", remedy=f"{install('usb')}, or install libusb-1.0"
             ) from error
         except usb.core.USBError as error:
             raise not_opened(self.name, error) from error

@@ -1,7 +1,7 @@
 """The live view as a web page, by Bokeh's server (extra `ui`): curves to zoom into, alarms, the last objects, the figures.
 
 What all pages show is made once after a picture; each page copies it once per second, for the range and the smoothing that it asks for.
-A request that names another host is refused where only this machine may ask (DNS rebinding), and so is a websocket of another origin.
+A request that names another host is refused where only this machine may ask (DNS rebinding), and what another site's page asks for.
 """
 
 from __future__ import annotations
@@ -319,25 +319,51 @@ class _View:
         self._marks.data = page.once("marks", page.marks)
 
 
-class _Door(Router):
-    """Lets requests through to Bokeh's server that name this host, where `local`, and a path of the page; websockets of this origin."""
+class _Server(BokehTornado):
+    """Bokeh's server, with the requests for a page that it has not answered yet: their sessions are on the way, and in no list of Bokeh."""
 
-    def __init__(self, app: BokehTornado, *, local: bool) -> None:
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.unanswered: set[Any] = set()
+        super().__init__(*args, **kwargs)
+
+    def log_request(self, handler: Any) -> None:
+        """Note that a request has its answer, whatever it is."""
+        self.unanswered.discard(handler.request)
+
+
+class _Door(Router):
+    """Lets requests through to Bokeh's server that name this host, where `local`, and a path of the page; none of another site's page.
+
+    Places are counted here, before a session is made, which takes memory and time.
+    """
+
+    def __init__(self, app: _Server, *, local: bool) -> None:
         self._app, self._local = app, local
 
     def find_handler(self, request: Any, **kwargs: Any) -> Any:
         """Return who answers."""
-        origin = request.headers.get("Origin")
         if self._local and not is_loopback(request.host_name.strip("[]")):
             return _refusal(request, 403, "This page is for the machine that it runs on.")
         if PATHS.fullmatch(request.path) is None or request.method not in ("GET", "HEAD"):
             return _refusal(request, 404, "There is no such page.")
-        if request.path == "/ws" and origin is not None and urlsplit(origin).netloc.lower() != request.host.lower():
-            return _refusal(request, 403, "A page of another origin has asked.")
-        if request.path == "/" and len(self._app.get_sessions("/")) >= SESSIONS_MAX:
-            full = f"{SESSIONS_MAX} pages follow this run already. Close one, wait 15 seconds and try again."
-            return _refusal(request, 503, full)
+        if {"Content-Length", "Transfer-Encoding"} & {*request.headers}:  # its answer would wait for a body, on a place
+            return _refusal(request, 400, "A request for a page has no body.")
+        if _is_foreign(request):
+            return _refusal(request, 403, "A page of another site has asked. Open this one by its address.")
+        if request.path == "/":
+            if len(self._app.get_sessions("/")) + len(self._app.unanswered) >= SESSIONS_MAX:
+                full = f"{SESSIONS_MAX} pages follow this run already. Close one, wait 15 seconds and try again."
+                return _refusal(request, 503, full)
+            self._app.unanswered.add(request)
         return self._app.find_handler(request, **kwargs)
+
+
+def _is_foreign(request: Any) -> bool:
+    """Return whether a browser says that a page of another origin has asked, also for a picture; a websocket names its origin alone."""
+    origin, site = request.headers.get("Origin"), request.headers.get("Sec-Fetch-Site", "none")
+    if origin is not None and urlsplit(origin).netloc.lower() != request.host.lower():
+        return True
+    return request.path != "/ws" and site not in ("none", "same-origin")
 
 
 def _refusal(request: Any, status: int, words: str) -> Any:
@@ -373,7 +399,7 @@ async def serve(
     for name in ("bokeh", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # nobody reads them beside a run
     loop, ended, page = IOLoop.current(), asyncio.Event(), Page(history, control=control)
-    app = BokehTornado(
+    app = _Server(
         {"/": Application(FunctionHandler(page.open))},
         extra_websocket_origins=["*"],  # the door has looked
         **LAYOUT["server"],

@@ -1,17 +1,21 @@
 """`import pans`: what a notebook needs, with the same figures as the commands give."""
 
 import re
+import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from automata import automaton_bundle, diamond, random_automaton
+from tree import ROOT
 
 import pans
 from pans.runtime.errors import UsageError
+from pans.runtime.offered import INSTALLS, install
 
 DEVICE = "sim:oled-qcmos?scene=fashion200&seed=1&pace=fast"
 
@@ -63,13 +67,33 @@ def test_without_its_extra_a_name_says_what_to_install_and_help_works(
     missing: tuple[str, ...], name: str, extra: str
 ) -> None:
     hidden = f"import pydoc, sys; sys.modules |= dict.fromkeys({missing}); import pans"
-    code = f"{hidden}; print(*dir(pans)); print(pydoc.render_doc(pans)); from pans import {name}"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    names, told = done.stdout.split("\n", 1)
-    assert {"load_recording", "run"} <= set(names.split()) <= {*pans.__all__} - {name}
-    assert "load_recording" in told
-    assert f"pans.{name} needs the package {missing[0]}, which is not installed" in done.stderr
-    assert f"pip install -c constraints.txt '.[{extra}]'" in done.stderr
+    there = f"from pans import *; print({name!r} in globals(), hasattr(pans, {name!r}), getattr(pans, {name!r}, None))"
+    code = f"{hidden}; {there}; print(*dir(pans)); print(pydoc.render_doc(pans)); "
+    for ask, error in ((f"from pans import {name}", "ImportError"), (f"pans.{name}", "MissingExtraError")):
+        done = subprocess.run([sys.executable, "-c", code + ask], capture_output=True, text=True)
+        found, names, told = done.stdout.split("\n", 2)
+        assert found == "False False None"
+        assert {"load_recording", "run"} <= set(names.split()) <= {*pans.__all__} - {name}
+        assert "load_recording" in told
+        assert f"{error}: pans.{name} needs the package {missing[0]}, which is not installed" in done.stderr
+        assert install(extra) in done.stderr
+
+
+def test_what_is_installed_for_an_extra_are_its_packages() -> None:
+    """Never this package's own name, which is free on the index; limits stand where there is an upper one."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for extra, words in INSTALLS.items():
+        wanted = []
+        for row in extras[extra]:
+            inner = re.fullmatch(r"pans-runtime\[(.*)\]", row)
+            wanted += [one for name in inner[1].split(",") for one in extras[name]] if inner else [row]
+        named = [row if "==" in row or "<" in row else row.partition(">=")[0] for row in wanted]
+        assert shlex.split(words) == named, extra
+
+
+def test_no_remedy_installs_this_package_from_the_index() -> None:
+    files = [file for top in ("runtime", "trainer", "firmware_sim") for file in (ROOT / top).rglob("*.py")]
+    assert not [file for file in files if re.search(r"pip install [^\n]*pans-runtime", file.read_text())]
 
 
 def test_results_are_tables_in_a_notebook_and_frames_of_pandas(tmp_path: Path) -> None:

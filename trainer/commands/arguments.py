@@ -12,8 +12,8 @@ from math import floor
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import say, warn
+from pans.runtime.cli.finding import missing_extra
 from pans.runtime.cli.reading_bar import work_bar
-from pans.runtime.errors import UsageError
 from pans.runtime.images import SIDE_PX, Reading
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.ranges import Range
@@ -92,8 +92,7 @@ def needing(option: str, extra: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        what = f"{option} needs the package {error.name}, which is not installed"
-        raise UsageError(what, remedy=f"pip install 'pans-runtime[{extra}]'") from error
+        raise missing_extra(option, str(error.name), extra) from error
 
 
 def curve(values: Sequence[float], width: int = CURVE_WIDTH) -> str:

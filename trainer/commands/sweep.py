@@ -18,6 +18,7 @@ from typing import Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.cli.option_fields import add_options
 from pans.runtime.errors import UsageError
+from pans.runtime.offered import install
 from pans.runtime.outputs import check_outputs, file_identity
 from pans.runtime.ranges import Range
 from pans.trainer.options import DEFAULT_ALPHA, EPOCHS, EXACT_FEATURES_MAX, Options, check_options, option_names
@@ -126,7 +127,7 @@ def _database(url: str) -> Any:
             warnings.simplefilter("ignore", ExperimentalWarning)  # of heartbeat_interval
             return RDBStorage(url, engine_kwargs={"pool_pre_ping": True}, heartbeat_interval=HEARTBEAT_S)
     except ImportError as error:
-        remedy = "pip install 'pans-runtime[postgres]', or the driver of your database"
+        remedy = f"{install('postgres')}, or the driver of your database"
         raise UsageError(f"--storage {shown_storage(url)}: its driver is not installed", remedy=remedy) from error
     except (SQLAlchemyError, ValueError) as error:
         reason = str(getattr(error, "orig", None) or error).strip().split("\n", 1)[0]

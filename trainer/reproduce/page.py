@@ -21,6 +21,7 @@ import numpy as np
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import say
+from pans.runtime.cli.finding import missing_extra
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import check_outputs, make_folder, replace_file
 from pans.trainer.evaluate.walks import FIRST_OBJECTS as FIRST_OBJECTS
@@ -380,8 +381,7 @@ def write_page(folder: Path, page: Page, made: Made) -> None:
         try:
             draw(folder / f"{page.name}{ending}.png")
         except ModuleNotFoundError as error:
-            words = "the picture needs matplotlib, which is not installed"
-            raise UsageError(words, remedy="pip install 'pans-runtime[plot]'") from error
+            raise missing_extra("the picture", "matplotlib", "plot") from error
 
 
 def generated(folder: Path, page: Page) -> str:

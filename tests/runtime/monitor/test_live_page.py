@@ -6,7 +6,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -140,16 +141,44 @@ def test_what_the_server_lets_through() -> None:
             assert " 404 " in served.ask(f"GET {path}", here)
 
 
+def test_a_page_of_another_site_gets_nothing_and_takes_no_place() -> None:
+    with page() as served:
+        here, asked = f"Host: 127.0.0.1:{served.port}", "Sec-Fetch-Mode: no-cors\r\nSec-Fetch-Dest: image"
+        for site in ("cross-site", "same-site"):
+            for path in ("/", "/static/js/bokeh.min.js"):
+                assert " 403 " in served.ask(f"GET {path}", here, f"Sec-Fetch-Site: {site}", asked)
+        assert " 403 " in served.ask("GET /", here, "Origin: http://elsewhere.example")
+        assert " 200 " not in served.ask("GET /", here, "Content-Length: 5")  # the body never comes
+        for site in ("none", "same-origin"):
+            assert " 200 " in served.ask("GET /", here, f"Sec-Fetch-Site: {site}", "Sec-Fetch-Dest: document")
+
+
+def test_requests_that_come_at_once_get_no_more_places_than_there_are() -> None:
+    with page() as served, ExitStack() as opened:
+        here = f"Host: 127.0.0.1:{served.port}"
+        assert " 200 " in served.ask("GET /", here)
+        clients = [opened.enter_context(socket.create_connection(("127.0.0.1", served.port), 60)) for _ in range(60)]
+        for client in clients:
+            client.sendall(f"GET / HTTP/1.1\r\nConnection: close\r\n{here}\r\n\r\n".encode())
+        codes = [b"".join(iter(partial(client.recv, 1 << 16), b"")).split()[1] for client in clients]
+    assert codes.count(b"200") == live_page.SESSIONS_MAX - 1
+    assert codes.count(b"503") == 60 - codes.count(b"200")
+
+
 def test_who_comes_when_the_page_is_full_is_told() -> None:
     full = range(live_page.SESSIONS_MAX)
-    app = SimpleNamespace(get_sessions=lambda path: full, find_handler=lambda request, **more: "let in")
-    request = SimpleNamespace(
-        path="/", method="GET", host="10.0.0.1", host_name="10.0.0.1", headers={}, connection=None
+    app = SimpleNamespace(
+        get_sessions=lambda path: full, unanswered=set(), find_handler=lambda request, **more: "let in"
     )
+    asked = {"path": "/", "method": "GET", "host": "10.0.0.1", "host_name": "10.0.0.1", "connection": None}
+    request, last = (type("Request", (), asked | {"headers": {}})() for _ in range(2))
     door = live_page._Door(app, local=False)
     assert door.find_handler(request) != "let in"
     full = full[1:]
     assert door.find_handler(request) == "let in"
+    assert door.find_handler(last) != "let in"  # while the one before has no session yet
+    live_page._Server.log_request(app, SimpleNamespace(request=request))  # it was refused after all
+    assert door.find_handler(last) == "let in"
     assert live_page._Door(app, local=True).find_handler(request) != "let in"
 
 

@@ -228,7 +228,7 @@ def test_without_the_frames_extra_the_remedy_is_named(recording: Path, monkeypat
         monkeypatch.setitem(sys.modules, name, None)
         with pytest.raises(UsageError, match=name) as error:
             call()
-        assert error.value.remedy == "pip install 'pans-runtime[frames]'"
+        assert error.value.remedy == "pip install pandas xarray"
 
 
 def test_the_clicks_are_in_order_and_within_the_plan(run_of: Path) -> None:
