@@ -33,12 +33,13 @@ INSTALLS = {
 
 
 def install(extra: str) -> str:
-    """Return the command that installs what an extra needs.
+    """Return the command that installs what an extra, or several with commas between, needs.
 
     >>> install("export")
     'pip install h5py'
     """
-    return f"pip install {INSTALLS[extra]}"
+    packages = dict.fromkeys(word for one in extra.split(",") for word in INSTALLS[one].split(" "))
+    return f"pip install {' '.join(packages)}"
 
 
 def load_offered(point: EntryPoint) -> Any:

@@ -28,7 +28,7 @@ BLOCKED = (
 NEEDS = {  # command line: what it needs, and the extra that has it
     "train s.npz --features 2 -o new.pans": ("torch", "train"),
     "train s.npz --encoder automaton --photons 3 -o new.pans": ("torch", "train"),
-    "sweep s.npz --features 2 --storage new.log": ("optuna", "sweep"),
+    "sweep s.npz --features 2 --storage new.log": ("optuna", "train,sweep"),
     "baseline direct --task s.npz --method cnn": ("torch", "train"),
     "reproduce alpha --collect --cache new -o out": ("torch", "train"),
     "export r.pansrec --format photon-hdf5 -o new.h5": ("h5py", "export"),

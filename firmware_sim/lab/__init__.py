@@ -10,14 +10,16 @@ from __future__ import annotations
 import inspect
 import math
 import time
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.firmware_sim.device.upload import Refused
-from pans.runtime.errors import ConfigError, LinkError, UsageError
+from pans.runtime.errors import ConfigError, LinkError, PansError, UsageError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.offered import load_offered
 from pans.runtime.wire.commands import PatternChunk
@@ -108,6 +110,26 @@ class Objects(Protocol):
     """What brings objects before the detector: `place` brings one by its number since ARM, and returns its class or -1."""
 
     def place(self, number: int) -> int: ...
+
+
+PROTOCOLS: dict[str, Any] = {"projectors": Projector, "counters": Counter, "objects": Objects}
+MEMBERS: dict[
+    str, dict[str, tuple[str, Callable[[Any], bool]]]
+] = {  # by kind: a member that is no method, what it is, and whether it is
+    "projectors": {
+        "shortest_us": (
+            "a number of microseconds, from 0: the shortest light that it can show",
+            lambda us: isinstance(us, Real) and not isinstance(us, bool) and 0 <= us < math.inf,
+        )
+    },
+    "counters": {
+        "clock": (
+            "a pans.firmware_sim.lab.SteeredClock, of the profile's ticks",
+            lambda clock: isinstance(clock, SteeredClock),
+        )
+    },
+    "objects": {},
+}
 
 
 class Apparatus(Hardware):
@@ -225,6 +247,10 @@ def make_adapter(kind: str, text: str, profile: Profile) -> Any:
         remedy = f"known: {', '.join(known)}, or module:Class"
         raise UsageError(f"there is none of the {kind} called {name!r}", remedy=remedy)
     make = load_offered(known.get(name) or EntryPoint(name, name, f"pans.{kind}"))
+    if not callable(make):
+        raise UsageError(
+            f"{name} is a {type(make).__name__}, allowed: a class that is made from the profile and settings"
+        )
     defaults = {one.name: one.default for one in list(inspect.signature(make).parameters.values())[1:]}
     settings = {}
     for pair in pairs:
@@ -234,4 +260,39 @@ def make_adapter(kind: str, text: str, profile: Profile) -> Any:
         except (KeyError, ValueError) as error:
             words = "they are " + ", ".join(f"{one}={usual!r}" for one, usual in defaults.items())
             raise UsageError(f"{name}: {pair!r} is no setting", remedy=words) from error
-    return make(profile, **settings)
+    try:
+        made = make(profile, **settings)
+    except (PansError, OSError, ImportError):  # what is not there, in words of its own
+        raise
+    except Exception as error:
+        what = f"{name}: its class, called with the profile and settings, raised {type(error).__name__}: {error}"
+        raise UsageError(what, remedy="repair the adapter; --debug shows where") from error
+    check_adapter(kind, name, made)
+    return made
+
+
+def check_adapter(kind: str, name: str, adapter: Any) -> None:
+    """Raise UsageError for an adapter of `kind` that lacks a member of its protocol, or has another type of it; it names that member."""
+    protocol = PROTOCOLS[kind]
+    remedy = f"see pans.firmware_sim.lab.{protocol.__name__}, which lists its members"
+    for member, (words, fits) in MEMBERS[kind].items():
+        if not hasattr(adapter, member):
+            raise UsageError(f"{name} has no {member}, needed: {words}", remedy=remedy)
+        if not fits(value := getattr(adapter, member)):
+            found = f"{value!r}" if isinstance(value, int | float | str | None) else f"a {type(value).__name__}"
+            raise UsageError(f"{name}: {member} is {found}, needed: {words}", remedy=remedy)
+    for member, wanted in inspect.getmembers(protocol, inspect.isfunction):
+        if member.startswith("_"):
+            continue
+        names = [*inspect.signature(wanted).parameters][1:]
+        call = f"a method, called as {member}({', '.join(names)})"
+        method = getattr(adapter, member, None)
+        if not callable(method):
+            found = f"has no {member}" if method is None else f"has a {type(method).__name__} as {member}"
+            raise UsageError(f"{name} {found}, needed: {call}", remedy=remedy)
+        try:
+            inspect.signature(method).bind(*names)
+        except ValueError:  # a method of a compiled library tells nothing of itself
+            continue
+        except TypeError as error:
+            raise UsageError(f"{name}: {member} cannot be called so: {error}, needed: {call}", remedy=remedy) from error

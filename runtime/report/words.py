@@ -39,7 +39,7 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
     last = [("fault", fault, "") for fault in facts["faults"]] + [("busy", words, "") for words in _busy_words(facts)]
     last += [("recording", recording, ""), ("report", report, "")]
     simulated = "SIMULATED · " * facts["simulated"]
-    abstained = f", {facts['abstained']} abstained" if facts["abstained"] else ""
+    abstained = f", {facts['abstained']} abstained" if facts.get("abstained") else ""
     head = f"{facts['decisions']} decisions{abstained} ({objects_words(facts)})"
     head = f"{simulated}{facts['verdict']}{_but(facts)}: {head}"
     return "\n".join([head, *lines_of(rows_of(facts, "closing", "flow", "walks") + last)])
@@ -97,7 +97,7 @@ def _further(facts: Facts) -> dict[str, Any]:
         found["text"] |= {
             "objects": objects_words(facts),
             "lit": "" if is_apart else f", illumination {light:.1f}",
-            "every": f"of all {facts['decisions']:,} decisions" if facts["abstained"] else "",
+            "every": f"of all {facts['decisions']:,} decisions" if facts.get("abstained") else "",
             "latency": "not measured in virtual time" if _is_virtual(facts) else latency_words(facts),
             "exposures": exposure_words(facts.get("exposure_timing", {})),
             "realtime": granted or "virtual time: nothing asked for",
@@ -171,7 +171,7 @@ def counted_words(facts: Facts) -> str:
         said = f"of {found:,} decisions about objects that passed alone" if found else ""
         return said + (f", {aborted:,} of them aborted: not right" if aborted else "")
     if "judged" not in facts:
-        return "abstained decisions with a known truth count as not right" if facts["abstained"] else ""
+        return "abstained decisions with a known truth count as not right" if facts.get("abstained") else ""
     known, n = facts["photons_known"], facts[group_of(facts)]
     partly = f"photons: of {known:,} of them, known from their marks" if 0 < known < n else ""
     return "; ".join(filter(None, (group_words(facts), partly)))

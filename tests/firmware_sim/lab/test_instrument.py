@@ -23,10 +23,11 @@ from c_device import needs_compiler
 from commands import json_of
 from tree import ROOT
 
-from pans.firmware_sim.lab import core
+from pans.firmware_sim.lab import check_adapter, core
 from pans.firmware_sim.testing import small_automaton_bundle
 from pans.runtime.bundle.model import load_bundle, write_bundle
-from pans.runtime.errors import ConfigError
+from pans.runtime.cli import main
+from pans.runtime.errors import ConfigError, UsageError
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_command
 
@@ -260,3 +261,72 @@ def test_a_core_that_others_could_have_put_there_is_not_loaded(tmp_path: Path) -
         with pytest.raises(ConfigError, match=r"the C core cannot be kept: .* others can write to it"):
             core.build_library(cache=tmp_path / "shared" / "core")
         open_to_all.chmod(0o700)
+
+
+class OwnProjector:
+    """An adapter as a lab writes it."""
+
+    shortest_us = 10.0
+
+    def __init__(self, profile: Any) -> None:
+        pass
+
+    def load(self, number: int, levels: Any) -> None: ...
+
+    def show(self, number: int, light_us: float) -> None: ...
+
+    def start(self) -> None: ...
+
+    def dark(self) -> None: ...
+
+    def check(self) -> None: ...
+
+
+def test_an_adapter_with_all_its_members_is_taken() -> None:
+    check_adapter("projectors", "mylab:Projector", OwnProjector(None))
+    with pytest.raises(
+        UsageError, match=r"has no clock, needed: a pans\.firmware_sim\.lab\.SteeredClock, of the profile's ticks"
+    ):
+        check_adapter("counters", "mylab:Counter", OwnProjector(None))
+
+
+@pytest.mark.parametrize(
+    ("member", "value", "says"),
+    [
+        ("shortest_us", None, r"shortest_us is None, needed: a number of microseconds"),
+        ("shortest_us", -1.0, r"shortest_us is -1\.0, needed: a number of microseconds, from 0"),
+        ("shortest_us", float("nan"), "shortest_us is nan"),
+        ("shortest_us", "10", "shortest_us is '10'"),
+        ("shortest_us", lambda self: 10, "shortest_us is a method"),
+        ("load", 3, r"has a int as load, needed: a method, called as load\(number, levels\)"),
+        ("dark", None, r"has no dark, needed: a method, called as dark\(\)"),
+        (
+            "show",
+            lambda self, number: None,
+            r"show cannot be called so: .*, needed: a method, called as show\(number, light_us\)",
+        ),
+    ],
+)
+def test_an_adapter_s_own_fault_is_named_with_its_member(member: str, value: Any, says: str) -> None:
+    wrong = type("Wrong", (OwnProjector,), {member: value})(None)
+    with pytest.raises(UsageError, match=f"mylab:Projector.*{says}"):
+        check_adapter("projectors", "mylab:Projector", wrong)
+
+
+def test_a_missing_member_ends_the_instrument_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mylab.py").write_text(
+        "class Projector:\n    def __init__(self, profile): pass\n"
+        "class Broken:\n    def __init__(self, profile): self.nothing\nNUMBER = 3\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    says = {
+        "Projector": "mylab:Projector has no shortest_us, needed: a number of microseconds",
+        "Broken": "mylab:Broken: its class, called with the profile and settings, raised AttributeError",
+        "NUMBER": "mylab:NUMBER is a int, allowed: a class",
+    }
+    for name, words in says.items():
+        asked = ["instrument", "--projector", f"mylab:{name}", "--counter", "tagger", "--profile", "alp-tagger"]
+        assert main(asked) == 2
+        assert words in capsys.readouterr().err
