@@ -385,7 +385,7 @@ def _read(
         grey = _turned(picture.getexif().get(EXIF_ORIENTATION, 1), _grey(path, picture, done), done)
         digest = hashlib.sha256(f"{grey.mode} {grey.size}".encode())
         for _, strip in _strips(grey):
-            digest.update(strip)
+            digest.update(strip.tobytes())
         if target is not None and grey.size != target[::-1]:
             if target[0] * target[1] > pixels_max:
                 raise UsageError(
