@@ -568,7 +568,9 @@ def read_grey_png(data: bytes, where: str) -> NDArray[np.float64]:
         image.DecompressionBombError,
     ) as error:
         remedy = "save it as 8-bit or 16-bit grey, without transparency"
-        raise DamagedFileError(f"{where}: not a readable grey PNG: {error}", remedy=remedy) from error
+        # Pillow names the open file by its address there
+        why = "it is no PNG" if isinstance(error, image.UnidentifiedImageError) else error
+        raise DamagedFileError(f"{where}: not a readable grey PNG: {why}", remedy=remedy) from error
 
 
 def shipped_scene(name: str) -> Path | None:

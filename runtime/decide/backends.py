@@ -172,7 +172,7 @@ class OfferedDecider:
             what = f"{self._whose} fails on the clicks {counts.tolist()}: {type(error).__name__}: {error}"
             raise UsageError(what, remedy="test it on these clicks, or run with another --backend") from error
         if not (0 <= label < self.n_classes and 0.0 <= probability <= 1.0):
-            what = f"{self._whose} answers {(label, probability)} to the clicks {counts.tolist()}"
+            what = f"{self._whose} answers ({label}, {probability}) to the clicks {counts.tolist()}"
             raise UsageError(what, remedy=f"allowed: a label in 0..{self.n_classes - 1} and a probability in 0..1")
         return Verdict(int(label), float(probability))
 

@@ -246,3 +246,11 @@ def test_tiles_larger_than_their_picture_are_counted(tmp_path):
     (tmp_path / "a.tiff").write_bytes(struct.pack("<2sHIH", b"II", 42, 8, len(rows)) + entries + bytes(4))
     with pytest.raises(UsageError, match=r"take 1024 MiB, allowed: 256"):
         read_grey(tmp_path / "a.tiff", 1000)
+
+
+def test_no_message_names_an_open_file_by_its_address(tmp_path):
+    (tmp_path / "a.png").write_bytes(images.PNG_END * 9)
+    for read in (lambda: read_grey(tmp_path / "a.png", 10), lambda: images.read_grey_png(images.PNG_END * 9, "a.png")):
+        with pytest.raises(DamagedFileError) as caught:
+            read()
+        assert "_io." not in str(caught.value)

@@ -122,7 +122,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
         check_classification_targets(named)
         self.classes_, labels = np.unique(named, return_inverse=True)
         if len(self.classes_) < 2:
-            raise ValueError(f"y holds one class, {self.classes_[0]!r}, needed are 2 or more")
+            raise ValueError(f"y holds one class, {self.classes_[0]}, needed are 2 or more")
         self.image_shape_ = _image_shape(self.image_shape or shape, grey.shape[1])
         self.scale_ = float(grey.max()) or 1.0 if self.scale == LARGEST else float(self.scale)
         self.seed_ = int(check_random_state(self.random_state).randint(1 << 31))

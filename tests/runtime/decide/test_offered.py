@@ -61,6 +61,7 @@ def test_it_is_found_by_its_entry_point_and_need_not_know_of_many_objects(offer:
     ("body", "words"),
     [
         ("(99, 1.0)", r"lab.*answers \(99, 1.0\) to the clicks"),
+        ("(__import__('numpy').int64(99), 1.0)", r"lab.*answers \(99, 1.0\) to the clicks"),
         ("(1, float('nan'))", "answers"),
         ("1 // 0", "fails on the clicks .* ZeroDivisionError"),
         ("None", "fails on the clicks .* TypeError"),
