@@ -119,7 +119,7 @@ MEMBERS: dict[
     "projectors": {
         "shortest_us": (
             "a number of microseconds, from 0: the shortest light that it can show",
-            lambda us: isinstance(us, Real) and not isinstance(us, bool) and 0 <= us < math.inf,
+            lambda us: isinstance(us, Real) and not isinstance(us, bool) and 0 <= float(us) < math.inf,
         )
     },
     "counters": {

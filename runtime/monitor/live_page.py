@@ -319,7 +319,7 @@ class _View:
         self._marks.data = page.once("marks", page.marks)
 
 
-class _Server(BokehTornado):
+class _Server(BokehTornado):  # type: ignore[misc]  # Bokeh is untyped here
     """Bokeh's server, with the requests for a page that it has not answered yet: their sessions are on the way, and in no list of Bokeh."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
