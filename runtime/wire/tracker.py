@@ -192,4 +192,4 @@ class StreamTracker:
             return None
         self.counters.gaps += 1
         self.counters.lost_exposures += missing
-        return Gap(self.next_exposure, missing, lost_messages, min(dropped, missing))
+        return Gap(self.next_exposure, missing, lost_messages, dropped)

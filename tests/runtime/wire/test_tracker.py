@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pans.runtime.wire import messages as wire
+from pans.runtime.wire.framing import content_crc
 from pans.runtime.wire.messages import ClickBlock, Frame, FrameDecoder, Mark
-from pans.runtime.wire.schema import RECEIVE_WINDOW
-from pans.runtime.wire.tracker import Gap, StreamTracker
+from pans.runtime.wire.schema import MAX_GAP_EXPOSURES, RECEIVE_WINDOW
+from pans.runtime.wire.tracker import MEMORY_BYTES, Gap, StreamTracker
 
 
 def clicks(seq: int, first: int, n: int, drops: int = 0) -> Frame:
@@ -53,7 +54,13 @@ def frames(first: int, n: int) -> Frame:
             [Gap(4, 4, 1, 0), None, None, None],
             {"repeated": 2},
         ),
-        ([clicks(1, 2, 8)], [None], {"malformed": 1, "exposures": 4}),  # a device that counts backwards
+        # a device that counts backwards, or far ahead
+        ([clicks(1, 2, 8)], [None], {"malformed": 1, "exposures": 4}),
+        ([clicks(1, 3, 1)], [None], {"malformed": 1, "exposures": 4}),
+        ([clicks(1, 4 + MAX_GAP_EXPOSURES, 1)], [Gap(4, MAX_GAP_EXPOSURES, 0, 0)], {"unexplained_drops": 1}),
+        ([clicks(1, 5 + MAX_GAP_EXPOSURES, 1)], [None], {"malformed": 1, "messages": 1}),
+        # each gap counts its own lost messages
+        ([clicks(2, 8, 4), clicks(3, 14, 2, drops=2)], [Gap(4, 4, 1, 0), Gap(12, 2, 0, 2)], {"lost_messages": 1}),
     ],
 )
 def test_what_is_missing_before_a_message(then: list[Frame], gaps: list[Gap | None], counts: dict[str, int]) -> None:
@@ -75,7 +82,8 @@ def test_marks_taken_elsewhere_do_not_hide_a_loss() -> None:
     tracker.accept(mark(6))
     tracker.advance((8, 16), messages=1, exposures=4)  # exposures follow without a gap: what was lost held none
     assert tracker.accept(clicks(8, 20, 4, drops=4))[1] == Gap(16, 4, 0, 4)
-    assert (tracker.counters.exposures, tracker.counters.unexplained_drops) == (16, 0)
+    counters = tracker.counters
+    assert (counters.messages, counters.exposures, counters.unexplained_drops) == (7, 16, 0)
 
 
 @pytest.mark.parametrize(
@@ -86,6 +94,8 @@ def test_marks_taken_elsewhere_do_not_hide_a_loss() -> None:
         (10, 6, Gap(4, 6, 0, 6), 10, 0),
         (6, 5, Gap(4, 2, 0, 2), 6, 1),
         (3, 0, None, 4, 1),  # before what came
+        (4 + MAX_GAP_EXPOSURES, 0, Gap(4, MAX_GAP_EXPOSURES, 0, 0), 4 + MAX_GAP_EXPOSURES, 0),
+        (5 + MAX_GAP_EXPOSURES, 0, None, 4, 1),
     ],
 )
 def test_what_is_missing_at_the_end_is_dropped_or_lost(
@@ -104,6 +114,18 @@ def test_a_message_beyond_the_receive_window_is_malformed(ahead: int, malformed:
     tracker = StreamTracker()
     assert (tracker.accept(clicks(ahead, 0, 1))[0] is None) == bool(malformed)
     assert tracker.counters.malformed == malformed
+
+
+@pytest.mark.parametrize(("ahead", "malformed"), [(2**31 - 1, 1), (2**31, 0)])
+def test_half_of_the_numbers_lie_ahead_and_half_have_passed(ahead: int, malformed: int) -> None:
+    tracker = StreamTracker()
+    assert tracker.accept(clicks(ahead, 0, 1)) == (None, None)
+    assert (tracker.counters.malformed, tracker.counters.repeated) == (malformed, 1 - malformed)
+
+
+def test_a_gap_is_an_event() -> None:
+    facts = {"first_exposure": 4, "exposures": 3, "messages": 2, "dropped_by_device": 1}
+    assert Gap(4, 3, 2, 1).event() == {"kind": "gap", **facts}
 
 
 def changed(frame: Frame) -> Frame:
@@ -125,8 +147,7 @@ def test_a_repeat_with_another_content_differs_from_what_was_taken(first: int) -
     for n, frame in enumerate(frames):
         assert tracker.accept(changed(frame)) == (None, None)
         assert tracker.differs is not None
-        assert tracker.differs.exposure_index == 4 * n
-        assert tracker.differs.found != tracker.differs.expected
+        assert tracker.differs == (4 * n, content_crc(changed(frame)), content_crc(frame))
     counters = tracker.counters
     assert (counters.messages, counters.repeated, counters.repeats_differing) == (6, 12, 6)
 
@@ -142,6 +163,14 @@ def test_what_was_lost_or_is_older_than_the_window_cannot_be_compared() -> None:
     assert (tracker.counters.repeats_unchecked, tracker.counters.repeats_differing) == (4, 1)
 
 
+@pytest.mark.parametrize("seq", [0, 1])
+def test_a_message_that_comes_after_its_loss_was_reported_has_nothing_to_be_compared_with(seq: int) -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(2, 2, 1))
+    tracker.accept(clicks(seq, seq, 1))
+    assert (tracker.counters.repeats_unchecked, tracker.counters.repeats_differing) == (1, 0)
+
+
 def test_another_stream_has_other_messages_under_the_same_numbers() -> None:
     tracker = StreamTracker()
     tracker.accept(clicks(0, 0, 4))
@@ -149,6 +178,21 @@ def test_another_stream_has_other_messages_under_the_same_numbers() -> None:
     tracker.finish(0, 0)
     tracker.accept(changed(clicks(0, 0, 4)))
     assert (tracker.counters.repeats_unchecked, tracker.counters.repeats_differing) == (1, 0)
+
+
+def test_another_stream_begins_anew_and_the_totals_go_on() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 5, 4, drops=5))
+    tracker.accept(mark(2))
+    tracker.restart()
+    assert tracker.position == (0, 0, 0)
+    assert tracker.accept(clicks(0, 3, 4, drops=3))[1] == Gap(0, 3, 0, 3)
+    counters = tracker.counters
+    assert (counters.messages, counters.exposures, counters.gaps, counters.device_drops) == (3, 8, 2, 8)
+    assert (counters.lost_messages, counters.unexplained_drops) == (1, 0)
+    tracker.finish(7, 3)
+    tracker.restart()
+    assert tracker.open
 
 
 @pytest.mark.parametrize("first", [0, 2**32 - 3])
@@ -164,6 +208,25 @@ def test_the_memory_goes_on_in_another_tracker(first: int) -> None:
         assert one.differs == other.differs
         assert (one.differs is None) == (n == 2)
     assert other.counters.repeats_unchecked == 1
+
+
+def test_the_memory_holds_the_window_and_no_more() -> None:
+    one, other = StreamTracker(), StreamTracker()
+    assert one.memory == bytes(MEMORY_BYTES)
+    lost = RECEIVE_WINDOW + 5  # its row holds message 5
+    for seq in range(RECEIVE_WINDOW + 10):
+        if seq != lost:
+            one.accept(clicks(seq, seq, 1, drops=3))
+    other.resume(one.position, one.memory)
+    assert other.position == one.position == (RECEIVE_WINDOW + 10, RECEIVE_WINDOW + 10, 3)
+    assert other.memory == one.memory
+    for seq, checked in ((9, False), (10, True), (lost, False), (lost + 4, True)):
+        for tracker in (one, other):
+            tracker.accept(changed(clicks(seq, seq, 1, drops=3)))
+            assert (tracker.differs is not None) == checked, seq
+    other.resume(one.position)
+    other.accept(changed(clicks(10, 10, 1)))
+    assert other.differs is None  # without a memory nothing is known of earlier messages
 
 
 @pytest.mark.parametrize(
