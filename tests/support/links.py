@@ -35,3 +35,28 @@ class Wrapped:
 
     def write(self, data: bytes) -> None:
         self.link.write(data)
+
+
+class Stepped(Wrapped):
+    """A link in virtual time whose time passes when a test says so; what is written is kept with its time, reads are counted."""
+
+    def __init__(self, link: Any) -> None:
+        super().__init__(link)
+        self.written: list[tuple[int, bytes]] = []
+        self.read_ns: list[int] = []
+        self._arrived = b""
+
+    def read(self, timeout_s: float) -> bytes:
+        self.read_ns.append(self.now_ns())
+        data, self._arrived = self._arrived, b""
+        return data or super().read(timeout_s)
+
+    def write(self, data: bytes) -> None:
+        self.written.append((self.now_ns(), data))
+        super().write(data)
+
+    def let_pass(self, seconds: float) -> None:
+        """Let time pass; what arrives meanwhile is read later."""
+        until_ns = self.now_ns() + round(seconds * 1e9)
+        while (left_ns := until_ns - self.now_ns()) > 0:
+            self._arrived += self.link.read(left_ns / 1e9)

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from links import served
+from links import Stepped, served
 
 from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.ports.serve import SimOptions, build_instrument
+from pans.firmware_sim.ports.serve import SimOptions, build_instrument, open_sim
 from pans.runtime.core.decision import Action
-from pans.runtime.errors import DeviceError, UsageError
+from pans.runtime.errors import DeviceError, LinkError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import open_link
 from pans.runtime.link.connection import Connection
@@ -23,18 +23,20 @@ from pans.runtime.live.gates import MAX_WAITING, GateQueue, SecondInstrument, id
 from pans.runtime.live.journal import Journal
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.messages import Ack, AckStatus, DeviceState, FrameDecoder
-from pans.runtime.wire.session import HostSession
+from pans.runtime.wire.commands import Arm, Gate, pack_command
+from pans.runtime.wire.messages import Ack, AckStatus, DeviceState, FrameDecoder, MessageType, Opcode
+from pans.runtime.wire.session import COMMAND_WINDOW, HostSession
 
 MS = 1_000_000
 PROFILE = load_profile("flow-snspd")
 TICK_HZ = 1_000_000  # one tick per microsecond, device time = host time
 
 
-def clock() -> ClockModel:
-    model = ClockModel(TICK_HZ)
+def clock(tick_hz: int = TICK_HZ) -> ClockModel:
+    model = ClockModel(tick_hz)
     for n in range(8):
-        model.add_probe(n * MS, n * 1000, n * 1000, n * MS)
+        tick = n * tick_hz // 1000
+        model.add_probe(n * MS, tick, tick, n * MS)
     return model
 
 
@@ -109,6 +111,55 @@ def test_what_is_known_to_be_late_is_never_sent() -> None:
     ]
 
 
+def test_a_pulse_at_the_present_tick_is_late_and_one_at_the_next_is_not() -> None:
+    bench = Bench()
+    bench.queue.take([pulse(4, 10_000), pulse(5, 10_001)])
+    assert bench.turn(10_000) == [1]
+    assert bench.failed == [4]
+
+
+def test_a_turn_says_whether_there_is_something_to_send() -> None:
+    bench = Bench()
+    turn = partial(bench.queue.turn, bench.session, bench.clock)
+    assert not turn(10 * MS)
+    bench.queue.take([pulse(4, 9_000)])
+    assert not turn(10 * MS)
+    bench.queue.take([pulse(5, 20_000)])
+    assert turn(10 * MS)
+    assert not turn(10 * MS)
+
+
+def test_two_commands_of_the_window_are_left_for_what_is_no_pulse() -> None:
+    bench = Bench()
+    bench.queue.take([pulse(n, 20_000) for n in range(20)])
+    assert len(bench.turn(10_000)) == COMMAND_WINDOW - 2
+    bench.session.submit(Opcode.RESET)
+    assert len(bench.turn(10_000)) == 1
+    bench.answer(2)
+    assert len(bench.turn(10_000)) == 1
+
+
+def test_a_pulse_carries_its_tick_length_and_output() -> None:
+    bench = Bench()
+    bench.queue.take([Action(4, 20_000, 70, 3)])
+    bench.queue.turn(bench.session, bench.clock, 10 * MS)
+    bench.session.poll(10 * MS)
+    (frame,) = FrameDecoder().feed(bench.session.take_output())
+    command = wire.decode_command(frame.payload)
+    assert (command.opcode, command.body) == (Opcode.GATE, pack_command(Gate(20_000, 70, 3)))
+
+
+def test_a_refusal_of_something_else_is_noted_and_counts_as_no_pulse() -> None:
+    bench = Bench()
+    bench.session.submit(Opcode.SHOW, may_be_refused=True)
+    bench.queue.take([pulse(4, 20_000)])
+    assert bench.turn(10_000) == [1, 2]
+    bench.answer(2, refused=1, text="no such state")
+    bench.turn(10_100)
+    assert (bench.queue.counters.done, bench.queue.counters.refused) == (1, 0)
+    assert bench.kinds() == ["show_refused"]
+
+
 def test_a_refusal_is_told_with_its_decision() -> None:
     bench = Bench()
     bench.queue.take([pulse(4, 20_000), pulse(5, 20_010)])
@@ -131,10 +182,12 @@ def test_pulses_behind_a_stalled_window_expire_and_are_not_sent_afterwards() -> 
     assert bench.failed == list(range(6, 20))
 
 
-def test_the_queue_is_bounded() -> None:
+@pytest.mark.parametrize("more", [0, 1, 5])
+def test_the_queue_is_bounded_and_the_oldest_expire(more: int) -> None:
     bench = Bench()
-    bench.queue.take([pulse(n, 1 << 40) for n in range(MAX_WAITING + 5)])
-    assert bench.failed == list(range(5))
+    bench.queue.take([pulse(n, 1 << 40) for n in range(MAX_WAITING + more)])
+    assert bench.failed == list(range(more))
+    assert (bench.queue.counters.asked, bench.queue.counters.expired) == (MAX_WAITING + more, more)
 
 
 def test_another_session_answers_no_pulse_of_the_last_one() -> None:
@@ -144,6 +197,7 @@ def test_another_session_answers_no_pulse_of_the_last_one() -> None:
     bench.session = HostSession(10)
     bench.turn(10_100)
     assert bench.queue.summary() == {"asked": 1, "done": 0, "refused": 1, "expired": 0}
+    assert [event["text"] for event in bench.journal.events] == ["the link was lost before the device answered"]
 
 
 def test_the_end_of_a_run_leaves_nothing_unknown() -> None:
@@ -154,6 +208,7 @@ def test_the_end_of_a_run_leaves_nothing_unknown() -> None:
     bench.queue.finish(bench.session)
     assert bench.queue.summary() == {"asked": 8, "done": 3, "refused": 3, "expired": 2}
     assert bench.failed == [3, 4, 5, 6, 7]
+    assert bench.kinds() == 3 * ["gate_refused"] + 2 * ["gate_expired"]
 
 
 def test_an_actuator_of_ones_own_gets_host_times() -> None:
@@ -180,6 +235,22 @@ def test_an_actuator_of_ones_own_gets_host_times() -> None:
     assert bench.kinds() == ["fired", "fired", "gate_refused"]
 
 
+def test_an_actuator_is_not_held_back_by_the_devices_command_window_nor_by_its_ticks() -> None:
+    fired: list[tuple[Any, ...]] = []
+    bench = Bench()
+    bench.clock = clock(10 * TICK_HZ)
+    bench.queue.actuator = SimpleNamespace(fire=lambda *words: fired.append(words) or "", close=lambda: None)  # type: ignore[func-returns-value]
+    for _ in range(COMMAND_WINDOW):
+        bench.session.submit(Opcode.RESET)
+    bench.queue.take([pulse(n, 200_000) for n in range(20)])
+    bench.turn(10_000)
+    assert len(fired) == 20
+    assert fired[0][0] / MS == pytest.approx(20.0, abs=0.01)
+    assert fired[0][1:] == (5.0, 0)
+    assert bench.queue.counters.done == 20
+    assert bench.journal.events[0]["tick"] == 200_000
+
+
 def test_unknown_actuators_are_refused_by_name() -> None:
     assert open_actuator("device", PROFILE) is None
     with pytest.raises(UsageError, match="no actuator 'sorter', known: device"):
@@ -190,6 +261,216 @@ def test_unknown_actuators_are_refused_by_name() -> None:
 
 PATIENCE_S = 10.0
 PULSER = load_profile("ideal")
+
+
+class Steps:
+    """A second instrument in virtual time: nothing waits, and what is sent is read with its time."""
+
+    def __init__(self, **options: int) -> None:
+        words = "".join(f"&{name}={value}" for name, value in options.items())
+        self.link = Stepped(open_sim(f"sim:ideal?scene=uniform&pace=fast{words}"))
+        self.device: Any = self.link.link.device
+        self.link.virtual = False
+        self.second = SecondInstrument("sim:ideal", self.link, PULSER)
+        self.link.virtual = True  # no thread reads
+
+    def armed(self) -> "Steps":
+        """After `connect`, and running."""
+        self.second.connect()
+        self.link.let_pass(0.2)
+        self.link.written.clear()
+        return self
+
+    def exchange(self, steps: int, step_s: float = 0.001, *, waits: bool = False) -> None:
+        for _ in range(steps):
+            self.second.exchange(self.link.now_ns(), waits=waits)
+            self.link.let_pass(step_s)
+
+    def sent(self, kind: MessageType) -> list[tuple[int, Any]]:
+        """When, in ms, what of a kind was sent."""
+        return [
+            (at_ns // MS, frame.payload)
+            for at_ns, data in self.link.written
+            for frame in FrameDecoder().feed(data)
+            if frame.type == kind
+        ]
+
+    def commands(self) -> list[Opcode]:
+        return [Opcode(wire.decode_command(body).opcode) for _, body in self.sent(MessageType.COMMAND)]
+
+
+def gaps(times: list[int]) -> set[int]:
+    return set(np.diff(times).tolist())
+
+
+def test_a_second_instrument_is_probed_kept_and_read_at_its_own_pace() -> None:
+    steps = Steps().armed()
+    steps.exchange(2000)
+    assert gaps([at for at, _ in steps.sent(MessageType.PING)]) == {89}
+    grants = steps.sent(MessageType.GRANT)
+    assert {wire.fields("GRANT", body) for _, body in grants} == {(0, 2000)}
+    assert all(480 <= gap <= 520 for gap in gaps([at for at, _ in grants]))
+    assert len(grants) == 4
+    assert steps.device.state is DeviceState.RUNNING
+    steps.link.read_ns.clear()
+    steps.exchange(100)
+    assert gaps([at // MS for at in steps.link.read_ns]) == {20}
+    steps.link.read_ns.clear()
+    steps.link.let_pass(0.02)
+    steps.exchange(50, waits=True)
+    assert gaps([at // MS for at in steps.link.read_ns]) == {1}
+
+
+def test_a_pulse_of_a_second_instrument_leaves_at_once_with_its_own_tick() -> None:
+    steps = Steps(drift_ppm=80).armed()
+    steps.exchange(300)
+    clock = steps.second.connection.known_clock()
+    for length_us, ticks in ((1000.0, round(1000 * clock.tick_hz / 1e6)), (1e-6, 1)):
+        now_ns = steps.link.now_ns()
+        at_ns = now_ns + 50 * MS
+        steps.link.written.clear()
+        command_id, tick, uncertainty_ns = steps.second.submit(at_ns, length_us, 3)
+        ((sent_ms, body),) = steps.sent(MessageType.COMMAND)
+        command = wire.decode_command(body)
+        assert (sent_ms, command.command_id) == (now_ns // MS, command_id)
+        assert command.body == pack_command(Gate(tick, ticks, 3))
+        assert (tick, uncertainty_ns) == (clock.to_tick(at_ns), clock.to_host_ns(tick)[1])
+        reads = len(steps.link.read_ns)
+        steps.exchange(1)
+        assert len(steps.link.read_ns) > reads, "its answer is looked for at once"
+
+
+def test_a_late_pulse_of_a_second_instrument_is_refused_and_the_session_goes_on() -> None:
+    steps = Steps().armed()
+    command_id, *_ = steps.second.submit(steps.link.now_ns() - MS, 10.0, 0)
+    steps.exchange(50)
+    session = steps.second.connection.session
+    assert [(refusal.command_id, refusal.status) for refusal in session.refusals] == [(command_id, AckStatus.TOO_LATE)]
+    assert steps.device.state is DeviceState.RUNNING
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_second_instrument_that_went_dark_is_armed_again_once(stopped: bool) -> None:
+    steps = Steps().armed()
+    if stopped:
+        steps.second.connection.session.submit(Opcode.STOP)
+    else:
+        steps.link.let_pass(3.0)
+        assert steps.device.state is DeviceState.SAFE
+    steps.link.let_pass(1.0)
+    steps.link.written.clear()
+    steps.exchange(1500)
+    assert steps.device.state is DeviceState.RUNNING
+    commands = steps.commands()
+    assert [command for command in commands if command != Opcode.STOP] == [Opcode.RESET, Opcode.ARM]
+    arm = wire.decode_command(steps.sent(MessageType.COMMAND)[-1][1])
+    assert arm.body[8:] == pack_command(Arm(0, 0, 2000))[8:]  # behind the start's tick
+
+
+@pytest.mark.parametrize(("at_ms", "length_ms"), [(300, 100), (-50, 0)])
+def test_a_second_instrument_stops_after_its_last_pulse(at_ms: int, length_ms: int) -> None:
+    steps = Steps().armed()
+    steps.exchange(300)
+    begun_ns = steps.link.now_ns()
+    steps.second.submit(begun_ns + at_ms * MS, length_ms * 1000.0, 1)
+    if at_ms > 0:
+        steps.second.submit(begun_ns + 20 * MS, 1000.0, 1)
+    steps.second.finish()
+    lasted_ms = (steps.link.now_ns() - begun_ns) // MS
+    assert max(at_ms + length_ms, 0) <= lasted_ms < max(at_ms + length_ms, 0) + 30
+    assert steps.device.state is DeviceState.IDLE
+    ends = [pulse.end_tick - pulse.tick for pulse in steps.device.gates.pulses]
+    assert max(ends, default=0) == length_ms * PULSER.clock.tick_hz // 1000
+    assert steps.commands()[-1] == Opcode.STOP
+
+
+def test_a_pulse_too_far_ahead_or_without_an_answer_does_not_hold_up_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    far = Steps().armed()
+    begun_ns = far.link.now_ns()
+    far.second.submit(begun_ns + 5000 * MS, 10.0, 0)
+    far.second.finish()
+    assert 1000 <= (far.link.now_ns() - begun_ns) // MS < 1050
+    assert far.device.state is DeviceState.IDLE
+    deaf = Steps().armed()
+    begun_ns = deaf.link.now_ns()
+    monkeypatch.setattr(deaf.link, "write", lambda data: None)
+    deaf.second.submit(begun_ns + 10 * MS, 10.0, 0)
+    deaf.second.finish()
+    assert 2000 <= (deaf.link.now_ns() - begun_ns) // MS < 2050
+
+
+def test_what_a_second_instrument_is_before_and_after_it_is_connected() -> None:
+    steps = Steps()
+    assert steps.second.facts() == {"url": "sim:ideal"}
+    with pytest.raises(LinkError, match="sim:ideal: the second instrument is not connected"):
+        _ = steps.second.connection
+    steps.armed()
+    steps.second.worst_uncertainty_ns = 2500
+    facts, fit = steps.second.facts(), steps.second.connection.known_clock().fit
+    assert fit is not None
+    assert (facts["simulated"], facts["drift_ppm"]) == (True, fit.drift_ppm)
+    assert (facts["uncertainty_us"], facts["worst_uncertainty_us"]) == (fit.uncertainty_ns / 1000, 2.5)
+    assert facts["serial"] == steps.second.connection.session.welcome.facts.get("serial")  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("connected", [False, True])
+def test_a_second_instrument_that_is_closed_closes_its_link(connected: bool) -> None:
+    steps = Steps()
+    if connected:
+        steps.armed()
+    steps.second.close()
+    with pytest.raises(LinkError, match="closed"):
+        steps.link.link.read(0.0)
+
+
+def test_a_link_in_virtual_time_is_closed_when_it_is_refused() -> None:
+    link = open_sim("sim:ideal?scene=uniform&pace=fast")
+    with pytest.raises(UsageError, match="real time"):
+        SecondInstrument("sim:ideal", link, PULSER)
+    with pytest.raises(LinkError, match="closed"):
+        link.read(0.0)
+
+
+@pytest.mark.parametrize("wrong", [{"mode": "parallel"}, {"tick_hz": 999}])
+def test_mode_and_clock_of_a_second_instrument_are_those_of_its_profile(wrong: dict[str, Any]) -> None:
+    steps = Steps()
+    mode, tick_hz = wrong.get("mode", PULSER.mode), wrong.get("tick_hz", PULSER.clock.tick_hz)
+    profile: Any = SimpleNamespace(name="mine", mode=mode, clock=SimpleNamespace(tick_hz=tick_hz))
+    steps.second.profile = profile
+    with pytest.raises(DeviceError, match=f"mine says {mode} at {tick_hz}"):
+        steps.second.connect()
+
+
+def test_the_worst_uncertainty_of_a_pulse_is_that_of_both_clocks() -> None:
+    steps, bench = Steps().armed(), Bench()
+    bench.queue.second = steps.second
+    bench.clock = clock()
+    now_us = steps.link.now_ns() // 1000
+    bench.queue.take([pulse(1, now_us + 10_000_000), pulse(2, now_us + 50_000)])
+    bench.queue.turn(bench.session, bench.clock, steps.link.now_ns())
+    far, near = bench.journal.events
+    assert [event["kind"] for event in (far, near)] == 2 * ["gate_sent"]
+    for event in (far, near):
+        own_ns = steps.second.connection.known_clock().to_host_ns(event["second_tick"])[1]
+        assert event["uncertainty_us"] == (bench.clock.to_host_ns(event["tick"])[1] + own_ns) / 1000
+    assert steps.second.worst_uncertainty_ns == far["uncertainty_us"] * 1000 > near["uncertainty_us"] * 1000
+
+
+def test_a_second_instrument_that_is_lost_is_noted_once_with_what_it_had_not_answered() -> None:
+    steps, bench = Steps().armed(), Bench()
+    bench.queue.second = steps.second
+    now_ns = steps.link.now_ns()
+    bench.queue.take([pulse(1, now_ns // 1000 + 50_000)])
+    bench.queue.turn(bench.session, bench.clock, now_ns)
+    steps.link.link.close()
+    bench.queue.take([pulse(2, now_ns // 1000 + 60_000)])
+    for _ in range(3):
+        bench.queue.turn(bench.session, bench.clock, now_ns + 30 * MS)
+    bench.queue.finish(bench.session)
+    assert bench.kinds() == ["gate_sent", "actuator_lost", "gate_refused", "gate_refused"]
+    assert bench.queue.summary() == {"asked": 2, "done": 0, "refused": 2, "expired": 0}
+
+
 TCP = "tcp:127.0.0.1:0"
 
 
@@ -324,21 +605,6 @@ def test_a_second_instrument_that_is_gone_does_not_end_the_run(serve_one: Callab
     lab.close()
 
 
-def test_a_lease_that_ran_out_is_taken_again(serve_one: Callable[..., Served], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pans.runtime.live.gates.LEASE_MS", 100)
-    other = serve_one("ideal")
-    second = connected(other)
-    until = time.perf_counter_ns() + round(PATIENCE_S * 1e9)
-    while other.device.state is not DeviceState.SAFE and time.perf_counter_ns() < until:
-        time.sleep(0.01)  # the host is away
-    assert other.device.state is DeviceState.SAFE
-    while other.device.state is not DeviceState.RUNNING and time.perf_counter_ns() < until:
-        second.exchange(time.perf_counter_ns(), waits=True)
-    assert other.device.state is DeviceState.RUNNING
-    second.finish()
-    second.close()
-
-
 def test_another_instrument_than_the_profile_says_is_refused(serve_one: Callable[..., Served]) -> None:
     other = serve_one("ideal")
     second = open_actuator(other.url, load_profile("flow-snspd"))
@@ -353,5 +619,6 @@ def test_every_profile_carries_the_idle_plan(name: str) -> None:
     profile = load_profile(name)
     plan = idle_plan(profile)
     assert plan.dark_slots_per_cycle == plan.slots_per_cycle == 1
-    assert plan.cycle_us >= 1e6 - 1
-    assert profile.exposure.min_us * 0.99 <= plan.exposure_us <= profile.exposure.max_us * 1.01
+    assert plan.cycle_us == pytest.approx(1e6, abs=1)
+    tick_us = 1e6 / profile.clock.tick_hz
+    assert plan.exposure_us == pytest.approx(max(profile.exposure.min_us, tick_us), abs=tick_us)
