@@ -3,9 +3,11 @@
 import gc
 import os
 import signal
+import stat
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -70,6 +72,21 @@ def _runs_uncompiled(item: pytest.Item) -> bool:
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     return Path(os.environ["PANS_DATA"])
+
+
+@pytest.fixture
+def synced(monkeypatch: pytest.MonkeyPatch) -> dict[int, Any]:
+    """What survives a power cut, by inode: the size of each file and the names in each folder when it was last synced."""
+    found: dict[int, Any] = {}
+    fsync = os.fsync
+
+    def note(handle: int) -> None:
+        fsync(handle)
+        facts = os.fstat(handle)
+        found[facts.st_ino] = set(os.listdir(handle)) if stat.S_ISDIR(facts.st_mode) else facts.st_size
+
+    monkeypatch.setattr(os, "fsync", note)
+    return found
 
 
 @pytest.fixture

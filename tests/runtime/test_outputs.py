@@ -3,6 +3,7 @@
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -42,6 +43,11 @@ def test_an_existing_file_stays_unless_forced(old: Path) -> None:
     write_file(old, b"new", force=True)
     assert old.read_bytes() == b"new"
     assert listing(old.parent) == ["old"]
+
+
+def test_a_file_survives_a_power_cut_and_then_its_name_does(tmp_path: Path, synced: dict[int, Any]) -> None:
+    write_file(path := tmp_path / "new", b"precious")
+    assert list(synced.items()) == [(path.stat().st_ino, 8), (tmp_path.stat().st_ino, {"new"})]
 
 
 def test_an_output_is_never_an_input_by_whatever_name(old: Path) -> None:

@@ -49,6 +49,11 @@ def dark(seed: int, n: int, rates: float | NDArray[np.float64], channels: int = 
     return np.random.default_rng(seed).random((n, channels)) < rates
 
 
+def test_dark_clicks_beyond_those_known_have_a_probability_and_fewer_have_none() -> None:
+    found = extra_probability(np.array([0.02, 0.01, 0.005, 1.0]), np.array([0.01, 0.01, 0.01, 0.5]))
+    assert found.tolist() == pytest.approx([0.01 / 0.99, 0.0, 0.0, 1.0])
+
+
 def test_nothing_wrong() -> None:
     health, found = found_states(dark(1, 200_000, 0.01))
     assert (found, health.present, health.rates().tolist()) == ([], [], [0.01] * N)

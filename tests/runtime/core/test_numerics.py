@@ -80,6 +80,14 @@ def test_counters_and_ticks_far_beyond_32_bits() -> None:
     assert streamed.core.windows.tallies[0] == 2**40 + n_features
 
 
+@pytest.mark.parametrize("floor", [1e-6, 1e-30])
+def test_evidence_against_a_class_is_bounded(floor: float) -> None:
+    """So that no single decision excludes a class whatever others say."""
+    scores = np.array([[0.0, 3.0, 1000.0]], np.float32)
+    assert log_evidence(scores, floor).tolist() == [[np.log(floor), np.log(floor), 0.0]]
+    assert log_evidence(scores).min() == np.log(1e-6)
+
+
 def test_log_evidence_against_mpmath() -> None:
     """Worst error over scores up to 700 apart: 2 units in the last place of the largest logarithm."""
     rng = np.random.default_rng(1)

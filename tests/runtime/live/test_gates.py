@@ -367,6 +367,34 @@ def test_a_second_instrument_that_went_dark_is_armed_again_once(stopped: bool) -
     assert arm.body[8:] == pack_command(Arm(0, 0, 2000))[8:]  # behind the start's tick
 
 
+def without_status(data: bytes) -> bytes:
+    frames = [part + b"\0" for part in data.split(b"\0")[:-1]]
+    return b"".join(one for one in frames if FrameDecoder().feed(one)[0].type != MessageType.STATUS)
+
+
+@pytest.mark.parametrize(("hears", "arms_at_s"), [(True, [0, 1, 2]), (False, [0])])
+def test_a_second_instrument_is_armed_again_once_a_second_and_not_while_it_has_not_answered(
+    hears: bool, arms_at_s: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No STATUS comes any more, so that it seems to be SAFE for ever."""
+    steps = Steps().armed()
+    steps.link.let_pass(3.5)
+    steps.second.connection.pump(0.0)
+    read = steps.link.read
+    monkeypatch.setattr(steps.link, "read", lambda timeout_s: without_status(read(timeout_s)))
+    if not hears:
+        monkeypatch.setattr(steps.link.link, "write", lambda data: None)
+    steps.link.written.clear()
+    begun_ms = steps.link.now_ns() // MS
+    steps.exchange(2500)
+    arms: dict[int, int] = {}
+    for at_ms, body in steps.sent(MessageType.COMMAND):
+        command = wire.decode_command(body)
+        if command.opcode == Opcode.ARM:
+            arms.setdefault(command.command_id, at_ms - begun_ms)
+    assert [round(at_ms / 1000) for at_ms in arms.values()] == arms_at_s
+
+
 @pytest.mark.parametrize(("at_ms", "length_ms"), [(300, 100), (-50, 0)])
 def test_a_second_instrument_stops_after_its_last_pulse(at_ms: int, length_ms: int) -> None:
     steps = Steps().armed()

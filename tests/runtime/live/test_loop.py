@@ -30,6 +30,7 @@ from pans.runtime.live import RunOptions, RunResult, run_live
 from pans.runtime.live.dark_run import DarkRun
 from pans.runtime.live.journal import Journal
 from pans.runtime.record import read_recording
+from pans.runtime.wire import messages as wire
 
 PROFILE = load_profile("oled-qcmos")
 
@@ -111,6 +112,30 @@ def test_virtual_runs_are_the_same_bit_for_bit(bundle: Bundle, scene: Path) -> N
 def test_a_silent_device_is_a_link_error(bundle: Bundle, scene: Path) -> None:
     with pytest.raises(LinkError, match="no WELCOME"):
         run(bundle, scene, wrap=lambda link: Disturbed(link, lambda data: b""))
+
+
+class OldNews(Wrapped):
+    """A link on which a STATUS of an earlier run comes after ARM: the device was SAFE, then."""
+
+    old = b""
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        for frame in wire.FrameDecoder().feed(data):
+            if frame.type == wire.MessageType.COMMAND and wire.decode_command(frame.payload).opcode == wire.Opcode.ARM:
+                safe = wire.Status(wire.DeviceState.SAFE, wire.StateReason.LEASE_EXPIRED, 0, 0, 1, 99)
+                self.old = wire.encode_status(safe, frame.session)
+
+    def read(self, timeout_s: float) -> bytes:
+        data, self.old = super().read(timeout_s) + self.old, b""
+        return data
+
+
+def test_a_status_from_before_the_run_is_no_news_of_it(bundle: Bundle, scene: Path) -> None:
+    links: list[Any] = []
+    result = run(bundle, scene, wrap=lambda link: links.append(OldNews(link)) or links[0])  # type: ignore[func-returns-value]
+    assert (result.ended, result.tally.decisions) == ("completed", 18)
+    assert links[0].old == b""
 
 
 @pytest.mark.parametrize("why", ["the device fell silent", "the cable was pulled"])

@@ -76,6 +76,15 @@ def test_a_batch_goes_on_where_it_was(lab: Path, monkeypatch: pytest.MonkeyPatch
     assert pans(*words, "--force", code=1)["run"] == 3
 
 
+def test_every_result_survives_a_power_cut(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans, synced: dict[int, Any]
+) -> None:
+    in_this_process(monkeypatch)
+    pans("batch info", "*/grid.pans", "-o", "r.jsonl", code=1)
+    facts = Path("r.jsonl").stat()
+    assert synced[facts.st_ino] == facts.st_size > 0
+
+
 def test_an_interrupted_batch_keeps_what_is_done(lab: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans) -> None:
     ran = in_this_process(monkeypatch)
     answer = batch.run_item

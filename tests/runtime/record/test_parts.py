@@ -115,6 +115,13 @@ def test_parts_replay_under_faults(tmp_path: Path, faults: str) -> None:
     check_clicks(tmp_path, tmp_path)
 
 
+def test_a_part_that_ends_within_the_last_object_leaves_the_rest_of_it_to_the_next(tmp_path: Path) -> None:
+    result = record_small(tmp_path / "run.pansrec", 8, limits=PartLimits(1))
+    assert result.tally.decisions == 8
+    assert check_each(tmp_path) == list(range(8))
+    assert {read_recording(path).n_decisions for path in parts_in(tmp_path)} <= {0, 1, 2}
+
+
 def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> None:
     result = record_small(tmp_path / "run.pansrec", 3000, limits=PartLimits(48 * KIB, 192 * KIB))
     paths = parts_in(tmp_path)

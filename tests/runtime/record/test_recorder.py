@@ -7,6 +7,7 @@ import os
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -261,6 +262,24 @@ def test_what_is_flushed_is_readable_while_recording_goes_on(tmp_path: Path) -> 
         recorder.add_decisions(decisions(1, 1))
         recorder.sync()
         assert facts(read_recording(path)) == (2, False)
+
+
+def test_beginning_syncs_and_end_survive_a_power_cut(tmp_path: Path, synced: dict[int, Any]) -> None:
+    path = tmp_path / "a.pansrec"
+
+    def survives() -> bool:
+        return bool(synced[path.stat().st_ino] == path.stat().st_size)
+
+    with Recorder(path, HEADER) as recorder:
+        assert survives()
+        assert synced[tmp_path.stat().st_ino] == {"a.pansrec"}
+        recorder.add_decisions(decisions(1))
+        recorder.flush()
+        assert not survives()
+        recorder.sync()
+        assert survives()
+        recorder.close({})
+    assert survives()
 
 
 def test_decisions_are_in_the_file_before_what_acts_upon_them(tmp_path: Path) -> None:

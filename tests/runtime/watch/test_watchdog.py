@@ -14,7 +14,7 @@ import pytest
 from host_process import HANGS, HANGS_AFTER, lit_instrument, start_host, until
 
 from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_TIMING
-from pans.runtime.record import read_recording
+from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.replaying import replay
 from pans.runtime.report.verify import verify_file
 from pans.runtime.watch import watchdog
@@ -100,6 +100,33 @@ def test_systemd_hears_of_the_loop_alone(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.delenv("NOTIFY_SOCKET")
     assert Notifier.of_environment() is None
     assert os.environ["WATCHDOG_USEC"]
+
+
+class Gone(BaseException):
+    """The process has ended."""
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_what_is_buffered_is_written_unless_the_run_hangs_while_it_records(
+    inside: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recorder that is entered twice would tear its own blocks."""
+
+    def gone(code: int) -> None:
+        raise Gone(code)
+
+    monkeypatch.setattr(os, "_exit", gone)
+    flushed, notes = list[str](), list[str]()
+    dog = watchdog.Watchdog(continuous=False)
+    dog.recorder, dog.note = SimpleNamespace(flush=lambda: flushed.append("flushed")), notes.append  # type: ignore[assignment]
+    with Recorder(tmp_path / "a.pansrec", {}) as recorder, pytest.raises(Gone, match=str(EXIT_INTERRUPTED)):
+        if inside:
+            recorder.watch_write = lambda *times: dog._end_process(signal.SIGTERM)
+            recorder.add_event({"kind": "gap"})
+            recorder.flush()
+        dog._end_process(signal.SIGTERM)
+    assert flushed == ([] if inside else ["flushed"])
+    assert "the run did not end by itself; it was in" in notes[0]
 
 
 def test_a_run_whose_light_is_off_has_time_to_close_its_links_and_files(monkeypatch: pytest.MonkeyPatch) -> None:
