@@ -3,11 +3,12 @@
 from fractions import Fraction
 from math import comb
 
-import mpmath
 import pytest
 
 from pans.runtime import intervals
 from pans.runtime.instrument.channel_health import dark_report
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ Click probabilities have theirs in instrument/test_click_law.py, intervals in te
 decide/test_mlp.py, folding of dead channels in trainer/export/test_writer.py.
 """
 
-import mpmath
 import numpy as np
 import pytest
 from heads import head_bundle, random_layers
@@ -19,6 +18,8 @@ from pans.runtime.kernel.calls import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import FrameBlock
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 
 
 def test_winning_probabilities() -> None:

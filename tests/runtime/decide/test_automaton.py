@@ -3,7 +3,6 @@
 from dataclasses import replace
 from fractions import Fraction
 
-import mpmath
 import naive_automaton as naive
 import numpy as np
 import pytest
@@ -17,6 +16,8 @@ from pans.runtime.decide.expectation import ExpectedWalk, expected_walk
 from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.instrument.click_law import ClickLaw, CountLaw, click_probability
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 
 AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=9), random_automaton(2, slots=5, channels=2)]
 

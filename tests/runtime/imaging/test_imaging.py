@@ -2,7 +2,6 @@
 
 import math
 
-import mpmath
 import numpy as np
 import pytest
 from naive_imaging import rendered
@@ -25,6 +24,8 @@ from pans.runtime.imaging import (
     tolerance_of,
 )
 from pans.runtime.imaging.sampling import _gathered, _tail
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 
 SHAPE = (9, 12)
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-import mpmath
 import numpy as np
 import pytest
 from hypothesis import given
@@ -26,6 +25,8 @@ from pans.runtime.instrument.click_law import (
     survival_coefficients,
 )
 from pans.runtime.instrument.profile import load_profile
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 
 MEANS = [0.0, 1e-30, 1e-7, 0.3, 1.0, 2.0, 50.0, 700.0, 1e4, 1e6]
 LAWS = [

@@ -1,6 +1,5 @@
 """The dark-count watch against loops over exposures, its run lengths against exact linear algebra and against the definition."""
 
-import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,6 +15,8 @@ from pans.runtime.instrument.cusum import (
     run_length,
     whole_steps,
 )
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 
 
 def exact_run_length(rate: float, click: int, silent: int, threshold: int) -> float:

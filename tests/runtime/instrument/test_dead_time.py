@@ -3,7 +3,6 @@
 import itertools
 from dataclasses import replace
 
-import mpmath
 import numpy as np
 import pytest
 from naive_dead_time import share_of_clicks
@@ -13,6 +12,8 @@ from pans.runtime.instrument.click_law import ClickLaw, both_chances, click_law,
 from pans.runtime.instrument.dead_time import DeadTime, counted_mean
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light
 from pans.runtime.instrument.profile import load_profile
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 
 MEANS = (0.2, 1.0, 3.0, 8.0, 20.0)
 KINDS = tuple(itertools.product((False, True), repeat=2))  # free-running, paralysable

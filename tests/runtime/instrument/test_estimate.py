@@ -7,7 +7,6 @@ from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
-import mpmath
 import numpy as np
 import pytest
 
@@ -21,6 +20,8 @@ from pans.runtime.instrument.profile import load_profile
 from pans.runtime.intervals import CHI2_95
 from pans.runtime.report.file_facts import file_facts
 from pans.runtime.report.verify import verify_file
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 
 PLAIN, NOISY = CountModel(ClickLaw()), CountModel(ClickLaw(0.0, 0.2, 0.84))
 

@@ -7,7 +7,6 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from mpmath import mp, mpf
 from trainings import assert_slope, random_machine
 
 from pans.runtime.instrument.click_law import ClickLaw, CountLaw, click_probability, count_chances
@@ -15,6 +14,9 @@ from pans.trainer.adaptive.machine import WRONG, Aim, Bits, Sight, as_bits, back
 from pans.trainer.adaptive.objects import Block
 from pans.trainer.adaptive.outcomes import WordLaw, channels_of, clicks_of, readings
 from pans.trainer.adaptive.tune import figures
+
+mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
+mp, mpf = mpmath.mp, mpmath.mpf
 
 NOISY = ClickLaw(dark_per_exposure=0.02, read_noise_e=0.3, threshold_e=0.5)
 CLICKS = (ClickLaw(), ClickLaw(0.05), NOISY)

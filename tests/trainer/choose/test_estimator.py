@@ -11,16 +11,17 @@ import torch
 import pans
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PlanError, UsageError
-from pans.trainer.choose import estimator
-from pans.trainer.choose.estimator import PansClassifier
 
-sklearn = pytest.importorskip("sklearn")
+sklearn = pytest.importorskip("sklearn", reason="needs the sklearn extra")
 from sklearn.base import clone  # noqa: E402
 from sklearn.datasets import load_digits  # noqa: E402
 from sklearn.model_selection import GridSearchCV, cross_val_score  # noqa: E402
 from sklearn.pipeline import make_pipeline  # noqa: E402
 from sklearn.preprocessing import MinMaxScaler  # noqa: E402
 from sklearn.utils.estimator_checks import parametrize_with_checks  # noqa: E402
+
+from pans.trainer.choose import estimator  # noqa: E402
+from pans.trainer.choose.estimator import PansClassifier  # noqa: E402
 
 SMALL: dict[str, Any] = {"features": 5, "photons": 4, "epochs": 1, "random_state": 0}
 FIXED = SMALL | {"encoder": "active", "features": 3, "options": {"hidden": 8}}

@@ -9,7 +9,6 @@ import pytest
 
 from pans.runtime.bundle.optics import phase_mask, scatter
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
-from pans.trainer.reproduce.passive import release_intensity
 from pans.trainer.tasks import registry as tasks
 from pans.trainer.tasks.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
 from pans.trainer.tasks.registry import FIBRE_TASKS, fold_tasks, load_task, path_from, remembered_task, task_names
@@ -275,6 +274,9 @@ def test_the_speckle_by_the_definition_of_the_fourier_transform():
 
 
 def test_the_release_normalises_every_batch_by_itself():
+    pytest.importorskip("torch", reason="needs the train extra")
+    from pans.trainer.reproduce.passive import release_intensity
+
     batched = release_intensity(IMAGES, batch=2)
     for start in (0, 2, 4):
         assert np.allclose(batched[start : start + 2], release_intensity(IMAGES[start : start + 2]))
