@@ -4,9 +4,11 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -96,16 +98,18 @@ def test_decisions_are_on_record_before_the_first_pulse_leaves() -> None:
     assert told == ["flushed", "sent", "sent"]
 
 
-def test_what_is_known_to_be_late_is_never_sent() -> None:
+@pytest.mark.parametrize("ticks_per_us", [1, 10])
+def test_what_is_known_to_be_late_is_never_sent(ticks_per_us: int) -> None:
     bench = Bench()
-    bench.queue.take([pulse(4, 9_000), pulse(5, 20_000)])
+    bench.clock = clock(ticks_per_us * TICK_HZ)
+    bench.queue.take([pulse(4, 9_000 * ticks_per_us), pulse(5, 20_000 * ticks_per_us)])
     assert bench.turn(10_000) == [1]
     assert bench.failed == [4]
     assert bench.journal.events == [
         {
             "kind": "gate_expired",
             "decision": 4,
-            "tick": 9_000,
+            "tick": 9_000 * ticks_per_us,
             "text": "its time passed 1000 us before it could be sent",
         }
     ]
@@ -168,7 +172,7 @@ def test_a_refusal_is_told_with_its_decision() -> None:
     bench.turn(10_100)
     assert bench.queue.summary() == {"asked": 2, "done": 1, "refused": 1, "expired": 0}
     assert bench.failed == [4]
-    assert bench.journal.events[0]["text"] == "gate tick has passed"
+    assert [event["text"] for event in bench.journal.events] == ["gate tick has passed"]
 
 
 def test_pulses_behind_a_stalled_window_expire_and_are_not_sent_afterwards() -> None:
@@ -484,18 +488,48 @@ def test_the_worst_uncertainty_of_a_pulse_is_that_of_both_clocks() -> None:
     assert steps.second.worst_uncertainty_ns == far["uncertainty_us"] * 1000 > near["uncertainty_us"] * 1000
 
 
-def test_a_second_instrument_that_is_lost_is_noted_once_with_what_it_had_not_answered() -> None:
+def test_the_queue_looks_soon_for_the_answer_of_a_second_instrument_and_has_it_at_the_end() -> None:
+    steps, bench = Steps().armed(), Bench()
+    bench.queue.second = steps.second
+
+    def turns(n: int) -> set[int]:
+        steps.link.read_ns.clear()
+        for _ in range(n):
+            bench.queue.turn(bench.session, bench.clock, steps.link.now_ns())
+            steps.link.let_pass(0.001)
+        return gaps([at_ns // MS for at_ns in steps.link.read_ns])
+
+    turns(30)
+    assert turns(100) == {20}
+    write = steps.link.write
+    steps.link.write = lambda data: None  # type: ignore[method-assign]
+    bench.queue.take([pulse(1, steps.link.now_ns() // 1000 + 1_500_000)])
+    turns(2)
+    assert turns(50) == {1}
+    steps.link.write = write  # type: ignore[method-assign]
+    bench.queue.finish(bench.session)
+    assert bench.queue.summary() == {"asked": 1, "done": 1, "refused": 0, "expired": 0}
+
+
+@pytest.mark.parametrize("refuses", [False, True])
+def test_a_second_instrument_that_is_lost_is_noted_once_with_what_it_had_not_answered(
+    refuses: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     steps, bench = Steps().armed(), Bench()
     bench.queue.second = steps.second
     now_ns = steps.link.now_ns()
     bench.queue.take([pulse(1, now_ns // 1000 + 50_000)])
     bench.queue.turn(bench.session, bench.clock, now_ns)
-    steps.link.link.close()
+    if refuses:
+        monkeypatch.setattr(steps.second, "exchange", Mock(side_effect=DeviceError("it refused ARM")))
+    else:
+        steps.link.link.close()
     bench.queue.take([pulse(2, now_ns // 1000 + 60_000)])
     for _ in range(3):
         bench.queue.turn(bench.session, bench.clock, now_ns + 30 * MS)
     bench.queue.finish(bench.session)
     assert bench.kinds() == ["gate_sent", "actuator_lost", "gate_refused", "gate_refused"]
+    assert all(event["text"].startswith("the second instrument was lost") for event in bench.journal.events[2:])
     assert bench.queue.summary() == {"asked": 2, "done": 0, "refused": 2, "expired": 0}
 
 
@@ -650,3 +684,13 @@ def test_every_profile_carries_the_idle_plan(name: str) -> None:
     assert plan.cycle_us == pytest.approx(1e6, abs=1)
     tick_us = 1e6 / profile.clock.tick_hz
     assert plan.exposure_us == pytest.approx(max(profile.exposure.min_us, tick_us), abs=tick_us)
+
+
+@pytest.mark.parametrize(("min_us", "exposure_us", "cycle_us"), [(1e-9, 1e-1, 1e6), (2e6, 2e6, 2e6)])
+def test_the_idle_plan_has_an_exposure_of_at_least_a_tick_and_a_cycle_that_holds_it(
+    min_us: float, exposure_us: float, cycle_us: float
+) -> None:
+    exposure = replace(PULSER.exposure, min_us=min_us, max_us=1e7)
+    plan = idle_plan(replace(PULSER, exposure=exposure))
+    assert plan.exposure_us == pytest.approx(max(exposure_us, 1e6 / PULSER.clock.tick_hz), rel=0.5)
+    assert cycle_us <= plan.cycle_us < 2 * cycle_us
