@@ -107,6 +107,7 @@ def test_results_are_tables_in_a_notebook_and_frames_of_pandas(tmp_path: Path) -
     assert ("as recorded", "yes") in cells(again._repr_html_())
     assert "as_recorded=True" in repr(again)
 
+    pytest.importorskip("torch", reason="needs the train extra")
     images = np.zeros((60, 4, 4), np.uint8)
     images[::2, :, :2] = images[1::2, :, 2:] = 255
     said: list[float] = []
@@ -149,5 +150,7 @@ def test_no_clicks_and_true_or_false_are_clicks_too() -> None:
 
 
 def test_every_public_name_is_listed_before_it_is_used() -> None:
+    pytest.importorskip("torch", reason="needs the train extra")
+    pytest.importorskip("sklearn", reason="needs the sklearn extra")
     code = "import pans; print(sorted({*pans.__all__} - {*dir(pans)}), all(hasattr(pans, name) for name in dir(pans)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[] True\n"

@@ -22,6 +22,7 @@ def card_of(thing: Any) -> str:
 
 
 def test_a_bundle_shows_its_facts_and_patterns() -> None:
+    pytest.importorskip("PIL", reason="needs the train extra")
     bundle = pans.load_bundle("fashion10")
     assert "10 of 28 x 28" in card_of(bundle)
     found = re.findall(r"base64,([^\"]+)", bundle._repr_html_())

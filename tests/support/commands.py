@@ -38,6 +38,7 @@ class Pans:
 
 
 def page_of(path: Path, tmp_path: Path) -> str:
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
     assert main(["report", str(path), "-o", str(tmp_path / "page.html")]) == 0
     assert [entry.name for entry in tmp_path.iterdir() if "html" in entry.name] == ["page.html"]
     return (tmp_path / "page.html").read_text()

@@ -115,6 +115,7 @@ def test_a_difference_is_that_of_the_figures_beside_it(runs: Path, tmp_path: Pat
         assert row["difference_is"] in ("a - b", "a / b")
         if row["difference_is"] == "a - b" and row["difference"] is not None:
             assert row["difference"] == pytest.approx(row["first"] - row["second"])
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
     assert main([*words, "-o", str(tmp_path / "page.html")]) == 0
     for said in (pans.said().out, words_of((tmp_path / "page.html").read_text())):
         assert "The verdicts differ: A PASS, B FAIL." in said
@@ -122,6 +123,7 @@ def test_a_difference_is_that_of_the_figures_beside_it(runs: Path, tmp_path: Pat
 
 
 def test_a_cut_recording_is_compared_as_far_as_it_goes(runs: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
     data = (runs / "a" / "run.pansrec").read_bytes()
     (tmp_path / "cut.pansrec").write_bytes(data[: int(0.8 * len(data))])
     assert main(["compare", str(tmp_path / "cut.pansrec"), str(runs / "b"), "-o", str(tmp_path / "page.html")]) == 0
@@ -141,6 +143,7 @@ def test_what_is_no_run_is_refused(what: str, runs: Path, tmp_path: Path) -> Non
 
 
 def test_the_page_in_a_browser(runs: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
     place = tmp_path / "page.html"
     assert main(["compare", str(runs / "a"), str(runs / "c"), "-o", str(place)]) == 0
     page = place.read_text()

@@ -17,8 +17,6 @@ from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.instrument.click_law import ClickLaw, CountLaw, click_probability
 
-mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
-
 AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=9), random_automaton(2, slots=5, channels=2)]
 
 
@@ -128,6 +126,7 @@ def test_chances_keep_their_digits_however_small(brightness: float) -> None:
     automaton = random_automaton(6, slots=7, width=3)
     patterns, objects = of_objects(automaton, n=2)
     found = expected_walk(automaton, patterns, objects, ClickLaw(), photons_per_level=brightness)
+    mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
     with mpmath.workdps(60):
         for i, seen in enumerate(objects):
             light = light_of(automaton, patterns @ seen, brightness)

@@ -424,6 +424,7 @@ def test_the_process_that_draws_loads_little_before_it_names_its_port() -> None:
 
 
 def test_a_drawing_process_that_dies_ends_no_run(capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("bokeh", reason="needs the ui extra")
     shown = Monitor(panel=False, address="127.0.0.1:0", lines=False)
     with shown:
         with urllib.request.urlopen(shown.url, timeout=60) as answer:

@@ -91,6 +91,8 @@ def test_rows_of_mixed_kinds_become_columns(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("way", ["npy", "png"])
 def test_a_bundle_comes_back_from_its_exports(way: str, tmp_path: Path, pans: Pans) -> None:
+    if way == "png":
+        pytest.importorskip("PIL", reason="needs the train extra")
     out, head = tmp_path / "parts", tmp_path / "head.onnx"
     facts = pans("export", FASHION, "--format", way, "-o", out)
     pans("export", FASHION, "--format", "onnx", "-o", head)
@@ -142,6 +144,7 @@ def test_png_pictures_are_those_of_other_readers(dtype: Any, tmp_path: Path) -> 
 
 
 def test_damaged_pictures_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("PIL", reason="needs the train extra")
     data = grey_png(np.zeros((4, 4), np.uint8))
     wrong = [b"", b"GIF89a", data[:-1], data[:20], data[:40] + b"x" + data[41:], data.replace(b"IHDR", b"JHDR")]
     wrong += [data[:cut] for cut in range(8, len(data), 3)]

@@ -79,14 +79,16 @@ def test_a_silent_device_ends_the_handshake_loudly() -> None:
             session.poll(step * 100 * MS)
 
 
-def test_another_schema_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("name", "value", "words"), [("SCHEMA", 0xBAD, "0x00000bad"), ("PROTOCOL_VERSION", 9, "protocol 9")]
+)
+def test_another_schema_or_protocol_is_named(name: str, value: int, words: str) -> None:
     session = HostSession(NONCE)
     session.start(0)
-    real = wire.SCHEMA
-    monkeypatch.setattr(wire, "SCHEMA", 0xBAD)
-    foreign = wire.encode_welcome({}, NONCE)
-    monkeypatch.setattr(wire, "SCHEMA", real)
-    with pytest.raises(DeviceError, match="0x00000bad"):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wire, name, value)
+        foreign = wire.encode_welcome({}, NONCE)
+    with pytest.raises(DeviceError, match=words):
         deliver(session, foreign)
 
 
@@ -200,6 +202,23 @@ def test_a_probe_counts_once_and_by_its_own_echo() -> None:
         deliver(session, wire.encode_pong(wire.Pong(*pong, 3, 4), NONCE), now_ns)
     assert [arrival_ns for _, arrival_ns in session.pongs] == [55]
     assert (session.counters.implausible, session.counters.stale_probes) == (1, 2)
+
+
+def test_of_64_probes_without_an_answer_the_oldest_is_given_up() -> None:
+    session = opened()
+    for number in range(1, session_module.MAX_PROBES + 2):
+        session.probe(number)
+    for number in (1, 2, session_module.MAX_PROBES + 1):
+        deliver(session, wire.encode_pong(wire.Pong(number, number, 3, 4), NONCE))
+    assert [pong.probe_id for pong, _ in session.pongs] == [2, session_module.MAX_PROBES + 1]
+    assert session.counters.stale_probes == 1
+
+
+def test_a_device_is_heard_by_frames_of_this_session_alone() -> None:
+    session = opened()
+    for nonce, now_ns in ((NONCE, 5), (NONCE + 1, 7)):
+        deliver(session, wire.encode_status(wire.Status(0, 0, 0, 0, 0, 0), nonce), now_ns)
+    assert session.heard_ns == 5
 
 
 def test_a_device_that_restarts_within_the_session_is_told() -> None:
