@@ -67,6 +67,28 @@ def test_the_uncertainty_grows_away_from_the_probes_by_three_sigma_of_the_rate(n
     assert far - near == pytest.approx((3 * sigma + WANDER) * ticks * NS_PER_TICK, rel=1e-3)
 
 
+@pytest.mark.parametrize(("held_ns", "possible"), [(0, True), (1_002_990, True), (1_003_010, False)])
+def test_a_device_holds_a_probe_no_longer_than_it_was_away(held_ns: int, possible: bool) -> None:
+    """Away for 1 ms, but for a rate error of 0.1 % and two readings of 1 us."""
+    assert ClockModel(1_000_000_000).can_be(0, 77, 77 + held_ns, 1_000_000) is possible
+
+
+def test_the_middle_of_both_ways_is_one_instant_and_no_round_trip_is_negative() -> None:
+    model = ClockModel(TICK_HZ)
+    model.add_probe(0, 1000, 5000, 600_000)  # the device held it from 100 to 500 us
+    assert model.history()[0].tolist() == (300_000, 3000, 200_000)
+    assert model.to_host_ns(3000)[0] == 300_000
+    model.add_probe(600_000, 6000, 6011, 601_000)  # a tick is coarser than a short trip
+    assert model.history()[1]["round_trip_ns"] == 0
+
+
+def test_the_bound_is_that_of_the_probe_that_gives_the_tightest() -> None:
+    model = ClockModel(TICK_HZ)
+    for step in range(40):
+        probed(model, step, late_ns=0 if step < 39 else 60_000)
+    assert model.to_host_ns(39 * PROBE_EVERY_NS // NS_PER_TICK)[1] < 60_000  # half the trip of the latest is 80 us
+
+
 def test_before_the_first_probe_nothing_is_converted() -> None:
     with pytest.raises(LinkError, match="no probe"):
         ClockModel(TICK_HZ).to_host_ns(0)
