@@ -169,6 +169,27 @@ def test_a_command_that_may_be_refused_is_reported_and_the_session_goes_on() -> 
     assert session.in_flight == 0
 
 
+def test_an_arm_that_came_too_late_may_be_sent_again() -> None:
+    session = opened(1, Opcode.ARM)
+    with pytest.raises(session_module.ArmTooLate, match="gone"):
+        acknowledge(session, 1, 1, wire.AckStatus.TOO_LATE, "gone")
+
+
+@pytest.mark.parametrize(("oldest", "waits"), [(2, [2, 3]), (3, [3]), (4, [])])
+def test_commands_that_a_kernel_sent_wait_as_its_own_do(oldest: int, waits: list[int]) -> None:
+    session = opened(2, Opcode.GATE, may_be_refused=True)
+    session.take_output()
+    frame = wire.encode_command(3, Opcode.SHOW, b"", NONCE)
+    session.continue_from(oldest, 5 * MS, [(3, frame)], Opcode.SHOW)
+    assert session.window == (4, oldest, 5 * MS, False)
+    for now_ms, repeated in ((254, []), (255, waits)):
+        session.poll(now_ms * MS)
+        assert ids(sent(session)) == repeated
+    if 3 in waits:
+        acknowledge(session, 3, 3, wire.AckStatus.TOO_LATE, "gone")
+        assert session.refusals[-1].opcode == Opcode.SHOW
+
+
 def test_a_lost_command_is_repeated_at_once_but_not_for_every_answer() -> None:
     session = opened(3)
     session.take_output()
