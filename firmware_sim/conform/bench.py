@@ -6,6 +6,7 @@ What a check waits for and does not get is `Broken`.
 from __future__ import annotations
 
 import secrets
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -13,7 +14,8 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, announced_channels, announced_counts, pack_command
-from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MalformedMessage, MessageType, Opcode
+from pans.runtime.wire.framing import unpack_body
+from pans.runtime.wire.messages import AckStatus, DeviceState, MalformedMessage, MessageType, Opcode
 from pans.runtime.wire.session import STREAM_TYPES
 
 from .plans import Layout, layout_for
@@ -24,6 +26,7 @@ QUIET_S = 0.3  # in which an answer that must not come would have come
 STEP_S = 0.02
 LEASE_MS = 4000
 KEPT_PIECES = 60  # of a rule's bytes, the first and the last of them
+KEPT_BODIES = 400  # messages: more than a short run has
 WINDOW = 1 << 20
 
 
@@ -62,7 +65,7 @@ class Bench:
         self.pieces: list[Piece] = []
         self.inbox: list[Heard] = []
         self._decoder = wire.FrameDecoder()
-        self.raw_clicks: list[bytes] = []  # payloads of the latest CLICKS, as they came
+        self.bodies: deque[bytes] = deque(maxlen=KEPT_BODIES)  # header and payload of the latest messages, as they came
         self._probe = 0
 
     # -- bytes ---------------------------------------------------------------------------------------------------------
@@ -79,10 +82,12 @@ class Bench:
             data = self.link.read(min(STEP_S, left_ns * 1e-9))
             if data:
                 self._note("<", data)
-                for frame in self._decoder.feed(data):
-                    self._take(frame)
+                for spans in self._decoder.bodies(data):
+                    for first, stop in spans.tolist():
+                        self._take(self._decoder.buffer[first:stop].tobytes())
 
-    def _take(self, frame: Frame) -> None:
+    def _take(self, body: bytes) -> None:
+        frame = unpack_body(body)
         if frame.session != self.session:
             return
         if frame.flags or frame.type not in DECODE:
@@ -97,8 +102,7 @@ class Bench:
             )
         if frame.type == MessageType.EXPOSED and "exposed_schema" not in self.facts:
             raise Broken("EXPOSED came from a device that does not announce it")
-        if frame.type == MessageType.CLICKS:
-            self.raw_clicks = [*self.raw_clicks[-KEPT_PIECES:], frame.payload]
+        self.bodies.append(body)
         self.inbox.append(Heard(frame.type, message, self.link.now_ns()))
 
     def _note(self, way: str, data: bytes) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import random
+import struct
 import zlib
 
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import cobs_encode, encode_frame
-from pans.runtime.wire.messages import MessageType
-from pans.runtime.wire.schema import HEADER
+from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode
+from pans.runtime.wire.schema import HEADER, MESSAGES
 
 from .bench import QUIET_S, Bench
 from .rules import need, rule
@@ -16,6 +17,8 @@ from .rules import need, rule
 GOLDEN = bytes.fromhex("020101010A44332211C4AF642E010101058FAF0A2A00")
 GOLDEN_SESSION = 0x11223344
 UNKNOWN_OPCODE = 0xEE
+LONGEST_BYTES = 12_332  # of a payload that a host may have to send: LOAD_PLAN of 1024 slots
+SHORT_RUN = 4  # cycles
 
 
 @rule(
@@ -126,6 +129,42 @@ def wrong_length(bench: Bench) -> None:
     bench.listen(0.1)
     need(not bench.inbox or all(one.kind == MessageType.STATUS for one in bench.inbox), "one of them was answered")
     bench.ping()
+    bench.upload(bench.layout())
+    bench.arm(0, ahead_s=0.05)
+    bench.send(encode_frame(MessageType.GRANT, b"\1" * 9, bench.session))  # would open the window
+    bench.until_state(DeviceState.RUNNING)
+    bench.listen(0.1)
+    need(not bench.stream(), "a GRANT of 9 bytes was taken")
+    bench.done(Opcode.STOP)
+
+
+@rule("1.13", "Reserved fields are sent as 0.")
+def reserved_fields(bench: Bench) -> None:
+    bench.bodies.clear()
+    bench.open()
+    bench.ping()
+    bench.refused(AckStatus.UNKNOWN_OPCODE, UNKNOWN_OPCODE, b"", "an unknown opcode")
+    bench.run(bench.layout(), SHORT_RUN)
+    for body in bench.bodies:
+        name = MessageType(body[0]).name
+        for place in (*_reserved("HEADER", 0), *_reserved(name, HEADER.size)):
+            need(body[place] == 0, f"byte {place} of {name}, which is reserved, is {body[place]:#04x}")
+
+
+@rule("1.14", "A payload of 12 332 bytes, the longest that any host may have to send, is taken.")
+def longest(bench: Bench) -> None:
+    body = bytes(LONGEST_BYTES - wire.STRUCTS["COMMAND"].size)
+    bench.refused(AckStatus.UNKNOWN_OPCODE, UNKNOWN_OPCODE, body, "an unknown opcode with a long body")
+
+
+def _reserved(name: str, at: int) -> list[int]:
+    """Places of the reserved bytes of a layout that begins at `at`."""
+    found: list[int] = []
+    for field in MESSAGES.get(name, ()):
+        size = struct.calcsize(f"<{field.code}")
+        found += range(at, at + size) if field.name == "reserved" else ()
+        at += size
+    return found
 
 
 def _framed(body: bytes, start: int) -> bytes:

@@ -14,12 +14,14 @@ from pans.runtime.wire.commands import (
     PatternChunk,
     pack_command,
 )
-from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode, encode_command
+from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, DeviceState, MessageType, Opcode, encode_command
 
 from .bench import Bench
+from .plans import Layout
 from .rules import NotTried, need, rule
 
 UNKNOWN_OPCODE = 0xEE
+MOST_GATES = 300  # that a check asks for until the list is full
 COMMANDS = 260  # past the first byte of their number
 MANY_COMMANDS, AT_ONCE = 65_800, 8  # past 16 bits of their number; as many unacknowledged as a host may have
 MALFORMED, RANGE, STATE, LATE = AckStatus.MALFORMED, AckStatus.OUT_OF_RANGE, AckStatus.WRONG_STATE, AckStatus.TOO_LATE
@@ -78,7 +80,7 @@ def unknown_opcode(bench: Bench) -> None:
 def malformed(bench: Bench) -> None:
     layout = bench.layout()
     plan = pack_command(layout.chunk())
-    head = struct.pack("<HHII", 0, 0, 0, 4)
+    head, long_head = (struct.pack("<HHII", 0, 0, 0, pixels) for pixels in (4, 2 * MAX_PIXELS_PER_CHUNK))
     for opcode, body, what in (
         (Opcode.STOP, b"x", "STOP with a body"),
         (Opcode.RESET, b"xy", "RESET with a body"),
@@ -87,6 +89,7 @@ def malformed(bench: Bench) -> None:
         (Opcode.LOAD_PATTERN, head, "LOAD_PATTERN without levels"),
         (Opcode.LOAD_PATTERN, head + b"\0", "LOAD_PATTERN with half a level"),
         (Opcode.LOAD_PATTERN, head + bytes(10), "LOAD_PATTERN with five levels of four"),
+        (Opcode.LOAD_PATTERN, long_head + bytes(2 * MAX_PIXELS_PER_CHUNK + 2), "LOAD_PATTERN with 4097 levels"),
         (Opcode.LOAD_PLAN, plan[:20], "a part of LOAD_PLAN's header"),
         (Opcode.LOAD_PLAN, plan[:36], "LOAD_PLAN without slots"),
         (Opcode.LOAD_PLAN, plan[:-5], "LOAD_PLAN with a part of a slot"),
@@ -107,6 +110,10 @@ def pattern_ranges(bench: Bench) -> None:
         refuse(facts["pattern_memory"], 0, 4, 0, "a pattern beyond the memory")
     if facts["levels"] <= 0xFFFF:
         refuse(0, 0, 4, facts["levels"], "a level that the projector does not have")
+        wrong = next(bench.layout().patterns())
+        wrong.levels[-1] = facts["levels"]
+        what = "a last level that the projector does not have"
+        bench.refused(RANGE, Opcode.LOAD_PATTERN, pack_command(wrong), what)
     if facts["pattern_pixels"] < 0xFFFFFFFF:
         refuse(0, 0, facts["pattern_pixels"] + 1, 0, "a pattern of too many pixels")
     refuse(1 if facts["pattern_memory"] > 1 else 0, 2, 4, 0, "a piece that continues nothing")
@@ -121,6 +128,7 @@ def plan_ranges(bench: Bench) -> None:
         {"mode": 1 - layout.mode},
         {"n_patterns": 0},
         {"exposure_ticks": 0},
+        {"slot_period_ticks": 0},
         {"cycle_ticks": 0},
         {"cycle_ticks": (1 << 48) + 1},
         {"block_exposures": 0},
@@ -136,13 +144,58 @@ def plan_ranges(bench: Bench) -> None:
     moved = good.slots.copy()
     moved["offset_ticks"] += np.uint64(good.cycle_ticks) - moved["offset_ticks"][-1]
     bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(good._replace(slots=moved)), "a slot at the end of the cycle")
+    # The gap from the last slot to the first of the next cycle is one tick shorter than an exposure.
+    short = int(good.slots["offset_ticks"][-1]) + good.exposure_ticks - 1
+    what = "the last exposure of a cycle over the first of the next"
+    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(good._replace(cycle_ticks=short)), what)
+    turned = good.slots.copy()
+    turned["offset_ticks"][:2] = good.slots["offset_ticks"][1::-1]
+    bench.refused(
+        RANGE, Opcode.LOAD_PLAN, pack_command(good._replace(slots=turned)), "slots that are not in order of time"
+    )
     for field, value in (("offset_ticks", good.cycle_ticks), ("pattern", good.n_patterns)):
         slots = good.slots.copy()
         slots[field][-1] = value
         bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(good._replace(slots=slots)), f"a slot with {field} {value}")
 
 
-@rule("4.9", "ARM without a complete plan, or with a pattern of it missing or incomplete, is refused with 4.")
+@rule("4.22", "Pieces of a plan come in order and repeat its header, else 3; first slot 0 starts over.")
+def plan_pieces(bench: Bench) -> None:
+    whole = bench.layout(shown=(DARK_PATTERN,) * 4).chunk()
+
+    def piece(first: int, stop: int, **header: Any) -> bytes:
+        return pack_command(whole._replace(first_slot=first, slots=whole.slots[first:stop], **header))
+
+    bench.upload(bench.layout())
+    bench.done(Opcode.LOAD_PLAN, piece(0, 2))
+    bench.refused(RANGE, Opcode.LOAD_PLAN, piece(3, 4), "a piece of a plan behind a gap")
+    bench.refused(RANGE, Opcode.LOAD_PLAN, piece(1, 2), "a piece of a plan over an earlier one")
+    for header in (
+        {"n_slots": whole.n_slots + 1},
+        {"exposure_ticks": whole.exposure_ticks + 1},
+        {"slot_period_ticks": whole.slot_period_ticks + 1},
+        {"cycle_ticks": whole.cycle_ticks + 1},
+        {"block_exposures": whole.block_exposures + 1},
+        {"cycles_per_object": whole.cycles_per_object + 1},
+        *([{"n_patterns": whole.n_patterns - 1}] if whole.n_patterns > 1 else []),
+    ):
+        bench.refused(
+            RANGE, Opcode.LOAD_PLAN, piece(2, 4, **header), f"a piece of a plan with another header, {header}"
+        )
+    bench.arm_refused("ARM with two of four slots")
+    bench.done(Opcode.LOAD_PLAN, piece(2, 4))
+    bench.arm(1, ahead_s=20.0, lease_ms=20_000)
+    bench.done(Opcode.STOP)
+    bench.done(Opcode.LOAD_PLAN, piece(0, 1))
+    bench.done(Opcode.LOAD_PLAN, piece(0, 2))
+    bench.done(Opcode.LOAD_PLAN, piece(2, 4))
+
+
+@rule(
+    "4.9",
+    "ARM without a complete plan, or with a pattern of it missing or incomplete, is refused with 4; with patterns of several sizes, or "
+    "when they are loaded, with 3.",
+)
 def arm_without_plan(bench: Bench) -> None:
     bench.open()
     body = pack_command(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
@@ -164,6 +217,35 @@ def arm_without_plan(bench: Bench) -> None:
                 bench.done(Opcode.LOAD_PATTERN, pack_command(PatternChunk(number, 0, layout.pixels, levels)))
             body = pack_command(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
             bench.refused(STATE, Opcode.ARM, body, f"ARM with {kept} of {layout.pixels} pixels of pattern {number}")
+    _refused_plan(bench, layout)
+    if layout.n_patterns > 1 and layout.pixels > 1:
+        _two_sizes(bench, layout)
+
+
+def _refused_plan(bench: Bench, layout: Layout) -> None:
+    """A plan that was refused because of its last slot is no plan."""
+    bench.open()
+    bench.upload(layout)
+    good = layout.chunk()
+    overlapping = good._replace(cycle_ticks=int(good.slots["offset_ticks"][-1]) + 1)
+    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_command(overlapping), "a plan whose cycles overlap")
+    bench.arm_refused("ARM with a plan that was refused")
+
+
+def _two_sizes(bench: Bench, layout: Layout) -> None:
+    bench.open()
+    bench.upload(layout)
+    half = PatternChunk(1, 0, layout.pixels // 2, np.zeros(min(layout.pixels // 2, MAX_PIXELS_PER_CHUNK), np.uint16))
+    opcode, body = Opcode.LOAD_PATTERN, pack_command(half)
+    ack = bench.command(opcode, body)
+    if ack.refuses(bench.last_id):
+        need(ack.status == RANGE, f"a second pattern of another size was refused with {ack.status}, expected {RANGE}")
+    else:
+        for first in range(MAX_PIXELS_PER_CHUNK, half.n_pixels, MAX_PIXELS_PER_CHUNK):
+            rest = np.zeros(min(half.n_pixels - first, MAX_PIXELS_PER_CHUNK), np.uint16)
+            bench.done(opcode, pack_command(half._replace(first_pixel=first, levels=rest)))
+        body = pack_command(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
+        bench.refused(RANGE, Opcode.ARM, body, "ARM with patterns of two sizes")
 
 
 @rule(
@@ -199,7 +281,8 @@ def uploads_need_idle(bench: Bench) -> None:
 
 @rule(
     "4.12",
-    "GATE is refused with 4 in IDLE, with 5 when its tick has passed, with 3 outside its ranges, and carried out ahead of time.",
+    "GATE is refused with 4 in IDLE, with 5 when its tick has passed, with 3 outside its ranges or when the list is full, with 2 of "
+    "another length, and carried out ahead of time.",
 )
 def gates(bench: Bench) -> None:
     now, hz = bench.ping().tx_tick, bench.facts["tick_hz"]
@@ -211,28 +294,42 @@ def gates(bench: Bench) -> None:
         (LATE, Gate(now, 100, 0), "GATE for a tick that has passed"),
         (RANGE, Gate(now + hz, 0, 0), "GATE for 0 ticks"),
         (RANGE, Gate(now + hz, 1, 0xFFFF), "GATE of output 65535"),
+        (RANGE, Gate(1 << 63, 1, 0), "GATE at tick 2^63"),
     ):
         bench.refused(status, Opcode.GATE, pack_command(gate), what)
+    body = pack_command(Gate(now + 15 * hz, hz // 1000, 0))
+    for wrong in (body[:-1], body + b"\0"):
+        bench.refused(MALFORMED, Opcode.GATE, wrong, f"GATE of {len(wrong)} bytes")
     if bench.facts.get("gate_channels", 1):
         bench.done(Opcode.GATE, pack_command(Gate(bench.ping().tx_tick + hz // 2, hz // 1000, 0)))
+        for count in range(1, MOST_GATES):
+            ack = bench.command(Opcode.GATE, body)
+            if ack.refuses(bench.last_id):
+                need(
+                    ack.status == RANGE,
+                    f"GATE {count} more was refused with {ack.status} ({ack.text}), expected {RANGE}",
+                )
+                break
     bench.done(Opcode.STOP)
 
 
 @rule("4.13", "Pieces of a pattern come in order, and first pixel 0 starts over.")
 def pattern_pieces(bench: Bench) -> None:
-    whole = min(bench.facts["pattern_pixels"], 6)
-    if whole < 4:
-        raise NotTried("patterns of less than four pixels")
+    whole = bench.layout().pixels
+    if whole < 6:
+        raise NotTried("patterns of less than six pixels")
 
     def piece(first: int, count: int) -> bytes:
         return pack_command(PatternChunk(0, first, whole, np.zeros(count, np.uint16)))
 
     bench.done(Opcode.LOAD_PATTERN, piece(0, 2))
     bench.refused(RANGE, Opcode.LOAD_PATTERN, piece(3, 1), "a piece behind a gap")
+    other = pack_command(PatternChunk(0, 2, whole - 1, np.zeros(1, np.uint16)))
+    bench.refused(RANGE, Opcode.LOAD_PATTERN, other, "a piece of a pattern with another number of pixels")
     bench.done(Opcode.LOAD_PATTERN, piece(2, 2))
     bench.done(Opcode.LOAD_PATTERN, piece(0, 2))
     bench.refused(RANGE, Opcode.LOAD_PATTERN, piece(4, 1), "a piece behind a gap, after first pixel 0")
-    bench.done(Opcode.LOAD_PATTERN, piece(2, whole - 2))
+    bench.done(Opcode.LOAD_PATTERN, piece(2, min(whole - 2, MAX_PIXELS_PER_CHUNK)))
 
 
 @rule("4.21", "Command ids go on past 65 536.", long=True)

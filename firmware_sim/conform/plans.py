@@ -43,6 +43,9 @@ class Layout:
     cycles_per_object: int = 2
     pause_ticks: int = 0  # before the last slot of a cycle, so that the spacing breaks there
     seamless: bool = False  # the next cycle follows without a pause
+    lead_ticks: int = (
+        0  # from the start of a cycle to its first exposure; at most the half spacing that a cycle has to spare
+    )
 
     @property
     def n_slots(self) -> int:
@@ -58,7 +61,7 @@ class Layout:
     @property
     def offsets(self) -> list[int]:
         """Ticks from the start of a cycle to that of each of its exposures."""
-        begins = [slot * self.period_ticks for slot in range(self.n_slots)]
+        begins = [self.lead_ticks + slot * self.period_ticks for slot in range(self.n_slots)]
         return [*begins[:-1], begins[-1] + self.pause_ticks]
 
     def seconds(self, cycles: int) -> float:

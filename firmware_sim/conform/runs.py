@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from pans.runtime.wire.messages import (
+    NO_OBJECT,
     ClickBlock,
     DeviceState,
     FrameBlock,
@@ -12,19 +13,27 @@ from pans.runtime.wire.messages import (
     MessageType,
     Opcode,
     StateReason,
+    encode_hello,
 )
+from pans.runtime.wire.schema import HEADER
 
 from .bench import LEASE_MS, PATIENCE_S, STEP_S, Bench
 from .plans import Layout
 from .rules import NotTried, beyond_the_link, need, rule
 
 CYCLES = 12
+WIDTHS = 17, 33, 65  # channels whose word is of the next size
 MESSAGES = 100  # cycles of three exposures: past the first byte of their numbers
+OBJECTS = 300  # past the first byte of their numbers
 LONG = 65_800  # exposures: past 16 bits of their numbers
 LONG_RATE_HZ = 4000  # a host in Python takes so many blocks
 LONG_S = 900.0  # that a check is willing to wait for so many
 AHEAD = 4096  # messages that the window is ahead of the latest one, as a host grants them
+HOUR_MS, ODD_LEASE_MS = 3_600_000, 70_789  # the longest lease; one of no whole seconds, beyond 32 bits of microseconds
 LEASE_SLACK_S = 0.05  # of a device that looks at its lease between other things
+HALF = 1 << 31
+ASKED = 20  # STATUS
+FIRST = 10  # messages that may leave before the window shuts
 MOST_TO_FILL = 3000  # messages that a check is willing to wait for
 
 
@@ -70,25 +79,36 @@ def states(bench: Bench) -> None:
     need(idle.lease_left_ms == 0, f"{idle.lease_left_ms} ms of a lease left in IDLE")
 
 
-@rule("4.15", "STOP ends a run: IDLE with reason 2, from ARMED and from RUNNING.")
+@rule("4.15", "STOP and RESET end a run: IDLE with reason 2, from ARMED and from RUNNING.")
 def stop(bench: Bench) -> None:
     bench.upload(bench.layout())
-    for state in (DeviceState.ARMED, DeviceState.RUNNING):
-        bench.arm(0)
-        bench.until_state(state)
-        bench.done(Opcode.STOP)
-        status = bench.until_state(DeviceState.IDLE)
-        need(status.reason == StateReason.STOPPED, f"reason {status.reason} after STOP, expected 2")
-        bench.inbox.clear()
+    for opcode in (Opcode.STOP, Opcode.RESET):
+        for state in (DeviceState.ARMED, DeviceState.RUNNING):
+            bench.arm(0)
+            bench.until_state(state)
+            bench.done(opcode)
+            status = bench.until_state(DeviceState.IDLE)
+            need(status.reason == StateReason.STOPPED, f"reason {status.reason} after {opcode.name}, expected 2")
+            bench.inbox.clear()
 
 
-@rule("4.16", "A lease that nobody renews ends in SAFE (reason 3), when it has run out and not before.")
+@rule(
+    "4.16",
+    "A lease that nobody renews ends in SAFE (reason 3), from ARMED and from RUNNING, when it has run out and not before.",
+)
 def lease(bench: Bench) -> None:
     bench.upload(bench.layout())
     bench.grant()
+    for ahead_s in (0.1, 20.0):
+        runs_out(bench, ahead_s)
+        bench.done(Opcode.RESET)
+
+
+def runs_out(bench: Bench, ahead_s: float) -> None:
+    """Arm for a start so far ahead, and let the lease run out."""
     lease_ms, hz = 400, bench.facts["tick_hz"]
     before = bench.ping().tx_tick
-    bench.arm(0, lease_ms=lease_ms, ahead_s=0.1)
+    bench.arm(0, lease_ms=lease_ms, ahead_s=ahead_s)
     after = bench.ping().rx_tick
     status = bench.until_state(DeviceState.SAFE)
     need(status.reason == StateReason.LEASE_EXPIRED, f"SAFE with reason {status.reason}, expected 3")
@@ -120,12 +140,15 @@ def renewal(bench: Bench) -> None:
     need(late <= LEASE_SLACK_S, f"SAFE {late * 1000:.0f} ms after the lease, which a GRANT with 0 must not renew")
 
 
-@rule("4.18", "SAFE outlives the session and takes no ARM; RESET leaves it, and uploads are kept.")
+@rule(
+    "4.18", "SAFE outlives the session and takes no ARM; STOP changes nothing, RESET leaves it, and uploads are kept."
+)
 def safe(bench: Bench) -> None:
     bench.upload(bench.layout())
     bench.arm(0, lease_ms=150, ahead_s=0.05)
     bench.until_state(DeviceState.SAFE)
-    bench.arm_refused("ARM in SAFE")
+    bench.done(Opcode.STOP)
+    bench.arm_refused("ARM in SAFE, after STOP")
     bench.done(Opcode.RESET)
     bench.until_state(DeviceState.IDLE)
     bench.arm(0, lease_ms=150, ahead_s=0.05)
@@ -142,6 +165,25 @@ def grant_in_idle(bench: Bench) -> None:
     bench.inbox.clear()
     status = bench.until_state(DeviceState.IDLE)
     need(status.lease_left_ms == 0, f"a GRANT in IDLE left a lease of {status.lease_left_ms} ms")
+
+
+@rule("4.23", "STATUS says in ms what is left of the lease, and a GRANT of more than an hour is one of an hour.")
+def lease_left(bench: Bench) -> None:
+    bench.upload(bench.layout())
+    bench.arm(0, lease_ms=HOUR_MS, ahead_s=20.0)
+    for asked, lease_ms in ((0, HOUR_MS), (ODD_LEASE_MS, ODD_LEASE_MS), (0xFFFFFFFF, HOUR_MS), (HOUR_MS, HOUR_MS)):
+        before = bench.ping().rx_tick
+        if asked:
+            bench.grant(lease_ms=asked)
+        bench.inbox.clear()
+        bench.send(encode_hello(bench.session))  # a repetition, which STATUS follows
+        status = bench.wait(MessageType.STATUS)
+        gone_ms = (status.tick - before) * 1000 / bench.facts["tick_hz"] + (0 if asked else PATIENCE_S * 1000)
+        need(
+            lease_ms - gone_ms - 1 <= status.lease_left_ms <= lease_ms,
+            f"{status.lease_left_ms} ms are left of a lease of {lease_ms}{f', asked for were {asked}' * (asked > HOUR_MS)}",
+        )
+    bench.done(Opcode.STOP)
 
 
 beyond_the_link(
@@ -196,7 +238,15 @@ def block_rules(bench: Bench) -> None:
 
 @rule("5.3", "Blocks are CLICKS or FRAMES, as the mode says, and name the pattern that was shown.")
 def shown(bench: Bench) -> None:
-    layout, _, stream, _ = run_once(bench)
+    bench_layout = bench.layout()
+    most = bench.facts["channels"] if bench_layout.mode else bench_layout.n_patterns
+    for n_patterns in sorted({min(most, n) for n in WIDTHS} | {bench_layout.n_patterns}):
+        hold_stamps(bench, n_patterns)
+
+
+def hold_stamps(bench: Bench, n_patterns: int) -> None:
+    """Hold what blocks say was shown against a plan of so many patterns."""
+    layout, _, stream, _ = run_once(bench, n_patterns=n_patterns)
     for block in blocks_of(stream):
         need(
             isinstance(block, FrameBlock) == bool(layout.mode),
@@ -207,8 +257,16 @@ def shown(bench: Bench) -> None:
             need(block.patterns.tolist() == wanted, f"patterns {block.patterns.tolist()}, the plan shows {wanted}")
         else:
             words = block.words.shape[1]
+            least, most = (word_bytes(channels) for channels in (n_patterns, bench.facts["channels"]))
             need(words in (1, 2, 4) or words % 8 == 0, f"words of {words} bytes")
-            need(8 * words >= layout.n_patterns, f"words of {words} bytes for {layout.n_patterns} channels")
+            need(
+                least <= words <= most, f"words of {words} bytes for {n_patterns} channels, expected {least} to {most}"
+            )
+
+
+def word_bytes(channels: int) -> int:
+    """Bytes of a word of FRAMES: a bit for each channel, rounded up to 1, 2, 4 or a multiple of 8."""
+    return next(size for size in (1, 2, 4, *range(8, 8200, 8)) if 8 * size >= channels)
 
 
 @rule(
@@ -249,20 +307,45 @@ def on_time(layout: Layout, start: int, block: Any) -> None:
     )
 
 
-@rule("5.5", "The object of a block is the number of the visit since ARM, or unknown.")
+@rule(
+    "5.5",
+    "The object of a block is the number of the visit since ARM, or unknown; a MARK is of an object that stands still, and stands at the "
+    "tick of its first exposure.",
+)
 def objects(bench: Bench) -> None:
-    layout, _, stream, _ = run_once(bench)
+    lead = bench.layout().period_ticks // 4
+    for changes, cycles in (({}, CYCLES), ({"lead_ticks": lead, "cycles_per_object": 1}, OBJECTS)):
+        layout = bench.layout(**changes)
+        start, stream, _ = bench.run(layout, cycles)
+        need(bool(blocks_of(stream)), "a whole run brought no block")
+        hold_objects(layout, start, stream)
+
+
+def hold_objects(layout: Layout, start: int, stream: list[Any]) -> None:
+    """Hold the objects of blocks and marks against the plan."""
     per_object = layout.n_slots * layout.cycles_per_object
+    known = False
     for block in blocks_of(stream):
         wanted = block.exposure_index // per_object
+        known = known or block.object_index != NO_OBJECT
         need(
-            block.object_index in (wanted, 0xFFFFFFFF),
+            block.object_index in (wanted, NO_OBJECT),
             f"object {block.object_index} in exposure {block.exposure_index}, expected {wanted}",
         )
-    for mark in (one for one in stream if isinstance(one, Mark) and one.half_exposures == 0):
+    for mark in (one for one in stream if isinstance(one, Mark)):
+        need(
+            mark.half_exposures == 0 or not known, f"MARK of a moving object {mark.object_index}, and objects in blocks"
+        )
+        if mark.half_exposures:
+            continue
         need(
             mark.exposure_index == mark.object_index * per_object,
             f"MARK of object {mark.object_index} at exposure {mark.exposure_index}",
+        )
+        late = mark.tick - start - layout.begins(mark.exposure_index)
+        need(
+            0 <= late < layout.period_ticks / 2,
+            f"MARK of object {mark.object_index} at a tick {late} after that of exposure {mark.exposure_index}",
         )
 
 
@@ -284,20 +367,31 @@ def window(bench: Bench) -> None:
         seen = [one for one in bench.inbox if one.kind in (0x90, 0x91, 0x92)]
         need(len(seen) <= limit, f"{len(seen)} stream messages with a limit of {limit}")
     need(len(seen) == 7, f"{len(seen)} stream messages with a limit of 7 and more waiting")
+    bench.stream()
+    for limit, more in (
+        (7 + HALF, False),
+        (6, False),
+        (6 + HALF, True),
+    ):  # of 32 bits: what lies half of them ahead lies behind
+        bench.grant(limit)
+        bench.listen(0.1)
+        found = len(bench.stream())
+        need((found > 0) == more, f"{found} stream messages behind 7 with a limit of {limit}")
     bench.done(Opcode.STOP)
 
 
 @rule(
     "5.7",
-    "Exposures are in blocks or in drops: a block's first exposure = those before it + its drops, and STATUS agrees at the end.",
+    "Exposures are in blocks or in drops: a block's first exposure = those before it + its drops, and STATUS agrees at the end; nothing "
+    "is dropped before buffer_messages are held back.",
 )
 def books(bench: Bench) -> None:
     held = int(bench.facts.get("buffer_messages", 0))
     if not 0 < held <= MOST_TO_FILL:
         raise NotTried(f"a buffer of {held} messages: this check fills buffers of 1 to {MOST_TO_FILL}")
-    layout = bench.layout(block_exposures=1, cycles_per_object=1 << 20)
+    layout = bench.layout(block_exposures=1)
     bench.upload(layout)
-    bench.grant(limit=10)
+    bench.grant(limit=FIRST)
     bench.arm(0, lease_ms=60_000)
     full_s = layout.seconds(-(-(held + 40) // layout.n_slots))
     # Only when drops have begun does the window open: the blocks behind it must count them.
@@ -314,7 +408,13 @@ def books(bench: Bench) -> None:
     bench.done(Opcode.STOP)
     closing = bench.until_state(DeviceState.IDLE)
     bench.listen(0.3)
-    agree(bench.stream(), closing)
+    stream = bench.stream()
+    agree(stream, closing)
+    first = next(block.seq for block in blocks_of(stream) if block.drops)
+    need(
+        first >= FIRST + held,
+        f"the device dropped after {first - FIRST} messages that were held back, it announces {held}",
+    )
     _, _, again = bench.run(layout, CYCLES)
     need(again.drops == 0, f"{again.drops} drops in a run without any: they are counted since ARM")
 
@@ -358,7 +458,8 @@ def broken_off(bench: Bench) -> None:
 def spare_bits(bench: Bench) -> None:
     layout, _, stream, _ = run_once(bench)
     if not layout.mode:
-        for piece in bench.raw_clicks:
+        for body in (one for one in bench.bodies if one[0] == MessageType.CLICKS):
+            piece = body[HEADER.size :]
             count = int.from_bytes(piece[28:30], "little")
             spare = piece[-1] >> (count % 8) if count % 8 else 0
             need(spare == 0, f"a block of {count} exposures with the last byte {piece[-1]:#04x}")
@@ -376,6 +477,29 @@ def closing_repeated(bench: Bench) -> None:
         (again.next_exposure, again.drops) == (closing.next_exposure, closing.drops),
         "two STATUS after the end say different numbers",
     )
+
+
+@rule("5.13", "In a run STATUS says how many exposures have begun.")
+def begun(bench: Bench) -> None:
+    layout = bench.layout(block_exposures=1, longer=4.0)  # an exposure is under way most of the time
+    bench.start(layout)
+    found = []
+    for _ in range(ASKED):
+        bench.listen(0.37 * layout.cycle_ticks / layout.tick_hz)
+        bench.inbox = [one for one in bench.inbox if one.kind != MessageType.STATUS]
+        bench.send(encode_hello(bench.session))  # a repetition, which STATUS follows
+        found.append(bench.wait(MessageType.STATUS))
+    bench.listen(layout.cycle_ticks / layout.tick_hz)
+    bench.done(Opcode.STOP)
+    bench.listen(STEP_S)
+    ticks = [block.tick for block in blocks_of(bench.stream())]
+    for status in found:
+        least = sum(tick <= status.tick for tick in ticks)
+        # One may begin between the tick that STATUS says and its sending.
+        need(
+            least <= status.next_exposure <= least + 1,
+            f"STATUS of tick {status.tick} says next exposure {status.next_exposure}, {least} have begun",
+        )
 
 
 def long_run(bench: Bench) -> Layout:
@@ -413,7 +537,7 @@ def long_stream(bench: Bench) -> None:
                 f"exposure {block.exposure_index} after {seen} in blocks and {block.drops} drops",
             )
             need(
-                block.object_index in (block.exposure_index, 0xFFFFFFFF),
+                block.object_index in (block.exposure_index, NO_OBJECT),
                 f"object {block.object_index} in exposure {block.exposure_index} of one cycle per object",
             )
             on_time(layout, start, block)

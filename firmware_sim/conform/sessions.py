@@ -5,18 +5,21 @@ from __future__ import annotations
 from contextlib import suppress
 
 from pans.runtime.wire import messages as wire
+from pans.runtime.wire.commands import pack_command
 from pans.runtime.wire.framing import encode_frame
 from pans.runtime.wire.messages import DeviceState, MessageType, Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA, wrong_facts
 
-from .bench import LEASE_MS, PATIENCE_S, Bench
-from .rules import Silent, beyond_the_link, need, rule
+from .bench import LEASE_MS, PATIENCE_S, QUIET_S, Bench
+from .rules import NotTried, Silent, beyond_the_link, need, rule
 
 CLOCK_PPM = 1000.0  # section 9
 CLOCK_S = 2.0
 FLOOD = 300
 FAST_HZ = 10_000  # blocks of one exposure: 570 kB/s
 STATUS_EVERY_S = 1.3  # once a second, and a little for the way
+AT_ONCE_S = 0.3  # of what follows at once: less than a second, in which STATUS comes by itself
+PROBES_AT_ONCE = 4
 
 
 @rule("2.1", "HELLO is answered with WELCOME in the new session, and STATUS follows at once.")
@@ -25,13 +28,23 @@ def welcome(bench: Bench) -> None:
     bench.wait(MessageType.STATUS, within_s=0.5, what="after WELCOME")
 
 
-@rule("2.2", "HELLO with the nonce of the present session is answered again and changes nothing.")
+@rule(
+    "2.2",
+    "HELLO with the nonce of the present session is answered again, with WELCOME and STATUS, and changes nothing.",
+)
 def repeated_hello(bench: Bench) -> None:
-    bench.done(Opcode.STOP)
-    bench.send(wire.encode_hello(bench.session))
-    bench.wait(MessageType.WELCOME, what="to a repeated HELLO")
+    bench.upload(bench.layout())
+    bench.arm(0, ahead_s=20.0, lease_ms=20_000)
+    bench.listen(AT_ONCE_S)
+    for _ in range(3):  # one STATUS a second comes by itself
+        bench.inbox.clear()
+        bench.send(wire.encode_hello(bench.session))
+        bench.wait(MessageType.WELCOME, what="to a repeated HELLO")
+        status = bench.wait(MessageType.STATUS, within_s=AT_ONCE_S, what="after WELCOME to a repeated HELLO")
+        need(status.state == DeviceState.ARMED, f"a repeated HELLO left ARMED for {DeviceState(status.state).name}")
     ack = bench.command(Opcode.STOP, number=bench.last_id)
     need(ack.last_id == bench.last_id, f"a repeated HELLO forgot the command ids: last id {ack.last_id}")
+    bench.done(Opcode.STOP)
 
 
 @rule("2.3", "A new session forgets uploads, command ids and the run: the device is IDLE.")
@@ -42,13 +55,16 @@ def new_session(bench: Bench) -> None:
     ack = bench.command(Opcode.STOP)
     need(ack.last_id == bench.last_id, f"the command ids did not start over: last id {ack.last_id}")
     bench.arm_refused("ARM after a new session")
-    for opcode, body in bench.layout().commands():
-        if opcode != Opcode.LOAD_PLAN:
-            bench.done(opcode, body)
-    bench.arm_refused("ARM with the plan of the session before")
+    for left_out, what in ((Opcode.LOAD_PLAN, "plan"), (Opcode.LOAD_PATTERN, "patterns")):
+        bench.upload(bench.layout())
+        bench.open()
+        for opcode, body in bench.layout().commands():
+            if opcode != left_out:
+                bench.done(opcode, body)
+        bench.arm_refused(f"ARM with the {what} of the session before")
 
 
-@rule("2.4", "Frames of another session are dropped.")
+@rule("2.4", "Frames of another session are dropped, and a new one brings no answer to what an earlier one asked.")
 def foreign(bench: Bench) -> None:
     bench.send(
         wire.encode_ping(1, 1, bench.session ^ 2)
@@ -57,42 +73,69 @@ def foreign(bench: Bench) -> None:
     bench.listen(0.2)
     need(not any(one.kind in (MessageType.PONG, MessageType.ACK) for one in bench.inbox), "one of them was answered")
     bench.done(Opcode.STOP)
-
-
-@rule("2.5", "HELLO of another schema is answered with the device's own WELCOME, and there is no session then.")
-def other_schema(bench: Bench) -> None:
-    bench.session ^= 4
-    bench.inbox.clear()
-    bench.send(
-        encode_frame(
-            MessageType.HELLO, wire.STRUCTS["HELLO"].pack(wire.SCHEMA ^ 1, wire.PROTOCOL_VERSION), bench.session
-        )
+    asked = wire.encode_ping(1, 1, bench.session) + wire.encode_command(
+        bench.last_id + 1, Opcode.STOP, b"", bench.session
     )
-    found = bench.wait(MessageType.WELCOME, what="to a HELLO of another schema")
-    need(found.schema == wire.SCHEMA, f"WELCOME says schema {found.schema:#010x}")
-    bench.send(wire.encode_ping(1, 1, bench.session))
-    bench.silent(MessageType.PONG, "in a session that must not be")
+    bench.session, bench.last_id = bench.session ^ 2, 0
+    bench.inbox.clear()
+    bench.send(asked + wire.encode_hello(bench.session))
+    bench.wait(MessageType.WELCOME)
+    bench.silent(MessageType.PONG, "in a new session, to a PING of the one before")
+    need(not any(one.kind == MessageType.ACK for one in bench.inbox), "ACK came of a command of the session before")
 
 
-@rule("2.6", "The tick counter does not restart with a session.")
+@rule(
+    "2.5",
+    "HELLO of another schema or protocol version is answered with the device's own WELCOME, and there is no session then.",
+)
+def other_schema(bench: Bench) -> None:
+    for schema, protocol in ((wire.SCHEMA ^ 1, wire.PROTOCOL_VERSION), (wire.SCHEMA, wire.PROTOCOL_VERSION + 1)):
+        what = f"HELLO of schema {schema:#010x}, version {protocol}"
+        bench.session ^= 4 * protocol
+        bench.inbox.clear()
+        bench.send(encode_frame(MessageType.HELLO, wire.STRUCTS["HELLO"].pack(schema, protocol), bench.session))
+        found = bench.wait(MessageType.WELCOME, what=f"to a {what}")
+        need(found.schema == wire.SCHEMA, f"WELCOME says schema {found.schema:#010x}")
+        need(found.protocol == wire.PROTOCOL_VERSION, f"WELCOME says version {found.protocol}")
+        bench.send(wire.encode_ping(1, 1, bench.session))
+        bench.silent(MessageType.PONG, f"in a session that must not be, after a {what}")
+
+
+@rule("2.6", "The tick counter does not restart with a session, and the epoch stays the same.")
 def ticks_go_on(bench: Bench) -> None:
-    before = bench.ping().tx_tick
+    before, epoch = bench.ping().tx_tick, bench.facts.get("epoch")
     bench.open()
     after = bench.ping().rx_tick
     need(after >= before, f"tick {before} in one session, {after} in the next")
+    need(bench.facts.get("epoch") == epoch, f"epoch {epoch} in one session, {bench.facts.get('epoch')} in the next")
 
 
-@rule("2.7", "STATUS comes once per second.")
+@rule("2.7", "STATUS comes once per second, with the present tick.")
 def status_every_second(bench: Bench) -> None:
     bench.listen(0.05)
     bench.inbox.clear()
     for _ in range(2):
-        bench.wait(MessageType.STATUS, within_s=STATUS_EVERY_S)
+        before = bench.ping().rx_tick
+        status = bench.wait(MessageType.STATUS, within_s=STATUS_EVERY_S)
+        after = bench.ping().rx_tick
+        need(
+            before <= status.tick <= after,
+            f"STATUS of tick {status.tick}, PONGs of {before} before and {after} after it",
+        )
 
 
 beyond_the_link(
     "2.8", "Another epoch says that the tick counter has restarted.", "the device would have to be switched off"
 )
+
+
+@rule("2.9", "HELLO of session 0 is dropped.")
+def no_nonce(bench: Bench) -> None:
+    session, bench.session = bench.session, 0
+    bench.send(wire.encode_hello(0))
+    bench.silent(MessageType.WELCOME, "to a HELLO of session 0")
+    bench.session = session
+    bench.ping()
 
 
 @rule("3.1", "WELCOME's map holds what it must, in its ranges, and no key twice.")
@@ -116,6 +159,30 @@ def announced(bench: Bench) -> None:
     need(found == AUTOMATON_SCHEMA, f"automaton_schema is {found:#010x}, expected {AUTOMATON_SCHEMA:#010x}")
 
 
+@rule("3.4", "WELCOME's tick is the present one.")
+def present_tick(bench: Bench) -> None:
+    before = bench.ping().tx_tick
+    bench.open()
+    after, tick = bench.ping().rx_tick, bench.facts.get("tick")
+    if tick is None:
+        raise NotTried("WELCOME says no tick")
+    need(before <= tick <= after, f"WELCOME says tick {tick}, PONGs {before} before and {after} after it")
+
+
+@rule("3.5", "As many patterns and slots as WELCOME announces are taken.")
+def announced_memory(bench: Bench) -> None:
+    layout, facts = bench.layout(), bench.facts
+    if facts["pattern_memory"] > 0:
+        last = next(layout.patterns())._replace(pattern=facts["pattern_memory"] - 1)
+        bench.done(Opcode.LOAD_PATTERN, pack_command(last))
+    plan = layout.chunk()
+    most = facts["slot_memory"]
+    whole = plan._replace(
+        n_slots=most, cycle_ticks=min(1 << 48, (most + 1) * layout.period_ticks), slots=plan.slots[:1]
+    )
+    bench.done(Opcode.LOAD_PLAN, pack_command(whole))
+
+
 @rule("6.1", "PONG echoes probe id and host nanoseconds.")
 def echo(bench: Bench) -> None:
     for number, ns in ((0, 0), (0xFFFFFFFF, (1 << 64) - 1), (0x01020304, 0x0102030405060708)):
@@ -131,6 +198,15 @@ def echo(bench: Bench) -> None:
 def answered_once(bench: Bench) -> None:
     bench.ping()
     bench.silent(MessageType.PONG, "a second time")
+
+
+@rule("6.7", "Four PINGs that come at once are answered, in the order in which they came.")
+def probes_at_once(bench: Bench) -> None:
+    numbers = list(range(7001, 7001 + PROBES_AT_ONCE))
+    bench.send(b"".join(wire.encode_ping(number, 1, bench.session) for number in numbers))
+    bench.listen(QUIET_S)
+    found = [one.message.probe_id for one in bench.inbox if one.kind == MessageType.PONG]
+    need(found == numbers, f"PINGs {numbers} at once were answered as {found}")
 
 
 @rule("6.3", "The ticks of arrival and departure lie within the time that the probe was away, and never go back.")

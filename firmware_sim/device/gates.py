@@ -8,6 +8,7 @@ from typing import NamedTuple
 from pans.runtime.wire.commands import Gate
 from pans.runtime.wire.messages import AckStatus
 
+from .sequential import MAX_TICK
 from .upload import Refused
 
 GATE_CHANNELS = 8  # this simulator's; a device says its number in WELCOME
@@ -44,6 +45,8 @@ class Gates:
     def _check(self, gate: Gate, now: int) -> None:
         if gate.tick <= now:
             raise Refused(AckStatus.TOO_LATE, f"gate tick {gate.tick} has passed, it is {now}")
+        if gate.tick >= MAX_TICK:
+            raise Refused(AckStatus.OUT_OF_RANGE, f"gate tick {gate.tick}: allowed up to {MAX_TICK - 1}")
         if gate.channel >= GATE_CHANNELS or not gate.duration_ticks:
             text = f"gate {gate.channel} for {gate.duration_ticks} ticks: channels are 0..{GATE_CHANNELS - 1}"
             raise Refused(AckStatus.OUT_OF_RANGE, text)

@@ -175,6 +175,7 @@ def _check_head(profile: Profile, head: PlanChunk) -> None:
     _require(1 <= head.n_slots <= MAX_SLOTS, lambda: f"{head.n_slots} slots: allowed 1..{MAX_SLOTS}")
     _require(low - 1 <= head.exposure_ticks <= high + 1, lambda: f"exposure {head.exposure_ticks}: {low}..{high} ticks")
     _require(head.exposure_ticks > 0, lambda: "exposure of 0 ticks")
+    _require(head.slot_period_ticks > 0, lambda: "exposures 0 ticks apart: at least 1 is needed")
     _require(0 < head.cycle_ticks <= MAX_CYCLE_TICKS, lambda: f"cycle of {head.cycle_ticks}: up to {MAX_CYCLE_TICKS}")
     _require(1 <= head.block_exposures <= longest, lambda: f"{head.block_exposures} exposures per block: 1..{longest}")
     _require(head.cycles_per_object > 0, lambda: "0 cycles per object: at least 1 is needed")

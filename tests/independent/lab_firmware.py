@@ -195,7 +195,7 @@ class Memory:
     def load_plan(self, body: bytes) -> None:
         """LOAD_PLAN."""
         head = struct.unpack_from("<BBHIIIIQHHI", body)
-        mode, _, patterns, n_slots, first, exposure, _, cycle, longest, _, per_object = head
+        mode, _, patterns, n_slots, first, exposure, spacing, cycle, longest, _, per_object = head
         count, odd = divmod(len(body) - 36, 12)
         if odd or not 0 < count <= 1024 or first + count > n_slots:
             raise Refused(MALFORMED, "slots of a plan")
@@ -205,7 +205,7 @@ class Memory:
         follows = first == len(self.plan_slots) and (*head[:4], *head[5:]) == (*self.plan_head[:4], *self.plan_head[5:])
         most = self.channels if self.channels else PATTERN_MEMORY
         good = bool(mode) == bool(self.channels) and 0 < patterns <= most and n_slots <= SLOT_MEMORY
-        if not (follows and good and exposure and longest and per_object and cycle <= 1 << 48):
+        if not (follows and good and exposure and spacing and longest and per_object and cycle <= 1 << 48):
             raise Refused(RANGE, f"plan from slot {first}")
         shown = [pattern for _, pattern, _ in slots if pattern != DARK]
         starts = [start for start, _, _ in self.plan_slots[-1:] + slots]
@@ -475,7 +475,7 @@ class Firmware:
             raise Refused(STATE, "no run")
         if tick <= self.tick:
             raise Refused(LATE, f"tick {tick} has passed, it is {self.tick}")
-        if output >= self.outputs or not length:
+        if output >= self.outputs or not length or tick >= 1 << 63:
             raise Refused(RANGE, f"output {output} for {length} ticks")
         self.books.pulses.append((tick, length, output))
 

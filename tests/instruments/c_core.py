@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from pans.firmware_sim.device import readings
 from pans.firmware_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES
-from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, PatternMemory
+from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, PatternMemory, Refused
 from pans.firmware_sim.device.view import View
 from pans.firmware_sim.lab.core import Core, Hardware, find_compiler, limits_of, states_of
 from pans.firmware_sim.program import Program, States
@@ -41,7 +42,8 @@ class SimulatedHardware(Hardware):
         if chunk is None:
             self._forget(self._patterns.revision + 1)
         else:
-            self._patterns.load(chunk)
+            with suppress(Refused):  # a projector takes what it is sent: to refuse is the core's part
+                self._patterns.load(chunk)
 
     def prepare(self, task: Any) -> None:
         view, ticks, n_patterns = self._view, task.exposure_ticks, task.n_patterns
