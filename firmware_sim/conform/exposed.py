@@ -47,8 +47,8 @@ def ran(bench: Bench, layout: Layout, seconds: float, *, stops: bool = False) ->
 
 @rule(
     "15.1",
-    "A device that announces when exposures happened tells of each exposure once, in EXPOSED directly before STATUS; one that does not "
-    "sends none.",
+    "A device that announces when exposures happened tells of each exposure once, in EXPOSED directly before STATUS, and of equal errors "
+    "names the first; one that does not sends none.",
 )
 def told_once(bench: Bench) -> None:
     schema = bench.facts.get("exposed_schema", EXPOSED_SCHEMA)
@@ -70,6 +70,8 @@ def _hold(others: list[Any], start: int) -> None:
             numbers, first, told = one[3:], told, told + one.exposures
             words = f"EXPOSED of the exposures {first} to {told - 1} names {numbers[0]} and {numbers[1]}"
             need(all(first <= number < told for number in numbers), words)
+            for error, number in zip((one.start_error, one.length_error), numbers):
+                need(error != 0 or number == first, f"{words}, where all are on the tick")
         elif isinstance(one, Status) and one.tick >= start:
             least = one.next_exposure - (UNDER_WAY if one.state == DeviceState.RUNNING else 0)
             words = f"EXPOSED has told of {told} exposures before a STATUS that says {one.next_exposure}"

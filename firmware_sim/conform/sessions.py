@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from contextlib import suppress
 
+import numpy as np
+
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import pack_command
+from pans.runtime.wire.commands import MAX_SLOTS_PER_CHUNK, PatternChunk, pack_command
 from pans.runtime.wire.framing import encode_frame
-from pans.runtime.wire.messages import DeviceState, MessageType, Opcode
+from pans.runtime.wire.messages import DARK_PATTERN, DeviceState, MessageType, Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA, wrong_facts
 
 from .bench import LEASE_MS, PATIENCE_S, QUIET_S, Bench
@@ -20,6 +22,7 @@ FAST_HZ = 10_000  # blocks of one exposure: 570 kB/s
 STATUS_EVERY_S = 1.3  # once a second, and a little for the way
 AT_ONCE_S = 0.3  # of what follows at once: less than a second, in which STATUS comes by itself
 PROBES_AT_ONCE = 4
+PAUSE_S = 0.05  # between sessions, in which ticks pass
 
 
 @rule("2.1", "HELLO is answered with WELCOME in the new session, and STATUS follows at once.")
@@ -62,6 +65,12 @@ def new_session(bench: Bench) -> None:
             if opcode != left_out:
                 bench.done(opcode, body)
         bench.arm_refused(f"ARM with the {what} of the session before")
+    layout = bench.layout()
+    longer = PatternChunk(0, 0, layout.pixels + 1, np.zeros(1, np.uint16))
+    if longer.n_pixels <= bench.facts["pattern_pixels"]:
+        bench.command(Opcode.LOAD_PATTERN, pack_command(longer))  # refused where patterns have one size
+        bench.open()
+    bench.upload(layout)
 
 
 @rule("2.4", "Frames of another session are dropped, and a new one brings no answer to what an earlier one asked.")
@@ -104,6 +113,7 @@ def other_schema(bench: Bench) -> None:
 @rule("2.6", "The tick counter does not restart with a session, and the epoch stays the same.")
 def ticks_go_on(bench: Bench) -> None:
     before, epoch = bench.ping().tx_tick, bench.facts.get("epoch")
+    bench.listen(PAUSE_S)
     bench.open()
     after = bench.ping().rx_tick
     need(after >= before, f"tick {before} in one session, {after} in the next")
@@ -161,6 +171,7 @@ def announced(bench: Bench) -> None:
 
 @rule("3.4", "WELCOME's tick is the present one.")
 def present_tick(bench: Bench) -> None:
+    bench.listen(PAUSE_S)
     before = bench.ping().tx_tick
     bench.open()
     after, tick = bench.ping().rx_tick, bench.facts.get("tick")
@@ -177,6 +188,8 @@ def announced_memory(bench: Bench) -> None:
         bench.done(Opcode.LOAD_PATTERN, pack_command(last))
     plan = layout.chunk()
     most = facts["slot_memory"]
+    full = bench.layout(shown=(DARK_PATTERN,) * min(most, MAX_SLOTS_PER_CHUNK))  # as many as one piece holds
+    bench.done(Opcode.LOAD_PLAN, pack_command(full.chunk()))
     whole = plan._replace(
         n_slots=most, cycle_ticks=min(1 << 48, (most + 1) * layout.period_ticks), slots=plan.slots[:1]
     )
@@ -198,15 +211,6 @@ def echo(bench: Bench) -> None:
 def answered_once(bench: Bench) -> None:
     bench.ping()
     bench.silent(MessageType.PONG, "a second time")
-
-
-@rule("6.7", "Four PINGs that come at once are answered, in the order in which they came.")
-def probes_at_once(bench: Bench) -> None:
-    numbers = list(range(7001, 7001 + PROBES_AT_ONCE))
-    bench.send(b"".join(wire.encode_ping(number, 1, bench.session) for number in numbers))
-    bench.listen(QUIET_S)
-    found = [one.message.probe_id for one in bench.inbox if one.kind == MessageType.PONG]
-    need(found == numbers, f"PINGs {numbers} at once were answered as {found}")
 
 
 @rule("6.3", "The ticks of arrival and departure lie within the time that the probe was away, and never go back.")
@@ -282,3 +286,12 @@ def answers_in_a_run(bench: Bench) -> None:
         bench.done(Opcode.STOP)
         bench.until_state(DeviceState.IDLE)
         bench.stream()
+
+
+@rule("6.7", "Four PINGs that come at once are answered, in the order in which they came.")
+def probes_at_once(bench: Bench) -> None:
+    numbers = list(range(7001, 7001 + PROBES_AT_ONCE))
+    bench.send(b"".join(wire.encode_ping(number, 1, bench.session) for number in numbers))
+    bench.listen(QUIET_S)
+    found = [one.message.probe_id for one in bench.inbox if one.kind == MessageType.PONG]
+    need(found == numbers, f"PINGs {numbers} at once were answered as {found}")

@@ -14,14 +14,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lab_bench import D_F, EXPOSURE_US, FASHION, LEVELS, PEAK_HZ, SCENE, Bench, profile_text
+from lab_bench import D_F, EXPOSURE_US, FASHION, LEVELS, PEAK_HZ, SCENE, Bench, VirtualLab, profile_text
 from lab_bundle import read_bundle
 from lab_decisions import decide_again
-from lab_firmware import SAFE
+from lab_firmware import SAFE, Firmware
 from lab_light import Light
 from lab_recording import read_recording
 
+from pans.firmware_sim.conform import conform
 from pans.runtime.cli import main
+from pans.runtime.instrument import load_profile
 from pans.runtime.live import LiveRun, Observers, RunResult
 from pans.runtime.wire.commands import Gate
 
@@ -156,6 +158,16 @@ def test_gates_are_done_or_refused_with_a_reason(tmp_path: Path) -> None:
     assert bench.books.refused == [(GATE, TOO_LATE), (GATE, OUT_OF_RANGE)]
     refusals = [event for event in result.events if event["kind"] == "gate_refused"]
     assert [event["status"] for event in refusals] == [TOO_LATE, OUT_OF_RANGE]
+
+
+@pytest.mark.parametrize("mode", ["sequential", pytest.param("parallel", marks=pytest.mark.slow)])
+def test_it_keeps_every_rule(mode: str, tmp_path: Path) -> None:
+    (tmp_path / "lab.toml").write_text(profile_text(mode))
+    light, parallel = Light.of_scene(SCENE, PEAK_HZ, LEVELS, 1), mode == "parallel"
+    firmware = Firmware(light, parallel=parallel, channels=D_F if parallel else 1)
+    found = conform(VirtualLab(firmware), load_profile(str(tmp_path / "lab.toml")), pixels=light.images[0].size)
+    assert {one.number: one.why for one in found if one.verdict in ("broken", "gone")} == {}
+    assert sum(one.verdict == "kept" for one in found) >= 70
 
 
 def test_what_is_lost_on_the_way_is_sent_again_or_reported(tmp_path: Path) -> None:

@@ -61,6 +61,15 @@ def tried(name: str, device: SteppedDevice, clock: DeviceClock, *only: str, long
     return {one.number: one for one in conform(link, load_profile(name), pixels=16, only=only, long=long)}
 
 
+def broken_by(mutant: Mutant, tmp_path: Path, *only: str, long: bool = False) -> set[str]:
+    """The rules that a copy of the C core with this fault breaks."""
+    device = c_core(mutant.profile, built(mutant, tmp_path), mutant.line_bytes_s)
+    found = tried(mutant.profile, *device, *only, long=long)
+    broken = {number for number, one in found.items() if one.verdict in ("broken", "gone")}
+    assert all(found[number].why and found[number].pieces for number in broken)
+    return broken
+
+
 class SlowLine(CDevice):
     """The C core behind a line of so many bytes per second; what the line does not take yet waits in the device."""
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from c_device import needs_compiler
-from mutants import Mutant, built, c_core, tried
+from mutants import Mutant, broken_by, c_core, tried
 
 from pans.firmware_sim.conform import RULES
 from pans.firmware_sim.device.clock import DeviceClock
@@ -180,23 +180,12 @@ MUTANTS = {
     ),
 }  # fmt: skip
 
-# What no rule can find, and why.
-
 QUICK = (
     "a number is skipped at 256", "no drops in blocks", "STOP counts the exposure under way", "ARM without its patterns",
     "a tick of the exposure's end", "a sequence of 16 bits", "drops of 16 bits",
     "a tick of drift per cycle", "answers starved by the stream", "the lease lasts a fifth longer",
     "a repeated command is carried out",
 )  # fmt: skip
-
-
-def broken_by(mutant: Mutant, tmp_path: Path, *only: str, long: bool = False) -> set[str]:
-    """The rules that a copy of the C core with this fault breaks."""
-    device = c_core(mutant.profile, built(mutant, tmp_path), mutant.line_bytes_s)
-    found = tried(mutant.profile, *device, *only, long=long)
-    broken = {number for number, one in found.items() if one.verdict in ("broken", "gone")}
-    assert all(found[number].why and found[number].pieces for number in broken)
-    return broken
 
 
 def test_the_faults_are_many_and_name_rules() -> None:
