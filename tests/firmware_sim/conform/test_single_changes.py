@@ -6,9 +6,14 @@ from pathlib import Path
 
 import pytest
 from c_device import needs_compiler
-from mutants import Mutant, broken_by
+from mutants import Mutant, broken_by, tried
 
 from pans.firmware_sim.conform import RULES
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.virtual import START_NS
+from pans.firmware_sim.scene.scene_file import open_scene
+from pans.runtime.instrument.profile import load_profile
 
 SLOW_LINE = 100_000  # bytes per second
 
@@ -531,3 +536,18 @@ def test_a_single_change_is_named_by_its_rule(fault: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize("fault", UNNAMED)
 def test_what_is_permitted_or_not_on_the_link_breaks_no_rule(fault: str, tmp_path: Path) -> None:
     assert broken_by(UNNAMED[fault][1], tmp_path) == set(), UNNAMED[fault][0]
+
+
+class WithoutEnd(Instrument):
+    """Renews a lease for as long as it is asked to."""
+
+    def _renew(self, lease_ms: int) -> None:
+        self._lease_tick = self._tick + lease_ms * self._tick_hz // 1000
+
+
+def test_a_simulator_whose_lease_has_no_maximum_is_found() -> None:
+    profile = load_profile("ideal")
+    clock = DeviceClock(profile.clock.tick_hz)
+    device = WithoutEnd(profile, open_scene("uniform"), power_on_tick=clock.tick_at(START_NS))
+    found = tried("ideal", device, clock, "4.16", "4.23")
+    assert {number for number, one in found.items() if one.verdict == "broken"} == {"4.23"}
