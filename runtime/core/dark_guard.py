@@ -40,6 +40,7 @@ from .plan import Plan
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+MOST_AFTER_CLICKS = 0.49  # a test for twice the chance needs one below a half
 PRIOR_WORDS = 200.0  # words' worth of the channels' own rates, beside what was seen
 MAX_MIXED = 256  # answers of a head that one decision may average
 
@@ -239,6 +240,9 @@ class MixedHead:
 
 
 POLICIES = ("warn", "tables", "mask", "abstain")
+# Dark exposures of which none was out of reach of a click: so many in a row come about by chance once in a million runs
+# where a fourth is out of reach: 0.75^48.
+UNWATCHED_MOST = 48
 MAX_FINDINGS = 1000  # kept for the summary; the recording has them all
 
 
@@ -254,6 +258,7 @@ class DarkGuard:
         shots: int = 1,
         afterpulses: int = 0,
         lit: DeadChannelTest | None = None,
+        behind: ChannelWatch | None = None,
     ) -> None:
         if policy not in POLICIES:
             raise UsageError(f"--on-dark {policy!r}, allowed: {', '.join(POLICIES)}")
@@ -266,11 +271,14 @@ class DarkGuard:
         self._n_features = plan.n_patterns
         self.policy, self.watch, self.health = policy, watch, ChannelHealth(watch)
         self.lit = lit  # finds dead channels in lit exposures; None: dark ones alone tell
+        # Dark exposures within reach of afterpulses: only more clicks than the highest chance of one tell anything.
+        self.behind = behind
+        self._health_behind = None if behind is None else ChannelHealth(behind, after_clicks=True)
         self._news: list[Finding] = []
         self.findings: list[Finding] = []
         self.dropped_findings = 0
         self._dark_slot = plan.slot_pattern == DARK_PATTERN
-        self._afterpulses = int(afterpulses)  # so many exposures behind a click are left out; 0: none
+        self._afterpulses = int(afterpulses)  # so many exposures after a click are judged apart; 0: none
         self._any_dark = bool(self._dark_slot.any())
         self._silent_before = 0  # exposures without a click before the next block, as far as is known
         self._next = 0
@@ -279,7 +287,8 @@ class DarkGuard:
 
     def warm_up(self) -> None:
         """Compile or load the kernels, before arming."""
-        self.watch.warm_up()
+        for watch in filter(None, (self.watch, self.behind)):
+            watch.warm_up()
 
     def restart(self) -> None:
         """Follow another stream: its exposures count from 0 again, the rates go on."""
@@ -290,7 +299,7 @@ class DarkGuard:
     def take(self, block: ClickBlock | FrameBlock) -> list[Finding]:
         """Take a block: its dark exposures, and what its lit ones say about dead channels; return the findings.
 
-        With one detector that afterpulses, exposures close behind a click are left out: an afterpulse is no dark count.
+        With one detector that afterpulses, dark exposures close after a click are held against the highest chance of an afterpulse.
         """
         if self.lit is not None:
             words = block.words if isinstance(block, FrameBlock) else self._words(block)
@@ -361,7 +370,14 @@ class DarkGuard:
         )
         silent = places - 1 - last  # exposures without a click before each one, and before the next block
         self._next, self._silent_before = block.exposure_index + len(bits), int(silent[-1])
-        return self.take_dark_words(words[dark & (silent[:-1] >= self._afterpulses)])
+        far = silent[:-1] >= self._afterpulses
+        return self.take_dark_words(words[dark & far]) + self._take_behind(words[dark & ~far])
+
+    def _take_behind(self, words: NDArray[np.uint8]) -> list[Finding]:
+        """Take dark exposures within reach of afterpulses, words uint8 (n, 1)."""
+        if self.behind is None or self._health_behind is None or not len(words):
+            return []
+        return self._keep(self._health_behind.take(self.behind.update_words(words)))
 
     def _words(self, block: ClickBlock) -> NDArray[np.uint8]:
         """Which channels clicked in each exposure, uint8 (n, 1), bit c is channel c; of photon numbers all above 0 are a click."""
@@ -394,9 +410,17 @@ class DarkGuard:
     @property
     def serious(self) -> list[Finding]:
         """The states of level warning or alarm that last."""
-        return [
-            finding for finding in self.health.present if LEVELS.index(finding.level) >= 1 or finding.kind == "dead"
-        ]
+        return [finding for finding in self.present if LEVELS.index(finding.level) >= 1 or finding.kind == "dead"]
+
+    def present_rate(self, finding: Finding) -> float:
+        """Return clicks per dark exposure of the finding's channels, as they are by now; any thread may ask."""
+        health = self._health_behind if finding.after_clicks and self._health_behind is not None else self.health
+        return float(health.rates()[list(finding.channels)].mean())
+
+    @property
+    def present(self) -> list[Finding]:
+        """The states that last, the oldest first; any thread may ask."""
+        return self.health.present + ([] if self._health_behind is None else self._health_behind.present)
 
     @property
     def flags(self) -> DecisionFlag:
@@ -408,7 +432,8 @@ class DarkGuard:
             return DecisionFlag.DARK_ALARM | DecisionFlag.ABSTAINED
         assert self._adapter is not None
         extra, masked = self._concerned(serious)
-        abstains = masked.all() or not self._adapter.can_do(masked | (extra > 0))
+        # Right after a click no other table helps: its dark clicks depend on that click.
+        abstains = any(one.after_clicks for one in serious) or masked.all() or not self._adapter.can_do(masked | (extra > 0))
         return DecisionFlag.DARK_ALARM | (DecisionFlag.ABSTAINED if abstains else DecisionFlag(0))
 
     def decider(self, ordinary: Decider) -> Decider:
@@ -430,7 +455,7 @@ class DarkGuard:
         """Remember the clicks of a decision made while nothing was wrong, int64 (d_f,): how often they come is what other tables
         are made with.
         """
-        if self._adapter is not None and not self.health.present:
+        if self._adapter is not None and not self.present:
             self._adapter.count(counts)
 
     def _concerned(self, serious: list[Finding]) -> tuple[F64, NDArray[np.bool_]]:
@@ -447,13 +472,14 @@ class DarkGuard:
     def report(self, report: DarkReport) -> DarkReport:
         """Return `report` with the findings, what lasts, and every channel's rate with its interval.
 
-        Its alarm is judged anew: from the exposures that were watched (behind no click, where the detector afterpulses), and against the
-        end of the interval where the expected rate is an estimate.
+        Its alarm is judged anew: from the exposures that were watched (after no click, where the detector afterpulses), and against the
+        end of the interval where the expected rate is an estimate; then from those after clicks.
         """
         watch = self.watch
         expected = float(watch.high.mean()) if watch.high.max() > FLOOR_RATE else 0.0
         judged = dark_report(expected, watch.exposures * watch.n_channels, int(watch.clicks.sum()))
         n = self.watch.exposures
+        alarm = judged.alarm or self._alarm_behind(report)
         rows = []
         for clicks, expected in zip(self.watch.clicks.tolist(), self.watch.expected.tolist()):
             low, high = wilson_interval(clicks, n)
@@ -463,11 +489,23 @@ class DarkGuard:
             )
         return replace(
             report,
-            alarm=judged.alarm,
+            alarm=alarm,
             policy=self.policy,
             findings=tuple(finding.event() for finding in self.findings),
-            present=tuple(f"{finding.level}: {finding.words}" for finding in self.health.present),
+            present=tuple(f"{finding.level}: {finding.words}" for finding in self.present),
             channels=tuple(rows),
+        )
+
+    def _alarm_behind(self, report: DarkReport) -> str:
+        """Return what is wrong with the dark exposures after clicks, or that no dark exposure could be watched; "" if nothing is."""
+        behind = self.behind
+        if behind is not None and (found := dark_report(float(behind.high[0]), behind.exposures, int(behind.clicks[0])).alarm):
+            return f"right after clicks: {found}"
+        if self.watch.exposures or report.exposures < UNWATCHED_MOST:
+            return ""
+        return (
+            f"none of {report.exposures} dark exposures could be watched: each came within {self._afterpulses} exposures of a click; "
+            "put dark slots behind slots that seldom click, or give more of them (--dark-slots)"
         )
 
 
@@ -492,7 +530,14 @@ def recorded_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots:
     lit = None
     if "lit" in header:  # recordings made before have none
         lit = DeadChannelTest(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
-    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, _exposures_left_out(header["afterpulses"]), lit)
+    behind = None
+    if header.get("after_clicks") is not None:  # recordings made before have none
+        most = np.array([float(header["after_clicks"])])
+        if not 0 <= most[0] <= 1:
+            raise ValueError(f"after_clicks {most[0]}, allowed: 0 to 1")
+        behind = ChannelWatch(1, np.minimum(most, MOST_AFTER_CLICKS), settings, np.array([FLOOR_RATE]))
+    left_out = _exposures_left_out(header["afterpulses"])
+    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, left_out, lit, behind)
 
 
 def _exposures_left_out(said: Any) -> int:

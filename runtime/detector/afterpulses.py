@@ -40,6 +40,8 @@ from pans.runtime.instrument.profile_schema import FREE_RUNNING
 F64 = NDArray[np.float64]
 MOST_PROBABLE = 0.6  # -log(1 - p) stays below 1: beyond it every detection would cause more than one
 HOLDS_TO = 0.3  # p with a time constant, up to which the law errs by at most 0.003
+# A memory that grows by less than this part per exposure is steady; time constants beyond so many exposures are cut short.
+STEADY_CHANGE, STEADY_ROUNDS = 1e-4, 1000
 LEAST_DARK = 1e-9  # chance of a dark click, below which none is told from another
 SMALL_RATIO = 1e-7  # below it log(1 + r)/r is 1 - r/2
 LEAST_MEAN = 1e-300  # of an exposure or a memory; below it there is none
@@ -185,6 +187,18 @@ class Afterpulses:
         if first <= least or not self.decay:
             return int(first > least)
         return math.ceil(math.log(first / least) / -math.log(self.decay))
+
+    def chance_after_clicks(self, dark: float, brightest: float) -> float:
+        """Return the highest chance that a dark exposure clicks right after a click, whatever came before.
+
+        `dark` is its chance without memory. Every exposure before is taken to have clicked in `brightest` photoelectrons.
+        """
+        mean, memory = brightest - math.log1p(-dark), np.zeros(2)
+        for _ in range(STEADY_ROUNDS):
+            before, memory = memory[0], self.after(mean, memory, 1)
+            if memory[0] <= before * (1 + STEADY_CHANGE):
+                break
+        return float(self.chance(dark, memory))
 
     def sight_by_last(self, rates: F64, rounds: int = 3) -> F64:
         """Return what afterpulses add to -log of silence in each slot of a cycle with the shares of clicks `rates`, float64 (slots, 2).

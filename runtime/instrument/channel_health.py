@@ -78,6 +78,7 @@ class Finding:
     rate: float
     expected: float
     words: str
+    after_clicks: bool = False  # found, and counted, in dark exposures within reach of afterpulses
 
     def event(self) -> dict[str, Any]:
         """Return it as an event for the recording."""
@@ -91,7 +92,7 @@ class Finding:
             "rate": self.rate,
             "expected": self.expected,
             "words": self.words,
-        }
+        } | ({"after_clicks": True} if self.after_clicks else {})
 
 
 @dataclass(slots=True)
@@ -107,10 +108,10 @@ class _State:
 
 
 class ChannelHealth:
-    """The present state of all channels behind one watch."""
+    """The present state of all channels behind one watch, which has seen dark exposures `after_clicks` or others."""
 
-    def __init__(self, watch: ChannelWatch) -> None:
-        self._watch = watch
+    def __init__(self, watch: ChannelWatch, *, after_clicks: bool = False) -> None:
+        self._watch, self._after_clicks = watch, after_clicks
         self._states: dict[tuple[int, ...], _State] = {}
 
     @property
@@ -191,7 +192,14 @@ class ChannelHealth:
         was, now = state.finding, self._watch.exposures
         length = now - was.since
         words = f"{_who(was.channels, self._watch.n_channels)} as expected again: {was.kind} is over after about {length} dark exposures"
-        return Finding("over", "notice", was.channels, now, was.since, was.expected, was.expected, words)
+        words = f"{self._when}{words}"
+        return Finding(
+            "over", "notice", was.channels, now, was.since, was.expected, was.expected, words, self._after_clicks
+        )
+
+    @property
+    def _when(self) -> str:
+        return "right after clicks " if self._after_clicks else ""
 
     def _name(self, alarm: Alarm) -> Finding:
         watch = self._watch
@@ -209,10 +217,12 @@ class ChannelHealth:
         ends = wilson_interval(int(alarm.clicks[list(channels)].sum()), alarm.exposures * len(channels))
         between = " to ".join(number(end / expected) for end in ends)
         words = (
-            f"{_who(channels, watch.n_channels)} {number(ratio)} times as often as expected in the dark (95 % interval {between}; "
+            f"{self._when}{_who(channels, watch.n_channels)} {number(ratio)} times as often as expected in the dark (95 % interval {between}; "
             f"{rate:.3g} per exposure, expected {expected:.3g}) in the {length} dark exposures before it was noticed: {_CAUSES[kind]}"
         )
-        return Finding(kind, level, channels, alarm.exposure, alarm.since, rate, expected, words)
+        return Finding(
+            kind, level, channels, alarm.exposure, alarm.since, rate, expected, words, self._after_clicks
+        )
 
     def _concerned(self, alarm: Alarm) -> tuple[tuple[int, ...], float, float]:
         """Return the channels concerned, their rate since the change, and the expected one."""

@@ -83,6 +83,8 @@ class DarkRun:
             expected, low, high = self.calibration.dark_probability(self.profile, plan.exposure_us, channels)
             hardly = self.calibration.dark_clicks(channels) < FEW_CLICKS  # measured: the profile's, as far as possible
             expected = np.where(hardly, np.clip(said, low, high), expected)
+        afterpulses = afterpulses_of(self.profile, plan.exposure_us)
+        brightest = float(bundle.pattern_levels.sum(axis=1, dtype=np.uint64).max()) * bundle.photons_per_level
         per_hour = (plan.dark_slots_per_cycle or plan.slots_per_cycle) * 3.6e9 / plan.cycle_us
         self._header = {
             "policy": self.policy,
@@ -90,7 +92,8 @@ class DarkRun:
             "expected": expected.tolist(),
             "low": low.tolist(),
             "high": high.tolist(),
-            "afterpulses": afterpulses_of(self.profile, plan.exposure_us).exposures_seen(float(np.min(expected))),
+            "afterpulses": afterpulses.exposures_seen(float(np.min(expected))),
+            "after_clicks": afterpulses.chance_after_clicks(float(np.max(high)), brightest) if afterpulses else None,
             "lit": {
                 "arl_exposures": max(LEAST_ARL, 2 * FALSE_ALARM_H * plan.slots_per_cycle * 3.6e9 / plan.cycle_us),
                 "arl_objects": max(LEAST_ARL, 2 * FALSE_ALARM_H * 3600 * plan.objects_hz),
@@ -129,7 +132,7 @@ class DarkRun:
         Not while the detector is in a state that changes them: that is named already, and is no change of light.
         """
         guard = getattr(run.core, "guard", None)
-        if guard is not None and guard.health.present:
+        if guard is not None and guard.present:
             return
         for found in self.light.take(_measured_clicks(output.decisions)):
             run.journal.note("light_changed", **found)

@@ -147,7 +147,7 @@ class Snapshots:
         guard = getattr(self._run.core, "guard", None)
         if guard is None:
             return {}
-        watch, facts, rates = guard.watch, dict[str, Any](), guard.health.rates()  # as they are by now
+        watch, facts = guard.watch, dict[str, Any]()
         if watch.exposures:  # one detector in one exposure, as what is expected; a flow tells by its empty frames
             facts = {"dark_exposures": watch.exposures * watch.n_channels, "dark_clicks": int(watch.clicks.sum())}
         return facts | {
@@ -157,8 +157,8 @@ class Snapshots:
             "dark_alarm_after": watch.alarm_after(),
             "dark_changed": bool(guard.findings),
             "dark_states": [
-                [one.level, rates[list(one.channels)].mean() / one.expected, one.words, one.since * watch.n_channels]
-                for one in sorted(guard.health.present, key=lambda one: -LEVELS.index(one.level))
+                [one.level, guard.present_rate(one) / one.expected, one.words, one.since * watch.n_channels]
+                for one in sorted(guard.present, key=lambda one: -LEVELS.index(one.level))
             ],
         }
 

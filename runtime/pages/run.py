@@ -39,7 +39,7 @@ NO_TIME_US = 0.05  # p99 of the host's own time
 CONFIDENCE_BINS = 10
 _NOT_WALKED = int(DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE)
 NEVER_NS = 1 << 62
-_OF_A_STATE = ("since_dark_exposure", "channels")  # what tells which state is over
+_OF_A_STATE = ("since_dark_exposure", "channels", "after_clicks")  # what tells which state is over
 PHASES = ("before it began", "until it was noticed", "from then on", "after it was over")
 _MARKS = ("device_end_ns", "arrival_ns", "arrival_ns", "decided_ns", "recorded_ns")  # of the ledger's stages
 _CURVES = {"link": "on the link", "decide": "in the host, to the decision", "record": "to the recorder"}
@@ -199,6 +199,8 @@ def dark_states(recording: Recording, rates: Rates, found: Sequence[Mapping[str,
     states = []
     for one in found:
         numbers = one["since_dark_exposure"], one["dark_exposure"] - 1, one["over"]
+        if one.get("after_clicks"):  # numbered among exposures that `rates` leaves out
+            numbers = None, None, None
         edges = [rates.dark_ticks[number] for number in numbers if number in rates.dark_ticks]
         phases = decisions_between(recording, edges) if len(edges) >= 2 and edges == sorted(edges) else []
         states.append({**one, "times": [rates.seconds_at(number) for number in numbers], "phases": phases})
@@ -349,6 +351,8 @@ def run_page(recording: Recording) -> bytes:
 
 def moment_of(event: Mapping[str, Any], decisions: Decisions, rates: Rates) -> str:
     """Return the seconds of the run at which an event was, by its tick, its decision or its dark exposure; "" where it has none."""
+    if event.get("after_clicks"):  # numbered among exposures that `rates` leaves out
+        return ""
     found = {"tick": rates.since_begin, "decision": decisions.when, "first_decision": decisions.when}
     found["dark_exposure"] = lambda number: rates.seconds_at(number - 1)
     at = next((find(int(event[key])) for key, find in found.items() if key in event), None)
