@@ -302,7 +302,7 @@ class _Run:
             if self.plan.automaton is not None:
                 say(f"pans: {drive_words(self.dark.profile, bundle, self.plan)}")
             n_cycles = n_objects * self.plan.cycles_per_object
-            self.dark.expect(self.plan, bundle)
+            self.dark.expect(self.plan, bundle, options.trials)
             self.core = Core(self.plan, decider, shots, n_cycles, self.dark.guard(self.plan, bundle, shots))
         self.header = recording_header(options, profile, bundle_sha256, decider, n_objects, self.plan)
         parts = {"dark": self.dark, "registration": self.registration, "flow": self.flow_run}
@@ -406,7 +406,7 @@ class _Run:
             illumination=self.bundle.illumination() * self.frames if shown is None else shown,
             expected_decisions=self.expected_decisions,
             flow=None if self.flow_run is None else self.flow_run.figures(),
-            dark=self.dark.figures(result.dark),
+            dark=self.dark.figures(result.dark, *self._lit(result), saturates=self.plan.largest == 1),
             walks=walks,
             registration=None if self.registration is None else self.registration.facts(),
             late_allowed=options.late_allowed,
@@ -418,6 +418,14 @@ class _Run:
         warn(fault)
         options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
         return options, replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
+
+    def _lit(self, result: RunResult) -> tuple[int, int]:
+        """Return clicks, and exposures with light that may each have given one; 0 and 0 of objects that pass by."""
+        tally = result.tally
+        if self.flow_run is not None:
+            return 0, 0
+        fixed = tally.decisions * tally.shots * self.plan.n_patterns if self.plan.automaton is None else 0
+        return tally.clicks, fixed or tally.exposures * self.plan.channels_at_once
 
     def _conclude(self, options: RunOptions, result: RunResult, summary: Summary) -> Outcome:
         """Write the page and return what came of the run."""

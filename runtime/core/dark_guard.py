@@ -433,7 +433,9 @@ class DarkGuard:
         assert self._adapter is not None
         extra, masked = self._concerned(serious)
         # Right after a click no other table helps: its dark clicks depend on that click.
-        abstains = any(one.after_clicks for one in serious) or masked.all() or not self._adapter.can_do(masked | (extra > 0))
+        abstains = (
+            any(one.after_clicks for one in serious) or masked.all() or not self._adapter.can_do(masked | (extra > 0))
+        )
         return DecisionFlag.DARK_ALARM | (DecisionFlag.ABSTAINED if abstains else DecisionFlag(0))
 
     def decider(self, ordinary: Decider) -> Decider:
@@ -499,7 +501,9 @@ class DarkGuard:
     def _alarm_behind(self, report: DarkReport) -> str:
         """Return what is wrong with the dark exposures after clicks, or that no dark exposure could be watched; "" if nothing is."""
         behind = self.behind
-        if behind is not None and (found := dark_report(float(behind.high[0]), behind.exposures, int(behind.clicks[0])).alarm):
+        if behind is not None and (
+            found := dark_report(float(behind.high[0]), behind.exposures, int(behind.clicks[0])).alarm
+        ):
             return f"right after clicks: {found}"
         if self.watch.exposures or report.exposures < UNWATCHED_MOST:
             return ""

@@ -34,7 +34,7 @@ class Walks(NamedTuple):
 
     `successors` uint32 (states, outcomes). `nodes` int64 (windows,) is where each walk stands: a state, `states` + a leaf, or BROKEN.
     `need` int64 (windows,) is how many right exposures make it whole, `last` int64 (windows,) the last exposure of the visit that belongs
-    to it. `shown` int64 (states,) counts the exposures of each state in the whole run.
+    to it. `shown` and `clicked` int64 (states,) count the exposures of each state in the whole run, and those with a click.
     """
 
     successors: npt.NDArray[np.uint32]
@@ -42,6 +42,7 @@ class Walks(NamedTuple):
     need: npt.NDArray[np.int64]
     last: npt.NDArray[np.int64]
     shown: npt.NDArray[np.int64]
+    clicked: npt.NDArray[np.int64]
 
 
 class WindowArrays(NamedTuple):
@@ -124,7 +125,7 @@ def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # 
     dark, and all else for nothing.
     """
     slot_at, window_at = maps
-    successors, nodes, need, last, shown = walks
+    successors, nodes, need, last, shown, clicked = walks
     n_states = successors.shape[0]
     for i in range(patterns.shape[0]):
         slot, window, stamp = slot_at[relative + i], window_at[relative + i], patterns[i]
@@ -135,6 +136,7 @@ def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # 
             counts[window, slot] = bits[i]
             seen[window, 0] += 1
             shown[node] += 1
+            clicked[node] += bits[i] != 0
             nodes[window] = np.int64(successors[node, bits[i]])
             if nodes[window] >= n_states:
                 need[window], last[window] = seen[window, 0], relative + i
@@ -414,7 +416,7 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
     automaton = plan.automaton
     if automaton is None:
         none = read_only(np.zeros((0, 2), np.uint32)), np.zeros(0, np.int64)
-        return Walks(*none, np.full(len(last), shots * n_features, np.int64), last, np.zeros(0, np.int64))
+        return Walks(*none, np.full(len(last), shots * n_features, np.int64), last, *np.zeros((2, 0), np.int64))
     slots = int(np.count_nonzero(plan.slot_pattern == ADAPTIVE_PATTERN))
     if shots != 1:
         raise PlanError(
@@ -423,8 +425,8 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
         )
     if not automaton.n_slots <= slots <= n_features:
         raise PlanError(f"walks of {automaton.n_slots} exposures in cycles of {slots} for numbers of {n_features}")
-    nodes, shown = np.zeros(len(last), np.int64), np.zeros(automaton.n_states, np.int64)
-    return Walks(read_only(automaton.successors), nodes, np.full(len(last), slots, np.int64), last, shown)
+    nodes, (shown, clicked) = np.zeros(len(last), np.int64), np.zeros((2, automaton.n_states), np.int64)
+    return Walks(read_only(automaton.successors), nodes, np.full(len(last), slots, np.int64), last, shown, clicked)
 
 
 def visit_maps(plan: Plan, shots: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:

@@ -220,9 +220,7 @@ class ChannelHealth:
             f"{self._when}{_who(channels, watch.n_channels)} {number(ratio)} times as often as expected in the dark (95 % interval {between}; "
             f"{rate:.3g} per exposure, expected {expected:.3g}) in the {length} dark exposures before it was noticed: {_CAUSES[kind]}"
         )
-        return Finding(
-            kind, level, channels, alarm.exposure, alarm.since, rate, expected, words, self._after_clicks
-        )
+        return Finding(kind, level, channels, alarm.exposure, alarm.since, rate, expected, words, self._after_clicks)
 
     def _concerned(self, alarm: Alarm) -> tuple[tuple[int, ...], float, float]:
         """Return the channels concerned, their rate since the change, and the expected one."""

@@ -114,7 +114,7 @@ class LightWatch:
         if self.stated and not self.found and (ends or n.bit_count() == 1):
             wanted = self.stated * self.batch
             if abs(mean - wanted) > CHANGE * wanted + (STATED_ERRORS + STATED_FEW / n) * error:
-                self._note(mean / wanted, 0, "the bundle states")
+                self._note(mean / wanted, 0, stated=True)
         if ends:
             self.baseline = make_baseline(mean, deviation, error, self.arl_batches)
             self._since = dict.fromkeys(self._since, (self.decisions, self._batches, self._total))
@@ -151,17 +151,19 @@ class LightWatch:
         """Note the change, and begin a new baseline: from here on clicks are compared with the new mean."""
         decisions, batches, clicks = self._since[side]
         ratio = (self._total - clicks) / ((self._batches - batches) * base.mean)
-        self._note(ratio, decisions, "they were at the beginning")
+        self._note(ratio, decisions, stated=False)
         self.baseline, self._learnt = None, (0, 0, 0)
         self._sums = dict.fromkeys(self._sums, 0.0)
 
-    def _note(self, ratio: float, since: int, what: str) -> None:
+    def _note(self, ratio: float, since: int, *, stated: bool) -> None:
+        what = "the bundle states" if stated else "they were at the beginning"
         side = "fall" if ratio < 1 else "rise"
         words = (
             f"clicks per decision {'fell' if side == 'fall' else 'rose'} to {ratio:.3g} of what {what}, since about "
             f"{self.decisions - since} decisions: light source, place of the object, detector efficiency, or other objects; calibrate again"
         )
-        self.found.append({"side": side, "ratio": ratio, "decision": self.decisions, "since": since, "words": words})
+        found = {"side": side, "ratio": ratio, "decision": self.decisions, "since": since, "words": words}
+        self.found.append(found | {"stated": True} if stated else found)
 
 
 def make_baseline(mean: float, deviation: float, error: float, arl_batches: float) -> Baseline:

@@ -84,6 +84,7 @@ class Summary:
     simulated: bool
     verdict: str
     faults: list[str]
+    warnings: list[str]  # what may have spoilt decisions, and is no fault
     calibration: dict[str, Any] | None
     calibration_warnings: list[str]
     light: dict[str, Any] | None
@@ -130,7 +131,7 @@ def summarise(
     the host waiting, and nothing else is wrong.
     """
     timing = result.timing
-    dark = DarkFigures(None, [], None, []) if dark is None else dark
+    dark = DarkFigures(None, [], None, [], []) if dark is None else dark
     more = ([] if flow is None else gate_faults(flow.gates)) + dark.faults
     faults = find_faults(result, expected_decisions, aborts_are_faults=flow is None, late_allowed=late_allowed) + more
     busy = ""
@@ -155,6 +156,7 @@ def summarise(
         "simulated": bool(result.device.get("simulated")),
         "verdict": "FAIL" if faults else "PASS",
         "faults": faults,
+        "warnings": dark.changes,
         "calibration": dark.calibration,
         "calibration_warnings": dark.warnings,
         "light": dark.light,

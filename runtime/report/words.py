@@ -36,7 +36,10 @@ Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 def closing_words(summary: Summary, recording: str, report: str) -> str:
     """The lines that the command ends with."""
     facts = summary.as_json()
-    last = [("fault", fault, "") for fault in facts["faults"]] + [("busy", words, "") for words in _busy_words(facts)]
+    last = [("fault", fault, "") for fault in facts["faults"]]
+    last += [("warning", words, "") for words in facts["warnings"]] + [
+        ("busy", words, "") for words in _busy_words(facts)
+    ]
     last += [("recording", recording, ""), ("report", report, "")]
     simulated = "SIMULATED · " * facts["simulated"]
     abstained = f", {facts['abstained']} abstained" if facts.get("abstained") else ""
@@ -265,6 +268,7 @@ def write_markdown(
         simulated,
         f"**{facts['verdict']}**{markdown(_but(facts))}",
         *(f"- {markdown(fault)}" for fault in facts["faults"]),
+        *(f"- warning: {markdown(words)}" for words in facts["warnings"]),
         *_table("Results", ("figure", "value", ""), rows_of(facts, "figures", "flow", "walks")),
         *_table("Timing", ("microseconds", *QUANTILES), [] if _is_virtual(facts) else stage_rows(facts)),
         *(f"- {name}: {markdown('; '.join(filter(None, texts)))}" for name, *texts in rows_of(facts, "timing")),

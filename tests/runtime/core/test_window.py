@@ -166,6 +166,10 @@ def test_walks_match_the_oracle(case: tuple[Plan, dict[int, tuple[int, int]], se
     assert tallies[LATE_SLOTS] == sum(walk["late"] for walk in walks)
     shown = np.bincount([state for walk in walks for state in walk["states"]], minlength=plan.automaton.n_states)
     assert windows.walks.shown.tolist() == shown.tolist()
+    clicked = np.zeros(plan.automaton.n_states, np.int64)
+    for walk in walks:
+        np.add.at(clicked, walk["states"], np.array(walk["clicks"][: len(walk["states"])]) > 0)
+    assert windows.walks.clicked.tolist() == clicked.tolist()
 
 
 def test_a_walk_is_decided_at_its_leaf_not_at_the_end_of_its_cycle() -> None:

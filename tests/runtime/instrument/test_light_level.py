@@ -130,7 +130,10 @@ def test_a_run_beside_its_place_says_so(tmp_path: Path, pans: Pans) -> None:
     device = "sim:dmd-spad?scene=fashion200&pace=fast&seed=3&optics=shift={0},{0}"
     for shift, found in ((0, 0), (1, 1)):
         words = ["run", "fashion-adaptive", "--device", device.format(shift), "--decisions", "1650", "--no-realtime"]
-        light = pans(*words, "--out", tmp_path / str(shift))["light"]
+        summary = pans(*words, "--out", tmp_path / str(shift), code=found)
+        light = summary["light"]
         assert light["clicks_stated"] == pytest.approx(5.46, abs=0.01)
         assert len(light["found"]) == found
+        # what the bundle states is contradicted: a fault without a calibration, too
+        assert summary["faults"] == [one["words"] for one in light["found"]]
     assert 1.1 < light["found"][0]["ratio"] < 1.35
