@@ -217,7 +217,8 @@ class ChannelHealth:
         ends = wilson_interval(int(alarm.clicks[list(channels)].sum()), alarm.exposures * len(channels))
         between = " to ".join(number(end / expected) for end in ends)
         words = (
-            f"{self._when}{_who(channels, watch.n_channels)} {number(ratio)} times as often as expected in the dark (95 % interval {between}; "
+            f"{self._when}{_who(channels, watch.n_channels)} {number(ratio)} times as often as expected in the dark "
+            f"(95 % interval {between}; "
             f"{rate:.3g} per exposure, expected {expected:.3g}) in the {length} dark exposures before it was noticed: {_CAUSES[kind]}"
         )
         return Finding(kind, level, channels, alarm.exposure, alarm.since, rate, expected, words, self._after_clicks)

@@ -266,6 +266,56 @@ def test_an_afterpulse_is_no_dark_count() -> None:
     assert found[False]
 
 
+@pytest.mark.parametrize(("chance", "found"), [(0.02, False), (1.0, True)])
+def test_dark_exposures_after_clicks_are_held_against_the_highest_chance_of_an_afterpulse(
+    chance: float, found: bool
+) -> None:
+    plan, expected = shot_major(3, 1), np.array([0.01])
+    watch = ChannelWatch(1, expected, WatchSettings(arl_exposures=1e7))
+    most = np.array([Afterpulses(0.02).chance_after_clicks(0.01, 5.0)])
+    assert most[0] == pytest.approx(1 - 0.99 * 0.98)
+    behind = ChannelWatch(1, most, WatchSettings(arl_exposures=1e7), np.array([1e-9]))
+    guard = DarkGuard(plan, watch, "warn", afterpulses=1, behind=behind)
+    bits = np.ones(4 * 1500, np.uint8)
+    bits[::4] = np.random.default_rng(3).random(1500) < chance
+    findings = []
+    for first in range(0, len(bits), 40):
+        shown = np.resize(plan.slot_pattern, 40)
+        findings += guard.take(ClickBlock(0, 0, 0, first, 100, 0, shown, bits[first : first + 40]))
+    report = guard.report(dark_report(0.01, 1500, int(bits[::4].sum())))
+    assert (watch.exposures, behind.exposures) == (0, 1500)
+    assert [(one.kind, one.level) for one in findings] == [("burst", "alarm")] * found
+    assert all("right after clicks" in one.words and one.event()["after_clicks"] for one in findings)
+    assert [one.words for one in guard.present] == [one.words for one in findings]
+    assert ("right after clicks" in report.alarm) == found
+
+
+def test_dark_exposures_of_which_none_can_be_watched_are_an_alarm() -> None:
+    plan = shot_major(3, 1)
+    guard = DarkGuard(plan, ChannelWatch(1, np.array([0.01])), "warn", afterpulses=2)
+    assert "none of 100 dark exposures" in guard.report(dark_report(0.01, 100, 1)).alarm
+    assert guard.report(dark_report(0.01, 5, 0)).alarm == ""
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.5, 3.0])
+def test_no_history_leads_to_a_higher_chance_than_the_highest(tau: float) -> None:
+    law, rng = Afterpulses(0.1, tau, 0.1), np.random.default_rng(1)
+    most, memory = law.chance_after_clicks(0.01, 4.0), np.zeros(2)
+    for _ in range(300):
+        light = float(rng.choice([0.0, 1.0, 4.0]))
+        memory = law.after(light + 0.01, memory, int(rng.random() < 0.8))
+        assert law.chance(0.01, memory) <= most * (1 + 1e-3)
+
+
+def test_a_detector_that_always_clicks_fails(tmp_path: Path, pans: Pans) -> None:
+    device = "sim:dmd-spad?scene=fashion200&seed=1&pace=fast&changes=dark:at_s=0.01:factor=10000"
+    words = ["run", "fashion-adaptive", "--device", device, "--decisions", "200", "--no-realtime", "--out", tmp_path]
+    summary = pans(*words, code=1)
+    assert summary["verdict"] == "FAIL"
+    assert any(fault.startswith("right after clicks the detector clicks") for fault in summary["faults"])
+    assert main(["replay", str(tmp_path / "run.pansrec")]) == 0
+
+
 def test_dark_exposures_count_when_it_was_silent_for_long_enough() -> None:
     plan = shot_major(3, 1)
     bits = (np.random.default_rng(2).random(4000) < 0.2).astype(np.uint8)
