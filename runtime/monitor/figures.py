@@ -168,7 +168,7 @@ def dark_state(picture: dict[str, Any]) -> tuple[str, str, str]:
     if states := picture.get("dark_states"):
         level, ratio, *_ = states[0]
         return (
-            f"{number(ratio)} times the expected rate",
+            f"{number(ratio)} times the expected rate since it changed",
             "; ".join(one_line(one[2], 300) for one in states),
             LEVELS[level],
         )
@@ -241,8 +241,8 @@ def health(history: History) -> list[tuple[str, str, str]]:
     words, _, level = dark_state(picture)
     when = " in the last minute" if some is sums else ""
     rate = f"{dark / exposures:.2g} dark counts per exposure{when}" if exposures else "No dark exposures yet"
-    if dark and picture.get("dark_states"):  # of the counts that stand here, like the rate
-        words = f"{number(dark / exposures / picture['dark_expected'])} times the expected rate"
+    if picture.get("dark_states"):  # one figure on the page: that of `dark_state`, not one of another window
+        rate, words = f"Dark counts {words}", ""
     detector = level or "note", f"{rate}{f', {words}' if words else ''}."
     return [("machine", *machine), ("link", *link), ("detector", *detector)]
 

@@ -119,7 +119,7 @@ def test_an_alarm_has_a_beginning_an_end_and_a_cause() -> None:
                 "dark_states": [["alarm", 50.0, "hot", 9]],
             },
             ["good", "good", "bad"],
-            "0.02 dark counts per exposure in the last minute, 20 times the expected rate",
+            "Dark counts 50 times the expected rate since it changed.",
         ),
         (
             {"dark_clicks": 8, "dark_exposures": 400, "dark_expected": 0.001, "dark_high": 0.001, "dark_changed": True},
