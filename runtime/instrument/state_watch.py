@@ -55,7 +55,8 @@ class StateWatch:
         self._seen: I64 = np.zeros((2, n), np.int64)  # exposures and clicks at the last look
         self._sums: F64 = np.zeros((2, n))  # those that count
         self._walks_before = 0  # that count no more
-        self._restart()
+        self._looks, self._squares = 0, Squares()
+        self._kept = dict[int, tuple[F64, Squares]]()  # sums and squares as they were at some of the looks
 
     @staticmethod
     def of_pace(n_states: int, walks_hz: float, trials: int) -> StateWatch:
@@ -110,8 +111,7 @@ class StateWatch:
 
     def _restart(self) -> None:
         self._sums = np.zeros_like(self._sums)
-        self._looks, self._squares = 0, Squares()
-        self._kept = dict[int, tuple[F64, Squares]]()  # sums and squares as they were at some of the looks
+        self._looks, self._squares, self._kept = 0, Squares(), {}
 
     def _compare(self, level: int) -> None:
         """Compare the latest 2^`level` stretches with all before them."""
