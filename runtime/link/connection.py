@@ -147,8 +147,16 @@ class Connection:
     def handshake(self) -> Welcome:
         """Open the session and return what the device says of itself; the device leaves SAFE if it was latched there."""
         self.session.start(self.link.now_ns())
-        while self.session.welcome is None:
-            self.pump(SETUP_POLL_S)
+        try:
+            while self.session.welcome is None:
+                self.pump(SETUP_POLL_S)
+        except LinkError as error:
+            if isinstance(error, DeviceError) or not getattr(self.link, "is_shared", bool)():
+                raise
+            raise LinkError(
+                f"{self.link.name} is in use by another program, and answers one at a time: {error.message}",
+                remedy="end the other program, or name another device",
+            ) from error
         welcome = self.session.welcome
         if wrong := wrong_facts(welcome.facts):
             raise DeviceError(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import select
+import socket
 import sys
 import time
 from contextlib import suppress
@@ -19,6 +20,7 @@ from pans.runtime.errors import LinkError, UsageError
 READ_BYTES = 1 << 16
 READ_POLL_S = 0.05
 WRITE_TIMEOUT_S = 2.0
+TCP_ESTABLISHED = "01"  # in Linux's /proc/net/tcp
 FTDI_SLOW_MS = 2  # above it an adapter keeps bytes longer than a decision may take
 
 
@@ -80,6 +82,22 @@ class SerialLink:
             return int(self._port.fileno()) if self._selectable else None
         except self._errors:
             return None
+
+    def is_shared(self) -> bool:
+        """Whether another connection of this machine leads to the same socket; False where the system does not tell."""
+        if (handle := self.fileno()) is None:
+            return False
+        try:
+            ours = socket.socket(fileno=handle)  # only to ask: the descriptor stays pyserial's
+            try:
+                host, port = ours.getpeername()
+            finally:
+                ours.detach()
+            there = f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"
+            rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()]
+        except (OSError, ValueError):  # no socket, one of IPv6, no Linux
+            return False
+        return sum(row[2:4] == [there, TCP_ESTABLISHED] for row in rows) > 1
 
     def close(self) -> None:
         """See `Link.close`."""

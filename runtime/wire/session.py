@@ -84,6 +84,7 @@ class HostSession:
         self._retry_after_ns = RETRY_FIRST_NS
         self._oldest_ns = 0
         self._fast_retry_ns = 0  # not before
+        self._repeats = False  # commands that are sent again wait in the output
         self._probe_id = 0
         self._probes: dict[int, int] = {}  # sent and not answered: id and host time
 
@@ -151,6 +152,7 @@ class HostSession:
             return b""
         data = b"".join(self._output)
         self._output.clear()
+        self._repeats = False
         return data
 
     # -- commands that the kernel sends --------------------------------------------------------------------------------
@@ -190,7 +192,7 @@ class HostSession:
                     )
                 raise LinkError(
                     f"no WELCOME within {HELLO_GIVE_UP_NS // NS_PER_MS} ms",
-                    remedy="check that the device runs firmware of protocol 1 and that the port is the right one",
+                    remedy="check that no other program uses the device, that the port is right, and that its firmware speaks protocol 1",
                 )
             self._output.append(wire.encode_hello(self.nonce))
             self._hello_due_ns = now_ns + HELLO_EVERY_NS
@@ -212,10 +214,16 @@ class HostSession:
                 f"command {self._unacknowledged[0][0]} was not acknowledged within {RETRY_GIVE_UP_NS // NS_PER_MS} ms",
                 remedy="check the link; `pans doctor` looks at the port",
             )
-        self._output.extend(frame for _, frame in self._unacknowledged)
-        self.counters.retransmissions += len(self._unacknowledged)
+        self._repeat()
         self._retry_after_ns = min(2 * self._retry_after_ns, RETRY_LONGEST_NS)
         self._retry_due_ns = now_ns + self._retry_after_ns
+
+    def _repeat(self) -> None:
+        """Send what is not acknowledged again, once in an output: a backlog of old ACKs would repeat all of it every 10 ms."""
+        if not self._repeats:
+            self._repeats = True
+            self._output.extend(frame for _, frame in self._unacknowledged)
+            self.counters.retransmissions += len(self._unacknowledged)
 
     # -- what the device says ------------------------------------------------------------------------------------------
 
@@ -289,8 +297,7 @@ class HostSession:
         if oldest > ack.last_id and now_ns >= self._fast_retry_ns:
             # A later command was answered, so the oldest is lost: a gate cannot wait for the time-out.
             self._fast_retry_ns = now_ns + FAST_RETRY_NS
-            self._output.extend(frame for _, frame in self._unacknowledged)
-            self.counters.retransmissions += len(self._unacknowledged)
+            self._repeat()
         while self._unacknowledged and self._unacknowledged[0][0] <= ack.last_id:
             acknowledged, _ = self._unacknowledged.popleft()
             self._oldest_ns, self._retry_after_ns = now_ns, RETRY_FIRST_NS

@@ -436,3 +436,21 @@ def test_a_simulated_instrument_behind_another_scheme_is_recorded_as_simulated(t
     assert result.recording is not None
     recording = pans.load_recording(result.recording)
     assert recording.header["simulated"] is recording.simulated is result.summary.simulated is True
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells whose sockets are connected")
+def test_a_device_that_another_program_uses_is_said_to_be_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pans.runtime.wire.session.HELLO_GIVE_UP_NS", 300_000_000)
+    device, clock = build_instrument(OPTIONS, time.perf_counter_ns())
+    with served(device, clock) as port:
+        first = Connection(open_link(port.url))
+        first.handshake()
+        second = Connection(open_link(port.url))
+        with pytest.raises(LinkError, match="in use by another program") as refused:
+            second.handshake()
+        assert "firmware" not in refused.value.remedy
+        second.close()
+        first.close()
+        third = Connection(open_link(port.url))
+        third.handshake()
+        third.close()

@@ -198,6 +198,18 @@ def test_a_lost_command_is_repeated_at_once_but_not_for_every_answer() -> None:
         assert ids(sent(session)) == repeated, now_ns
 
 
+def test_a_backlog_of_old_answers_repeats_the_commands_once() -> None:
+    """Each ACK comes 300 times, spread over seconds, and is read at once: the output must not grow with their number."""
+    session = opened(8)
+    sent(session)
+    for number in range(300):
+        acknowledge(session, 0, now_ns=number * 20 * MS)
+    assert ids(sent(session)) == list(range(1, 9))
+    acknowledge(session, 0, now_ns=300 * 20 * MS)
+    assert ids(sent(session)) == list(range(1, 9))
+    assert session.counters.retransmissions == 16
+
+
 def test_stream_and_status_frames_are_handed_on_the_rest_is_digested() -> None:
     session = opened()
     assert deliver(session, wire.encode_mark(wire.Mark(0, 0, 0, 0, 0, 0.0), NONCE)) == [True]
