@@ -16,16 +16,19 @@ from commands import fixed_run, json_of, page_of, words_of
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.runtime.core.follower import exposure_timing
+from pans.runtime.core.follower import Place, exposure_timing
+from pans.runtime.core.still import Core
 from pans.runtime.live import RunOptions, RunResult, run_live
 from pans.runtime.pages.run import advice_on
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.replaying import replay
+from pans.runtime.record.sent_plan import sent_to_device
 from pans.runtime.report.summary import exposure_fault, find_faults
 from pans.runtime.report.words import exposure_words
 from pans.runtime.timing.ledger import TimingLedger
-from pans.runtime.wire.messages import Exposed, encode_exposed
+from pans.runtime.wire.messages import Exposed, Frame, MessageType, encode_exposed, unpack_body
 from pans.runtime.wire.schema import EXPOSED_SCHEMA
+from pans.runtime.wire.session import STREAM_TYPES
 
 FRAMES = 900
 MOST = 40  # ticks
@@ -38,11 +41,17 @@ class Board(Instrument):
     schema: int | None = EXPOSED_SCHEMA
     copies = 1  # of each EXPOSED
     beyond = 0  # what is added to their numbers
+    every_ticks = 0  # between STATUS and STATUS, above 0
 
     def __init__(self, *what: Any, **words: Any) -> None:
         self.off: list[tuple[int, int]] = []
         self.dice = random.Random(words["seed"])
         super().__init__(*what, **words)
+
+    def _send_status(self) -> None:
+        super()._send_status()
+        if self.every_ticks and self._status_tick is not None:
+            self._status_tick = self._tick + self.every_ticks
 
     def _send_exposed(self, ended: int) -> None:
         first = len(self.off)
@@ -106,6 +115,59 @@ def test_a_device_that_does_not_announce_it_is_not_judged(tmp_path: Path, schema
     assert exposure_words(again) == "not told by the device"
     assert find_faults(result, 0) == []
     assert result.decisions_sha256 == told.decisions_sha256
+
+
+def talkative(path: Path) -> tuple[Any, list[Frame]]:
+    """A core that has begun the stream of a run with a STATUS every 20 ms, and the run's messages."""
+    ran(path, every_ticks=20_000)
+    recording = read_recording(path / "run.pansrec")
+    (arm,) = sent_to_device(recording).arms.values()
+
+    def core() -> Core:
+        begun = fault_grid.Case.of("sequential", FRAMES).core
+        begun.begin(arm.start_tick, arm.n_cycles)
+        return begun
+
+    return core, [unpack_body(body) for _, body in recording.messages()]
+
+
+@pytest.mark.parametrize(
+    ("is_old", "silent", "judged"), [(False, False, False), (False, True, True), (True, True, False)]
+)
+def test_a_part_of_a_recording_goes_on_with_what_was_told_before_it(
+    tmp_path: Path, *, is_old: bool, silent: bool, judged: bool
+) -> None:
+    """One that was made before parts knew is not judged; `silent`: EXPOSED ends with the first part."""
+    core, frames = talkative(tmp_path)
+    one, later, place, half = core(), core(), None, 0
+    while place is None or half < len(frames) // 2:
+        one.step(frames[half])
+        half += 1
+        place = one.part()
+    assert place.told[0] > 500
+    assert place.told[1] > MOST // 2
+    facts = json.loads(json.dumps(place.facts()))
+    later.resume(Place.of({name: value for name, value in facts.items() if name != "told" or not is_old}))
+    for frame in frames[half:]:
+        if not silent or frame.type != MessageType.EXPOSED:
+            later.step(frame)
+    assert (later.completed, later.contradictions) == (True, {})
+    assert (later.untold > 0) is judged
+
+
+def test_the_tail_of_a_stream_that_broke_off_need_not_be_told_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core, frames = talkative(tmp_path)
+    monkeypatch.setattr("pans.runtime.core.follower.TAIL_US", 40_000.0)
+    last = max(at for at, frame in enumerate(frames) if frame.type == MessageType.EXPOSED)
+    whole = [frame for frame in frames[:last] if frame.type != MessageType.STATUS]
+    for kept, is_told in ((frames[:last], True), (whole, True), ([f for f in whole if f.type in STREAM_TYPES], False)):
+        broken = core()
+        for frame in kept:
+            broken.step(frame)
+        broken.end()
+        assert (broken.untold == 0) is is_told
 
 
 def test_what_lies_beyond_the_plan_is_not_believed(tmp_path: Path) -> None:
