@@ -425,7 +425,7 @@ class _Run:
         if self.flow_run is not None:
             return 0, 0
         fixed = tally.decisions * tally.shots * self.plan.n_patterns if self.plan.automaton is None else 0
-        return tally.clicks, fixed or tally.exposures * self.plan.channels_at_once
+        return tally.of["decisions"].clicks, fixed or tally.exposures * self.plan.channels_at_once
 
     def _conclude(self, options: RunOptions, result: RunResult, summary: Summary) -> Outcome:
         """Write the page and return what came of the run."""
