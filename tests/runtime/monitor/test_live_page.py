@@ -194,7 +194,8 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         )
         for text in (
             "75.0%",
-            "600 of 1,000",
+            "630 of 1,000",
+            "of the 600 decisions",
             "SIMULATED",
             "dark counts",
             "hot",
