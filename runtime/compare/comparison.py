@@ -26,6 +26,7 @@ from pans.runtime.intervals import number
 from pans.runtime.pages.page import flat, render, words
 from pans.runtime.pages.run import Decisions, is_virtual, latency_curves, ledger_of
 from pans.runtime.record.parts import open_recording
+from pans.runtime.record.recorded_summary import checked_summary
 from pans.runtime.safe_text import one_line
 from pans.runtime.wire.messages import NO_OBJECT
 
@@ -87,7 +88,7 @@ def read_side(path: str | Path) -> Side:
         if "decisions" not in summary or "verdict" not in summary:
             remedy = "save what `pans run --json` prints, or name the recording"
             raise UsageError(f"{place}: not a summary: it has no keys `decisions` and `verdict`", remedy=remedy)
-        return Side(place, {}, summary, None, None, True)
+        return Side(place, {}, checked_summary(summary, str(place)), None, None, True)
     found = open_recording(place, salvage=True)
     decisions, told = found.decisions(), found.summary
     if distinct := int(told.get("device", {}).get("objects", 0)):  # then the first one is shown again

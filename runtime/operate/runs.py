@@ -37,6 +37,7 @@ from pans.runtime.ranges import Range
 from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
 from pans.runtime.record.log import skim_decisions
 from pans.runtime.record.parts import part_number
+from pans.runtime.record.recorded_summary import checked_summary
 from pans.runtime.safe_text import one_line
 
 OURS = re.compile(r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock")
@@ -148,8 +149,7 @@ def _end(path: Path) -> dict[str, Any]:
         where = str(path)
         chain = check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, FORMAT_VERSION, where)
         if (block := last_block(file, Kind.END, chain, LIMITS, where)) is not None:
-            summary = parse_json_object(block.payload, where).get("summary")
-            return summary if isinstance(summary, dict) else {}
+            return checked_summary(parse_json_object(block.payload, where).get("summary"), where)
     return {}
 
 

@@ -46,6 +46,7 @@ from .format import (
     expand_timings,
 )
 from .log import LogReader
+from .recorded_summary import checked_summary
 
 MESSAGES_AT_ONCE = ROWS_AT_ONCE = 1 << 14
 
@@ -330,9 +331,7 @@ class _Scan:
             for key, value in facts.items():
                 if end.get(key) != value:
                     raise DamagedFileError(f"{where}: END says {key} = {ascii(end.get(key))[:80]}, found {value}")
-            if not isinstance(end.get("summary"), dict):
-                raise DamagedFileError(f"{where}: END holds no summary")
-            self.summary = end["summary"]
+            self.summary = checked_summary(end.get("summary"), f"{where}: END")
         elif kind == Kind.DECISIONS:
             self.n_decisions += len(self.log.rows(block.payload, where))
         self.kinds[kind] += 1

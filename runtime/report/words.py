@@ -99,7 +99,7 @@ def _further(facts: Facts) -> dict[str, Any]:
         granted = ", ".join(f"{what}: {answer}" for what, answer in facts.get("realtime", {}).items())
         found["text"] |= {
             "objects": objects_words(facts),
-            "lit": "" if is_apart else f", illumination {light:.1f}",
+            "lit": "" if is_apart or light is None else f", illumination {light:.1f}",
             "every": f"of all {facts['decisions']:,} decisions" if facts.get("abstained") else "",
             "latency": "not measured in virtual time" if _is_virtual(facts) else latency_words(facts),
             "exposures": exposure_words(facts.get("exposure_timing", {})),
