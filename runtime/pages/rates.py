@@ -14,6 +14,7 @@ from pans.runtime.record.exposures import Exposures, is_dark
 
 HEAT_BINS, EXPOSURES_PER_BIN = 120, 25  # of each pattern: a rate from fewer is noise
 DARK_BINS, DARK_PER_BIN = 40, 200
+LIGHT_BINS, WALKS_PER_BIN = 60, 100
 OBJECTS_KEPT = 1 << 14  # whose true class is remembered: the exposures of an object come soon after its mark
 BINS = 128
 TOLD_APART = 4096  # objects of a stretch that follow one another in number: an interval counts no more of them
@@ -62,11 +63,19 @@ class Stretches:
 class Rates:
     """Clicks and exposures over time per pattern, channel or step of a walk ("clicks", "exposures") and in the dark ("dark clicks", ...).
 
-    Of an automaton also those of each state in the whole run, `state_clicks` and `state_exposures` (states,); of fixed patterns those of
+    Of an automaton also those of each state in the whole run, `state_clicks` and `state_exposures` (states,), and the light shown over time
+    where `state_light` (states,) says what each state shows, photoelectrons per unit transmission; of fixed patterns the clicks of
     each pattern and true class, `class_clicks` and `class_exposures` (channels, classes). A clock that went back adds to the first stretch.
     """
 
-    def __init__(self, plan: Plan, n_classes: int = 0, wanted: Iterable[int] = (), left_out: int = 0) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        n_classes: int = 0,
+        wanted: Iterable[int] = (),
+        left_out: int = 0,
+        state_light: F64 | None = None,
+    ) -> None:
         self._plan, self._dark, self._wanted, self._left_out = plan, 0, sorted({*wanted}), left_out
         # begin of each `wanted` dark exposure by its number, `left_out` exposures behind a click not counted (as by core/dark_guard.py)
         self.dark_ticks: dict[int, int] = {}
@@ -75,9 +84,10 @@ class Rates:
         walks, self.parallel = plan.automaton is not None, plan.mode == "parallel"
         self.n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
         self.what = "channel" if self.parallel else "step of the walk" if walks else "pattern"
-        self.over = Stretches(**{"clicks": (self.n,), "exposures": (self.n,), "dark clicks": (), "dark exposures": ()})
+        self.over = Stretches(**{"clicks": (self.n,), "exposures": (self.n,), "dark clicks": (), "dark exposures": (), "light": ()})
         n_states = 0 if plan.automaton is None else plan.automaton.n_states
         self.state_clicks, self.state_exposures = np.zeros((2, n_states))
+        self._state_light = state_light
         self.class_clicks, self.class_exposures = np.zeros((2, self.n, 0 if walks else n_classes))
         self._truths: dict[int, int] = {}
 
@@ -111,6 +121,8 @@ class Rates:
                 states = np.minimum(item.state[~dark], plan.automaton.n_states - 1)
                 np.add.at(self.state_clicks, states, lit[:, 0])
                 np.add.at(self.state_exposures, states, 1)
+                if self._state_light is not None:
+                    self.over.sums["light"] += np.bincount(at, self._state_light[states], BINS)
                 shown = plan.automaton.depth[states].astype(np.int64)
             self._add(at, np.minimum(shown, self.n - 1), lit[:, 0], truth)
         while len(self._truths) > OBJECTS_KEPT:
@@ -172,6 +184,26 @@ class Rates:
         rate = np.where(clicks > 0, clicks / exposures, np.nan)
         found = {"seconds": (edges[1:] + edges[:-1]) / 2, "rate": rate, "low": low, "high": high, "end_s": edges[-1]}
         return found | {"least": low[low > 0].min(initial=high.max()), "most": high.max()}
+
+    def walks_over(self) -> dict[str, Any] | None:
+        """Return how often state 0 clicked over time, with its interval, and the illumination per walk (`light`, None where not known).
+
+        None of fixed patterns, and of a run too short for two stretches.
+        """
+        if self._plan.automaton is None:
+            return None
+        walks = float(self.over.sums["exposures"][:, 0].sum())
+        over = self.over.merged(int(np.clip(walks // WALKS_PER_BIN, 1, LIGHT_BINS)))
+        some = over.sums["exposures"][:, 0] > 0
+        if some.sum() < 2:
+            return None
+        clicks, begun = (over.sums[name][some, 0] for name in ("clicks", "exposures"))
+        low, high = np.array([wilson_interval(int(c), int(n)) for c, n in zip(clicks, begun)]).T
+        edges = self._edges(over)
+        middles = ((edges[1:] + edges[:-1]) / 2)[some]
+        light = None if self._state_light is None else over.sums["light"][some] / begun
+        rate = {"rate": clicks / begun, "low": low, "high": high, "mean": float(clicks.sum()) / walks}
+        return {"seconds": middles, **rate, "light": light, "end_s": float(edges[-1])}
 
     def seconds_at(self, number: int | None) -> float | None:
         """Return when a `wanted` dark exposure began, seconds since the first exposure; None where the recording does not have it."""

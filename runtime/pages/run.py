@@ -33,6 +33,7 @@ from .rates import BINS, TOLD_APART, Rates, Stretches
 
 CONFUSION_MAX = 40  # classes
 ACCURACY_BINS, OBJECTS_PER_BIN = 60, 20
+CLICKS_PER_BIN = 50  # decisions
 SHOWN, OF_A_KIND = 200, 30  # events
 LEAST_US = 1.0  # of the axis of latencies
 NO_TIME_US = 0.05  # p99 of the host's own time
@@ -80,6 +81,9 @@ class Decisions:
         self.add("decisions", numbers)
         ticks = np.maximum(rows["tick"].astype(np.float64) - self._first_tick, 0.0)
         self.add("seconds", numbers, ticks / self._tick_hz)
+        whole, clicks = (rows["flags"] & _NOT_WALKED) == 0, rows["clicks"].astype(np.float64)
+        for name, weights in (("measured", None), ("clicks", clicks[whole]), ("squares", clicks[whole] ** 2)):
+            self.add(name, numbers[whole], weights)
         for name, which in (("judged", judged), ("right", right)):
             self.add(name, numbers[which])
         self.over.tell_apart("objects", numbers[judged].astype(np.int64) - self._first, rows["object"][judged])
@@ -104,6 +108,19 @@ class Decisions:
         band = {"low": np.minimum(low, share), "high": np.maximum(high, share)}
         sums = {"mean": self.right / self.judged, "objects": (min(counts), max(counts))}
         return {"seconds": self._seconds(over)[some], "share": share, **band, **sums}
+
+    def clicks(self) -> dict[str, Any] | None:
+        """Return clicks per measured decision over time, with a 95 % interval by their spread; None where the run is too short."""
+        measured = self.over.sums.get("measured", np.zeros(1))
+        over = self.over.merged(int(np.clip(measured.sum() // CLICKS_PER_BIN, 1, ACCURACY_BINS)))
+        some = over.sums.get("measured", np.zeros(1)) > 1
+        if some.sum() < 2:
+            return None
+        n, total, squares = (over.sums[name][some] for name in ("measured", "clicks", "squares"))
+        mean = total / n
+        error = 1.96 * np.sqrt(np.maximum(squares - n * mean**2, 0.0) / (n - 1) / n)
+        when = self._seconds(over)[some]
+        return {"seconds": when, "mean": mean, "low": mean - error, "high": mean + error, "whole": total.sum() / n.sum()}
 
     def stacked(self, prefix: str) -> dict[str, Any] | None:
         """Return the sums whose names begin with `prefix` over time, one upon the other, the largest first; None without any."""
@@ -207,6 +224,13 @@ def dark_states(recording: Recording, rates: Rates, found: Sequence[Mapping[str,
     return states
 
 
+def light_changes(events: Sequence[Mapping[str, Any]], decisions: Decisions) -> list[tuple[float | None, float]]:
+    """Return of each change of the light about when it began, None where the recording does not have that, and when it was found."""
+    found = [one for one in events if one["kind"] == "light_changed" and "decision" in one and "since" in one]
+    times = [(decisions.when(int(one["since"])), decisions.when(int(one["decision"]) - 1)) for one in found]
+    return [(since, at) for since, at in times if at is not None]
+
+
 def decisions_between(recording: Recording, edges: Sequence[int]) -> list[tuple[Any, ...]]:
     """Return the decisions before, between and after device ticks: name, how many, labelled, of known truth, right, clicks of all, objects.
 
@@ -307,7 +331,9 @@ def run_page(recording: Recording) -> bytes:
     states = events.dark if first == 0 else []  # dark exposures are numbered in the run, not in its parts
     moments = [(one["since_dark_exposure"], one["dark_exposure"] - 1, one["over"] or 0) for one in states]
     left_out = int(((config.get("dark") or {}).get("guard") or {}).get("afterpulses", 0))
-    rates = Rates(plan, len(classes), [int(number) for three in moments for number in three], left_out)
+    numbers = [int(number) for three in moments for number in three]
+    state_light = None if bundle is None or plan.automaton is None else bundle.light_of(plan.automaton)
+    rates = Rates(plan, len(classes), numbers, left_out, state_light)
     walks = Walks(plan.automaton) if plan.automaton is not None else None
     for rows in together(recording.iter_decisions()):
         decisions.take(rows)
@@ -338,6 +364,7 @@ def run_page(recording: Recording) -> bytes:
         states_shown=first_states(bundle, walks.automaton, rates) if walks is not None and bundle is not None else [],
         walked=rows_of(summary, "walks"),
         rates=rates,
+        light_changes=light_changes(events.shown, decisions),
         states=dark_states(recording, rates, events.dark),
         timed=timed,
         latency=stage_rows({**told, **summary}) if timed else [],
