@@ -41,6 +41,7 @@ class ExpectedWalk:
     photons: F64
     illumination: F64
     exposures: F64
+    first_clicked: F64  # chance that state 0 clicks, in any of its channels
     leaves: F64
     ends: F64 | None = None  # (n, 2): mean and mean square of the carriers in traps behind a walk, with a time constant
 
@@ -70,7 +71,7 @@ def expected_walk(
     _check_arguments(automaton, patterns, transmission)
     _check_law(automaton, law, afterpulses)
     n, n_leaves = len(transmission), automaton.n_leaves
-    sums, leaves = np.zeros((4, n)), np.empty((n, n_leaves))
+    sums, leaves = np.zeros((5, n)), np.empty((n, n_leaves))
     ends = np.empty((n, 2)) if afterpulses.time else None
     step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
     order = np.argsort(automaton.depth, kind="stable").astype(np.int64)
@@ -88,10 +89,12 @@ def expected_walk(
             sums[1, here] += (reached * each.sum(axis=2)).sum(axis=1)
             sums[2, here] += reached @ (shown[rows].sum(axis=1) * share)
             sums[3, here] += reached.sum(axis=1)
+            if states[0] == 0:  # alone in its slot
+                sums[4, here] = clicks if automaton.n_outcomes == 2 else 1.0 - outcome_chances(law, each)[0, :, 0]
         leaves[here] = walks.chance[:, :, automaton.n_states :].sum(axis=0)
         if ends is not None and isinstance(walks, _RememberedWalks):
             ends[here] = walks.sums.ends.T
-    return ExpectedWalk(sums[0], sums[1], sums[2], sums[3], leaves, ends)
+    return ExpectedWalk(sums[0], sums[1], sums[2], sums[3], sums[4], leaves, ends)
 
 
 def _check_arguments(automaton: Automaton, patterns: NDArray[Any], transmission: NDArray[Any]) -> None:
@@ -154,14 +157,18 @@ class _Walks:
         Returns the chances with which the objects reached them (n, m), and the expected clicks (n,).
         """
         reached = self.chance[0][:, states]
-        if isinstance(self._law, CountLaw):
-            chances = count_chances(self._law, photoelectrons[:, :, 0])
-        else:
-            chances = word_chances(*both_chances(self._law, photoelectrons))
+        chances = outcome_chances(self._law, photoelectrons)
         for outcome, chance in enumerate(chances):
             after = self._automaton.successors[states, outcome]
             _pass_on(self.chance[0], self.chance[0], states, after, np.ascontiguousarray(chance))
         return reached, (reached * np.tensordot(self._clicks, chances, 1)).sum(axis=1)
+
+
+def outcome_chances(law: ClickLaw | CountLaw, photoelectrons: F64) -> F64:
+    """Return the chance of each outcome, (outcomes, n, m), of `photoelectrons` (n, m, channels); no click at all is outcome 0."""
+    if isinstance(law, CountLaw):
+        return count_chances(law, photoelectrons[:, :, 0])
+    return word_chances(*both_chances(law, photoelectrons))
 
 
 def word_chances(click: F64, miss: F64) -> F64:

@@ -12,6 +12,10 @@ A stretch is `walks` long; the latest 2^j are looked at after every 2^(j-1). So 
 It assumes that objects come in no order over the stretches compared. Objects that stay for several walks, and a mix that changes slowly,
 spread the stretches more than chance does: for each length the mean square of the comparisons so far, of this length or a shorter one, is
 measured before the stretches that are tested, and the test is wider by it. A change of the clicks by TOLERATED or less is none.
+
+Until something has changed, state 0 is also compared with the `stated` share of walks in which it clicks. One walk of another object each
+has the variance p (1 - p), whatever the objects; walks of objects that were seen before add nothing that can be relied on, so that as many
+walks count as there are different objects. What differs by STATED_TOLERATED or less, as another mixture of objects may, is as stated.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 TOLERATED = 0.01  # of the clicks expected from the states shown: as much as 5 % of the light of the shipped automaton
+STATED_TOLERATED = 0.05  # of the stated share: 14 % of the light of the shipped automaton
 LOOK_S = 0.5  # of walks in a stretch: two looks per second take about 1 ms
 LEAST_WALKS, LEAST_VISITS = 64, 8  # in a stretch: walks, and objects
 LEARNT = 16  # comparisons of one length, from which their spread is known to about a third
@@ -51,6 +56,8 @@ class StateWatch:
     def __init__(self, n_states: int, walks: int, week_walks: float) -> None:
         self.walks, self.looks_per_week = max(1, walks), week_walks / max(1, walks)
         self.found: list[dict[str, Any]] = []
+        self.stated: tuple[float, float] | None = None  # ends of the share of walks whose state 0 clicks
+        self.walks_per_object, self.objects = 1, math.inf  # different objects, as far as is known
         n = min(n_states, STATES_WATCHED)
         self._seen: I64 = np.zeros((2, n), np.int64)  # exposures and clicks at the last look
         self._sums: F64 = np.zeros((2, n))  # those that count
@@ -62,7 +69,9 @@ class StateWatch:
     def of_pace(n_states: int, walks_hz: float, trials: int) -> StateWatch:
         """Return the watch of an automaton that walks `walks_hz` times per second, `trials` times before each object."""
         walks = max(LEAST_WALKS, LEAST_VISITS * trials, math.ceil(LOOK_S * walks_hz))
-        return StateWatch(n_states, walks, WEEK_S * walks_hz)
+        watch = StateWatch(n_states, walks, WEEK_S * walks_hz)
+        watch.walks_per_object = trials
+        return watch
 
     def is_due(self, begun: int) -> bool:
         """Whether there is something to look at, after so many walks have shown their first state."""
@@ -82,15 +91,16 @@ class StateWatch:
         self._looks += 1
         self._kept[self._looks] = self._sums, dict(self._squares)
         known = len(self.found)
+        self._compare_stated()
         for level in range(self._looks.bit_length()):
             if self._looks % (1 << max(level - 1, 0)) == 0 and (1 << level) < self._looks:
                 self._compare(level)
-                if len(self.found) > known:
+                if any(not one.get("stated") for one in self.found[known:]):
                     self._walks_before += int(self._sums[0, 0])
                     self._restart()
                     return self.found[known:]
         self._kept = {at: one for at, one in self._kept.items() if at + 2 * (at & -at) > self._looks}
-        return []
+        return self.found[known:]
 
     def report(self) -> dict[str, Any]:
         """Return what was watched, the smallest change of the clicks of the second half that is found now, and what was found."""
@@ -104,6 +114,7 @@ class StateWatch:
         return {
             "walks": self._walks_before + int(begun),
             "first_state_clicked": float(clicks[0]) / begun if begun else None,
+            "first_state_stated": None if self.stated is None else list(self.stated),
             "change_found": least,
             "false_alarm_every_walks": self.looks_per_week * self.walks,
             "found": self.found,
@@ -112,6 +123,25 @@ class StateWatch:
     def _restart(self) -> None:
         self._sums = np.zeros_like(self._sums)
         self._looks, self._squares, self._kept = 0, Squares(), {}
+
+    def _compare_stated(self) -> None:
+        """Compare how often state 0 clicked since the run began with what is stated, until something is found."""
+        walks, clicks = self._sums[:, 0].tolist()
+        different = min(walks / self.walks_per_object, self.objects)
+        if self.stated is None or self.found or different < 1:
+            return
+        share = clicks / walks
+        wanted = float(np.clip(share, *self.stated))
+        chance = found_at(different * wanted * (1 - wanted), self.looks_per_week) / different
+        if abs(share - wanted) <= STATED_TOLERATED * wanted + chance:
+            return
+        ratio, side = share / max(wanted, 1e-300), "fall" if share < wanted else "rise"
+        words = (
+            f"state 0, with which every walk begins, clicked in {100 * share:.3g} % of {int(walks)} walks, {ratio:.3g} of what is stated: "
+            "light source, place of the object, detector efficiency, or other objects; calibrate again"
+        )
+        found = {"side": side, "ratio": ratio, "decision": self._walks_before + int(walks), "since": 0, "words": words}
+        self.found.append(found | {"stated": True, "objects": int(different)})
 
     def _compare(self, level: int) -> None:
         """Compare the latest 2^`level` stretches with all before them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -116,6 +117,20 @@ class DarkRun:
             self.states = StateWatch.of_pace(plan.automaton.n_states, 1e6 / plan.cycle_us, trials)
         stated = bundle.expected_on(self.profile.name, plan.automaton)
         self.light.stated = None if stated is None else float(stated["clicks"])
+        if stated is not None and self.states is not None and "first_state_clicked" in stated:
+            self.states.stated = self._within_calibration(float(stated["first_state_clicked"]))
+
+    def _within_calibration(self, share: float) -> tuple[float, float]:
+        """Return the least and largest share of exposures that click, stated as `share`, with the light that the calibration allows.
+
+        Of f times the light 1 - (1 - share)^f is as far off as it can be, whatever the objects: E(x^f) is on one side of E(x)^f.
+        """
+        if self.calibration is None:
+            return share, share
+        low, high = self.calibration.values["peak_photoelectrons_hz_ci"]
+        light = self.profile.projector.peak_photoelectrons_hz
+        ends = low / light, math.inf if high is None else high / light
+        return 1 - (1 - share) ** min(ends[0], 1.0), 1 - (1 - share) ** max(ends[1], 1.0)
 
     def header(self) -> dict[str, Any]:
         """What the recording says, and a replay needs."""
@@ -130,6 +145,8 @@ class DarkRun:
         welcome = run.connection.session.welcome
         objects = None if welcome is None else welcome.facts.get("objects")
         self._few_objects = isinstance(objects, int) and objects < MANY_OBJECTS
+        if self.states is not None and isinstance(objects, int) and objects > 0:
+            self.states.objects = objects
         for warning in self.warnings:
             run.journal.note("calibration_warning", words=warning)
 
@@ -168,7 +185,7 @@ class DarkRun:
         facts = None if one is None else {"path": one.path, "sha256": one.sha256, "made_utc": one.values["made_utc"]}
         watched = [*self.light.found, *([] if self.states is None else self.states.found)]
         watched = sorted(watched, key=lambda found: int(found["decision"]))
-        hard = [found for found in watched if one is not None or (found.get("stated") and not self._few_objects)]
+        hard = [found for found in watched if one is not None or (found.get("stated") and not self._is_of_few(found))]
         faults = [str(found["words"]) for found in hard]
         changes = [str(found["words"]) for found in watched if found not in hard]
         if lit >= LEAST_LIT and (not clicks or (saturates and clicks == lit)):
@@ -181,6 +198,10 @@ class DarkRun:
             faults += self._contradictions(dark)
         states = {} if self.states is None else {"states": self.states.report()}
         return DarkFigures(facts, self.warnings, self.light.report() | states, faults, changes)
+
+    def _is_of_few(self, found: dict[str, Any]) -> bool:
+        """Whether fewer than MANY_OBJECTS different objects were seen when it was found."""
+        return self._few_objects or found.get("objects", MANY_OBJECTS) < MANY_OBJECTS
 
     def _contradictions(self, dark: DarkReport) -> list[str]:
         """Compare the run's dark clicks, of all channels, with the ends of the calibration's interval: one sentence, or none.

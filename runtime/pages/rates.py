@@ -84,7 +84,9 @@ class Rates:
         walks, self.parallel = plan.automaton is not None, plan.mode == "parallel"
         self.n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
         self.what = "channel" if self.parallel else "step of the walk" if walks else "pattern"
-        self.over = Stretches(**{"clicks": (self.n,), "exposures": (self.n,), "dark clicks": (), "dark exposures": (), "light": ()})
+        self.over = Stretches(
+            **{"clicks": (self.n,), "exposures": (self.n,), "dark clicks": (), "dark exposures": (), "light": ()}
+        )
         n_states = 0 if plan.automaton is None else plan.automaton.n_states
         self.state_clicks, self.state_exposures = np.zeros((2, n_states))
         self._state_light = state_light

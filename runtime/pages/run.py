@@ -120,7 +120,13 @@ class Decisions:
         mean = total / n
         error = 1.96 * np.sqrt(np.maximum(squares - n * mean**2, 0.0) / (n - 1) / n)
         when = self._seconds(over)[some]
-        return {"seconds": when, "mean": mean, "low": mean - error, "high": mean + error, "whole": total.sum() / n.sum()}
+        return {
+            "seconds": when,
+            "mean": mean,
+            "low": mean - error,
+            "high": mean + error,
+            "whole": total.sum() / n.sum(),
+        }
 
     def stacked(self, prefix: str) -> dict[str, Any] | None:
         """Return the sums whose names begin with `prefix` over time, one upon the other, the largest first; None without any."""

@@ -195,6 +195,7 @@ class PansClassifier(ClassifierMixin, BaseEstimator):
             names = ("accuracy", "clicks", "photons", "exposures")
             told = {name: getattr(found, f"{name}_mean", 0.0) for name in names}
             told |= {"illumination": found.illumination, "objects": found.objects, "split": "held-out images"}
+            told["first_state_clicked"] = getattr(found, "first_state_clicked", None)
             bundle = with_expected(bundle, {**(bundle.expected or {}), **told})
         return write_bundle(bundle, path, force=force)
 

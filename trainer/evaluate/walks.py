@@ -43,7 +43,18 @@ _LEAF_NUMBERS = 1 << 22  # objects times leaves at once
 _LIGHT_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
-OF_OBJECTS = ("right", "decided", "shares", "clicks", "photons", "illumination", "exposures", "surprise", "labels")
+OF_OBJECTS = (
+    "right",
+    "decided",
+    "shares",
+    "clicks",
+    "photons",
+    "illumination",
+    "exposures",
+    "first_clicked",
+    "surprise",
+    "labels",
+)
 ONE_DOSE = 1e-3  # of the dose that leaves 1/e: by so much the doses of walks to one state may differ, by steps of the dwell time
 BLEACHED_AT_ONCE = 512  # objects, whose pixels stand in memory
 
@@ -69,6 +80,7 @@ class MeasuredWalks(Conveyed):
     trials: int  # 0: exact, no trials were needed
     shots: int = 1
     by_class: ByClass | None = None
+    first_state_clicked: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +94,7 @@ class Walks:
     photons: F64
     illumination: F64
     exposures: F64
+    first_clicked: F64  # chance that state 0 clicks
     surprise: F64  # -log2 of the true class's probability at the leaf
     by_class: F64  # chance that an object of this class ends at this leaf, summed over the objects
     automaton: Automaton  # the one that ran
@@ -134,7 +147,7 @@ def walks_of(
 def leaf_chances(bundle: Bundle, profile: Profile, images: NDArray[np.uint8], conditions: Conditions = AS_IT_IS) -> F64:
     """Return the chance that a walk on each of `images` (n, height, width) ends at each leaf, float64 (n, leaves); see `walks_of`."""
     automaton = _fitting(bundle, profile, images, conditions, None)
-    return _walking(bundle, automaton, profile, images, conditions, None)(images)[4]
+    return _walking(bundle, automaton, profile, images, conditions, None)(images)[-1]
 
 
 def _walking(
@@ -178,7 +191,7 @@ def _walking(
 
     def expected(part: NDArray[np.uint8]) -> _Sums:
         found = walk(part, begins)
-        return found.clicks, found.photons, found.illumination, found.exposures, found.leaves
+        return found.clicks, found.photons, found.illumination, found.exposures, found.first_clicked, found.leaves
 
     return expected
 
@@ -236,11 +249,13 @@ def patterns_met(bundle: Bundle, imaging: Imaging) -> NDArray[Any]:
     return met(imaging, bundle.pattern_levels.astype(np.float64), bundle.image_shape, bundle.levels - 1.0)
 
 
-_Sums = tuple[F64, F64, F64, F64, F64]  # clicks, photons, illumination, exposures (n,), leaves (n, leaves)
+_Sums = tuple[
+    F64, F64, F64, F64, F64, F64
+]  # clicks, photons, illumination, exposures, state 0's clicks (n,), leaves (n, leaves)
 
 
 def _judged(sums: _Sums, labels: NDArray[np.int64], automaton: Automaton, leaf_labels: NDArray[np.uint16]) -> Walks:
-    leaves = sums[4]
+    leaves = sums[-1]
     surprise, by_class = np.empty(len(labels)), np.zeros((automaton.n_classes, automaton.n_leaves))
     surprises = -np.log2(np.maximum(automaton.posteriors[automaton.n_states :].astype(np.float64), LEAST))
     for label in range(automaton.n_classes):
@@ -249,7 +264,7 @@ def _judged(sums: _Sums, labels: NDArray[np.int64], automaton: Automaton, leaf_l
         by_class[label] = leaves[of_class].sum(axis=0)
     shares = leaves @ (leaf_labels[:, None] == np.arange(automaton.n_classes)).astype(np.float64)
     right, decided = shares[np.arange(len(labels)), labels], shares.sum(axis=1)
-    return Walks(right, decided, shares, *sums[:4], surprise, by_class, automaton, leaf_labels, labels)
+    return Walks(right, decided, shares, *sums[:-1], surprise, by_class, automaton, leaf_labels, labels)
 
 
 def _sampled(
@@ -277,7 +292,7 @@ def _sampled(
         left[active] = before * np.exp(-dose)[of_row]
         return np.asarray(np.einsum("kp,kp->k", before, (shown * mean_left(dose))[of_row]))
 
-    sums, leaves = np.zeros((4, n)), np.zeros((n, automaton.n_leaves))
+    sums, leaves = np.zeros((5, n)), np.zeros((n, automaton.n_leaves))
     memory = np.zeros((2, n))
     for trial in range(-BEGIN_ROUNDS if afterpulses.time else 0, trials):
         if trial == 0:
@@ -286,7 +301,7 @@ def _sampled(
         memory = rng.permutation(memory, axis=1) if afterpulses.time else np.zeros((2, n))
         if not bleaching.is_none:
             left[:] = seen
-        for _ in range(automaton.n_slots):
+        for slot in range(automaton.n_slots):
             if not active.size:
                 memory = afterpulses.in_the_dark(memory)
                 continue
@@ -307,14 +322,14 @@ def _sampled(
                 known = afterpulses.after(-log_no_click(law, photoelectrons), memory[:, active], outcome)
                 memory = afterpulses.in_the_dark(memory)
                 memory[:, active] = known
-            each: tuple[Any, ...] = (clicks, photoelectrons, sent, 1.0)
+            each: tuple[Any, ...] = (clicks, photoelectrons, sent, 1.0, (clicks > 0) & (slot == 0))
             for total, values in zip(sums, each):
                 total[active] += values
             node[active] = automaton.successors[state, outcome]
             active = active[node[active] < automaton.n_states]
         leaves[rows, node - automaton.n_states] += 1.0
     sums /= trials
-    return sums[0], sums[1], sums[2], sums[3], leaves / trials
+    return sums[0], sums[1], sums[2], sums[3], sums[4], leaves / trials
 
 
 def _drawn(law: ClickLaw | CountLaw, light: F64, sight: F64, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -352,6 +367,7 @@ def measured_walks(walks: Walks) -> MeasuredWalks:
         objects=n,
         trials=walks.trials,
         by_class=among_classes(walks.right, walks.labels, walks.classes, walks.decided) if walks.classes else None,
+        first_state_clicked=float(walks.first_clicked.mean()),
         **conveyed(walks.surprise, walks.labels, walks.photons, walks.illumination),
     )
 
@@ -388,7 +404,8 @@ def expected_figures(found: MeasuredWalks, profile: str, task: str, split: str) 
         raise ValueError("sampled figures are no expectation")
     conditions: dict[str, Any] = {"profile": profile, "task": task, "split": split, "objects": found.objects}
     conditions |= {"accuracy": found.accuracy_mean, "clicks": found.clicks_mean, "photons": found.photons_mean}
-    return conditions | {"illumination": found.illumination, "exposures": found.exposures_mean}
+    conditions |= {"illumination": found.illumination, "exposures": found.exposures_mean}
+    return conditions | {"first_state_clicked": found.first_state_clicked}
 
 
 def walk_payload(walks: Walks) -> dict[str, Any]:
