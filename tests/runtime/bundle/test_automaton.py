@@ -162,6 +162,12 @@ def test_expected_figures_are_kept_and_checked() -> None:
     assert bundle.expected_on(str(EXPECTED["profile"]), bundle.automaton) == EXPECTED
     assert bundle.expected_on("another", bundle.automaton) is None
     assert bundle.expected_on(str(EXPECTED["profile"]), diamond()) is None  # not the one that is judged
+    more = with_expected(
+        automaton_bundle(), EXPECTED | {"first_state_clicked": 0.25}
+    )  # bundles made before do not state it
+    assert more.expected == EXPECTED | {"first_state_clicked": 0.25}
+    with pytest.raises(UsageError, match="first_state_clicked"):
+        with_expected(automaton_bundle(), EXPECTED | {"first_state_clicked": 1.5})
     for change in ({"accuracy": 1.5}, {"clicks": 2.6}, {"exposures": 3.5}, {"objects": 0}, {"split": ""}, {"more": 1}):
         with pytest.raises(UsageError, match=rf"expected.*{next(iter(change))}|expected has the keys"):
             with_expected(automaton_bundle(), EXPECTED | change)

@@ -116,6 +116,7 @@ def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLa
         photons, illumination = (sum(float(p) * e for p, e in zip(wanted["shown"], each)) for each in (light, whole))
         totals = [float(wanted["clicks"]), float(wanted["exposures"]), photons, illumination]
         assert [sums[i] for sums in totals_of(found)] == pytest.approx(totals, rel=1e-12)
+        assert found.first_clicked[i] == pytest.approx(click[0], rel=1e-12)
         assert found.leaves[i] == pytest.approx([float(chance) for chance in wanted["leaves"]], rel=1e-11, abs=1e-300)
         assert found.leaves[i].sum() == pytest.approx(1.0, abs=1e-13)
 

@@ -54,6 +54,41 @@ def test_a_change_is_found_once_and_against_the_new_level_again(efficiency: floa
     assert "state 0 in" in watch.found[0]["words"]
 
 
+@pytest.mark.parametrize(
+    ("efficiency", "objects", "sides"),
+    [
+        (0.7, 20_000, ["fall"]),
+        (1.4, 20_000, ["rise"]),
+        (1.0, 20_000, []),
+        (0.96, 20_000, []),
+        (0.7, 200, []),
+        (0.0, 200, ["fall"]),
+    ],
+)
+def test_a_beginning_unlike_what_is_stated_is_found_where_enough_objects_differ(
+    efficiency: float, objects: int, sides: list[str]
+) -> None:
+    watch = StateWatch(3, WALKS, 1e8)
+    watch.stated, watch.objects = (float(KINDS[:, 0].mean()),) * 2, objects
+    for shown, clicked in np.cumsum(stretches(efficiency, 200, 8), axis=0):
+        watch.take(shown, clicked)
+    assert [one["side"] for one in watch.found] == sides
+    for one in watch.found:
+        assert (one["stated"], one["since"]) == (True, 0)
+        assert one["objects"] == min(one["decision"], objects)
+        assert "state 0" in one["words"]
+
+
+def test_walks_before_one_object_and_a_wide_statement_say_less() -> None:
+    rate = float(KINDS[:, 0].mean())
+    for trials, stated, found in ((1, (rate, rate), 1), (100, (rate, rate), 0), (1, (0.7 * rate, rate), 0)):
+        watch = StateWatch.of_pace(3, 100.0, trials)
+        watch.stated = stated
+        for shown, clicked in np.cumsum(stretches(0.7, 200, 8), axis=0):
+            watch.take(shown, clicked)
+        assert len(watch.found) == found
+
+
 def test_what_does_not_count_is_left_out() -> None:
     watch, sums = StateWatch(3, WALKS, 1e8), np.zeros((2, 3), np.int64)
     for counts, part in (

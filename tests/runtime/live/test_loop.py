@@ -25,6 +25,7 @@ from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.instrument.calibration import load_calibration
 from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.instrument.state_watch import StateWatch
 from pans.runtime.link.base import Link
 from pans.runtime.live import RunOptions, RunResult, run_live
 from pans.runtime.live.dark_run import DarkRun
@@ -211,13 +212,84 @@ def test_dark_counts_beyond_the_calibration_are_a_fault(clicks: int, contradicts
     assert DarkRun(profile, None, "warn", []).figures(report).faults == []
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
+@pytest.mark.parametrize(("objects", "stated"), [(200, True), (199, True), (None, True), (200, False)])
+def test_what_a_bundle_states_is_contradicted_by_many_objects_only(
+    objects: int | None, stated: bool, calibrated: bool, tmp_path: Path
+) -> None:
+    """Clicks unlike the statement are a fault without a calibration too; fewer objects may be others, and then it is a warning."""
+    small_calibration(tmp_path)
+    profile = small_setup()[0]
+    calibration = load_calibration(tmp_path / "calibration.json") if calibrated else None
+    dark, run = DarkRun(profile, calibration, "warn", []), MagicMock()
+    run.connection.session.welcome.facts = {} if objects is None else {"objects": objects}
+    dark.check_device(run)
+    dark.light.stated = 2.0 if stated else None
+    clicks = np.random.default_rng(1).integers(2, 5, 1600 if stated else 20_000)
+    dark.light.take(clicks)
+    if not stated:  # a change within the run
+        dark.light.take(clicks + 2)
+    (found,) = dark.light.found
+    figures = dark.figures()
+    is_fault = calibrated or (stated and objects != 199)
+    assert (figures.faults, figures.changes) == (([found["words"]], []) if is_fault else ([], [found["words"]]))
+
+
+def test_walks_of_few_objects_are_a_warning() -> None:
+    dark = DarkRun(small_setup()[0], None, "warn", [])
+    dark.states = StateWatch(1, 100, 1e8)
+    dark.states.stated, dark.states.walks_per_object = (0.9, 0.9), 100
+    shown = np.arange(100, 20_100, 100)
+    for n in shown:
+        dark.states.take(np.array([n]), np.array([n // 10]))
+    assert dark.states.found[0]["objects"] < 200
+    figures = dark.figures()
+    assert (figures.faults, figures.changes) == ([], [dark.states.found[0]["words"]])
+
+
+@pytest.mark.parametrize(
+    ("clicks", "lit", "saturates", "word"),
+    [
+        (0, 500, True, "none"),
+        (500, 500, True, "every one"),
+        (1, 500, True, ""),
+        (499, 500, True, ""),
+        (0, 499, True, ""),
+        (499, 499, True, ""),
+        (500, 500, False, ""),
+        (0, 500, False, "none"),
+    ],
+)
+def test_none_or_all_of_many_lit_exposures_are_a_warning(clicks: int, lit: int, saturates: bool, word: str) -> None:
+    figures = DarkRun(small_setup()[0], None, "warn", []).figures(None, clicks, lit, saturates=saturates)
+    assert figures.faults == []
+    assert [f"clicked in {word} of {lit} exposures" in one for one in figures.changes] == [True] * bool(word)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.9, 1.2), (0.9, None), (1.1, 1.2)])
+def test_a_calibration_widens_what_a_bundle_states_of_state_0(low: float, high: float | None) -> None:
+    """Whatever the objects: of so much more or less light none of their mixtures clicks more or less often."""
+    profile = small_setup()[0]
+    light = profile.projector.peak_photoelectrons_hz
+    calibration: Any = MagicMock(
+        values={"peak_photoelectrons_hz_ci": [low * light, None if high is None else high * light]}
+    )
+    calibration.applied_to.return_value = profile
+    ends = DarkRun(profile, calibration, "warn", [])._within_calibration(0.4)
+    assert DarkRun(profile, None, "warn", [])._within_calibration(0.4) == (0.4, 0.4)
+    for shares in (np.array([0.4, 0.4]), np.array([0.8, 0.0]), np.array([0.1, 0.7])):
+        for left in np.linspace(min(low, 1.0), 50.0 if high is None else high, 20):
+            assert ends[0] - 1e-12 <= np.mean(1 - (1 - shares) ** left) <= ends[1] + 1e-12
+    assert ends == pytest.approx((1 - 0.6 ** min(low, 1.0), 1.0 if high is None else 1 - 0.6**high))
+
+
 @pytest.mark.parametrize("present", [[], ["a burst"]])
 def test_a_state_of_the_detector_is_no_change_of_light(present: list[str]) -> None:
     dark: Any = DarkRun(small_setup()[0], None, "warn", [])
     dark.light = MagicMock()
     dark.light.take.return_value = []
     run, output = MagicMock(), MagicMock(decisions=[Decision(0, 0, 0, 0, 0, 4, 1, 1, 0, 0.9, 0)])
-    run.core.guard.health.present = present
+    run.core.guard.present = present
     dark.look(run, output)
     assert dark.light.take.called == (not present)
 

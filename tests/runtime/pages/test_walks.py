@@ -12,9 +12,10 @@ from commands import Pans
 
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
+from pans.runtime.pages import rates as rates_module
 from pans.runtime.pages.bundle import first_states
 from pans.runtime.pages.rates import Rates
-from pans.runtime.pages.run import Walks
+from pans.runtime.pages.run import Decisions, Walks, light_changes
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import iter_exposures
 from pans.runtime.record.sent_plan import recorded_plan
@@ -66,6 +67,43 @@ def test_the_first_states_tell_what_was_shown_and_what_clicked(recording: Record
             best = bundle.classes[int(plan.automaton.posteriors[successor].argmax())]
             where = f"state {successor}" if successor < plan.automaton.n_states else "the end"
             assert re.fullmatch(rf"(no )?click: {where}, {best} \d+ %", line)
+
+
+def test_light_over_time_is_that_of_the_messages(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rates_module, "WALKS_PER_BIN", 10)
+    plan, bundle = recorded_plan(recording), recording.bundle()
+    rates = Rates(plan, state_light=bundle.state_light())
+    for item in iter_exposures(recording, plan):
+        rates.take(item)
+    over, first = rates.walks_over(), [bit for state, bit in shown_states(recording) if state == 0]
+    assert over is not None
+    assert 2 <= len(over["rate"]) <= 6
+    assert over["mean"] == np.mean(first)
+    size = round(len(first) / over["end_s"] * (over["seconds"][1] - over["seconds"][0]))
+    parts = [first[at : at + size] for at in range(0, len(first), size)]
+    assert over["rate"].tolist() == pytest.approx([np.mean(part) for part in parts])
+    assert (over["low"] <= over["rate"]).all()
+    assert (over["rate"] <= over["high"]).all()
+    sizes = [len(part) for part in parts]
+    assert np.average(over["light"], weights=sizes) == pytest.approx(recording.summary["illumination_mean"])
+
+
+def test_clicks_over_time_and_where_they_changed() -> None:
+    rows = np.zeros(400, DECISION_DTYPE)
+    rows["index"], rows["tick"] = np.arange(400), 1_000_000 * np.arange(400)
+    rows["clicks"] = np.where(rows["index"] < 200, 6, 3) + rows["index"] % 2
+    rows["flags"][7], rows["clicks"][7] = int(DecisionFlag.GAP), 99
+    decisions = Decisions({"tick_hz": 1e6}, len(rows))
+    decisions.take(rows)
+    over = decisions.clicks()
+    assert over is not None
+    early, late = over["mean"][over["seconds"] < 190], over["mean"][over["seconds"] > 210]
+    assert early == pytest.approx([6.5] * len(early), abs=0.02)
+    assert late == pytest.approx([3.5] * len(late), abs=0.02)
+    assert (over["high"] - over["low"])[-2] == pytest.approx(2 * 1.96 * 0.5 / np.sqrt(60), rel=0.01)
+    found = {"kind": "light_changed", "since": 200, "decision": 251}
+    ((since, at),) = light_changes([found, {"kind": "gap"}, found | {"decision": 900}], decisions)
+    assert (since, at) == pytest.approx((200, 250), abs=1)
 
 
 def test_reliability_is_that_of_the_decisions() -> None:
