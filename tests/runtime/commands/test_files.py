@@ -152,10 +152,10 @@ def test_info_of_every_kind(tmp_path: Path, pans: Pans) -> None:
     assert (found["kind"], found["sha256"], found["illumination"]) == ("bundle", digest, 3.0)
     assert (found["back_ends"], found["classes"], found["patterns"]) == (["table"], ["a", "b"], 2)
     rows = [decision(0), decision(1, truth=0), decision(2, flags=9, label=0xFFFF), decision(3, truth=2, label=2)]
-    record(tmp_path / "a.pansrec", rows)  # the last one of a class that the bundle does not have
+    record(tmp_path / "a.pansrec", rows)  # the last is of a class that the bundle does not have: not judged
     found = pans("info", tmp_path / "a.pansrec")
     assert (found["kind"], found["complete"], found["simulated"], found["bundle"]) == ("recording", True, True, "toy")
-    assert (found["decisions"], found["abstained"], found["accuracy"]) == (4, 1, 1 / 3)
+    assert (found["decisions"], found["abstained"], found["accuracy"]) == (4, 1, 1 / 2)
     assert found["events"] == {"gap": 1}
     assert "toml" not in found["header"]["profile"]
     assert main(["info", str(tmp_path / "a.pansrec")]) == 0

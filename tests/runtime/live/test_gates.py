@@ -145,7 +145,7 @@ def test_two_commands_of_the_window_are_left_for_what_is_no_pulse() -> None:
 
 def test_a_pulse_carries_its_tick_length_and_output() -> None:
     bench = Bench()
-    bench.queue.take([Action(4, 20_000, 70, 3)])
+    bench.queue.take([Action(4, 10_000, 20_000, 70, 3)])
     bench.queue.turn(bench.session, bench.clock, 10 * MS)
     bench.session.poll(10 * MS)
     (frame,) = FrameDecoder().feed(bench.session.take_output())

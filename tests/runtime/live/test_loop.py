@@ -165,7 +165,7 @@ def test_several_shots_per_decision(bundle: Bundle, scene: Path) -> None:
     headed = made_bundle(**shown(bundle), head_onnx=onnx_chain(random_layers([4, 3])))
     result = run(headed, scene, shots=4, trials=2)
     assert result.tally.decisions == 12
-    assert result.tally.clicks / 12 > 4 * 0.2
+    assert result.tally.of["decisions"].clicks / 12 > 4 * 0.2
     assert result.tally.figures().photons_mean == pytest.approx(4 * run(headed, scene).tally.figures().photons_mean)
 
 
