@@ -236,7 +236,7 @@ def check_prologue(data: bytes, magic: bytes, version: int, where: str) -> int:
     """Return the checksum that seeds the first block; DamagedFileError for a foreign, cut, altered or newer file."""
     if data[: len(magic)] != magic[: len(data)]:
         what, taker = other_kind(data)
-        kind = f"it is {what}" if what else f"it starts with {data[:8]!a}, expected {magic!a}"
+        kind = f"it is {what}" if what else f"it starts with the bytes {data[:8].hex(' ')}, expected {magic.decode()}"
         raise DamagedFileError(f"{where}: not a recording: {kind}", remedy=taker)
     if len(data) < FILE_PROLOGUE.size:
         raise DamagedFileError(f"{where}: cut after {len(data)} bytes, nothing of it can be read")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import sys
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -46,9 +47,18 @@ def read_arrays(path: str | Path, wanted: Sequence[str] | None, max_bytes: int) 
                         _check_header(name, member, sizes[f"{name}.npy"])
             file.seek(0)
             with np.load(file, allow_pickle=False) as loaded:
-                return {name: loaded[name] for name in present}
+                return {name: _checked_text(name, loaded[name]) for name in present}
         except _UNREADABLE as error:
             raise ValueError(str(error) or type(error).__name__) from error
+
+
+def _checked_text(name: str, array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array; ValueError for one of texts with numbers that are no characters, of which Python cannot make a str."""
+    if array.dtype.kind == "U" and array.dtype.itemsize:
+        codes = np.ascontiguousarray(array).view(array.dtype.byteorder.replace("|", "=") + "u4")
+        if codes.max(initial=0) > sys.maxunicode:
+            raise ValueError(f"{name} holds the character {codes.max()}, allowed: 0 to {sys.maxunicode}")
+    return array
 
 
 def npz_bytes(**arrays: Any) -> bytes:
@@ -67,7 +77,10 @@ def _check_header(name: str, member: IO[bytes], size: int) -> None:
 
 def npy_header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, column-major order and dtype of the .npy array that `file` begins with; ValueError for whatever cannot be."""
-    version = np.lib.format.read_magic(file)
+    try:
+        version = np.lib.format.read_magic(file)
+    except ValueError as error:  # in Python's words
+        raise ValueError(f"{name} does not begin as a .npy array does") from error
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"{name} is stored in npy version {version}, allowed are 1.0 and 2.0")
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

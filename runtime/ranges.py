@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass
+from datetime import date, time
 from typing import Any
 
 
@@ -66,4 +67,4 @@ def number_text(value: Any) -> str:
     """Return what was found where a number should be, never longer than a line."""
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 1 << 64:
         return "a whole number beyond 64 bits"
-    return ascii(value)[:60]
+    return (value.isoformat() if isinstance(value, date | time) else ascii(value))[:60]

@@ -189,7 +189,7 @@ def _check_prologue(source: _Source) -> tuple[int, bytes]:
     start = source.read(0, min(size, _PROLOGUE.size))
     if start[: len(MAGIC)] != MAGIC[: len(start)]:
         what, remedy = other_kind(source.read(0, min(size, KIND_BYTES)))
-        found = f"it is {what}" if what else f"it starts with {start[:8]!a}, expected {MAGIC!a}"
+        found = f"it is {what}" if what else f"it starts with the bytes {start[:8].hex(' ')}, expected {MAGIC.decode()}"
         raise DamagedFileError(f"not a PANS bundle: {found}", remedy=remedy)
     smallest = _PROLOGUE.size + 2 + _DIGEST_BYTES
     demand(size >= smallest, f"truncated: {size} bytes, a bundle has at least {smallest}")

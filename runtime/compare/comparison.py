@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from pans.runtime.container import parse_json_object, read_file
 from pans.runtime.core.decision import is_decided, is_judged
 from pans.runtime.denominators import group_of
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.intervals import number
 from pans.runtime.pages.page import flat, render, words
 from pans.runtime.pages.run import Decisions, is_virtual, latency_curves, ledger_of
 from pans.runtime.record.parts import open_recording
-from pans.runtime.record.recorded_summary import checked_summary
+from pans.runtime.record.recorded_facts import checked_summary
+from pans.runtime.record.sent_plan import TICK_HZ
 from pans.runtime.safe_text import one_line
 from pans.runtime.wire.messages import NO_OBJECT
 
@@ -90,6 +91,10 @@ def read_side(path: str | Path) -> Side:
             raise UsageError(f"{place}: not a summary: it has no keys `decisions` and `verdict`", remedy=remedy)
         return Side(place, {}, checked_summary(summary, str(place)), None, None, True)
     found = open_recording(place, salvage=True)
+    try:
+        TICK_HZ.checked(found.header["config"]["tick_hz"], "tick_hz")
+    except (KeyError, TypeError, ValueError) as error:
+        raise DamagedFileError(f"{place}: its header has no config.tick_hz that can be: {error}") from error
     decisions, told = found.decisions(), found.summary
     if distinct := int(told.get("device", {}).get("objects", 0)):  # then the first one is shown again
         numbers = decisions["object"].copy()

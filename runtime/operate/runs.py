@@ -37,7 +37,7 @@ from pans.runtime.ranges import Range
 from pans.runtime.record.format import FORMAT_VERSION, LIMITS, MAGIC, Kind
 from pans.runtime.record.log import skim_decisions
 from pans.runtime.record.parts import part_number
-from pans.runtime.record.recorded_summary import checked_summary
+from pans.runtime.record.recorded_facts import checked_summary
 from pans.runtime.safe_text import one_line
 
 OURS = re.compile(r"[^/]*\.pansrec|(?:.*\.)?summary\.(?:md|json)|\..*\.(?:lock|partial|next|probe)|\.pans-run\.lock")

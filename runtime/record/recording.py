@@ -46,7 +46,7 @@ from .format import (
     expand_timings,
 )
 from .log import LogReader
-from .recorded_summary import checked_summary
+from .recorded_facts import checked_event, checked_header, checked_summary
 
 MESSAGES_AT_ONCE = ROWS_AT_ONCE = 1 << 14
 
@@ -226,7 +226,7 @@ def _pairs(block: Block, path: Path) -> Iterator[tuple[int, bytes]]:
 
 def _events(block: Block, path: Path) -> Iterator[dict[str, Any]]:
     where = f"{path}: an event in block {block.index}"
-    return (_checked_event(parse_json_object(line, where), where) for line in block.payload.splitlines())
+    return (checked_event(parse_json_object(line, where), where) for line in block.payload.splitlines())
 
 
 def _tables() -> Any:
@@ -270,16 +270,6 @@ def _checked_runs(block: Block, path: Path) -> NDArray[np.void]:
     return runs
 
 
-def _checked_event(event: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return an event that says of what kind it is; a decision that it names is a number."""
-    decision = event.get("decision", 0)
-    if not isinstance(event.get("kind"), str):
-        raise DamagedFileError(f"{where} does not say of what kind it is")
-    if not isinstance(decision, int) or not 0 <= decision < 1 << 63:
-        raise DamagedFileError(f"{where} names the decision {ascii(decision)[:40]}, allowed: its number")
-    return event
-
-
 def _start(file: Any, where: str) -> int:
     """Read the prologue; return the checksum that seeds the first block."""
     start = file.read(FILE_PROLOGUE.size)
@@ -318,7 +308,7 @@ class _Scan:
         if (kind == Kind.HEADER) != (block.index == 0) or (kind == Kind.BUNDLE and self.kinds[kind]):
             raise DamagedFileError(f"{where}: {kind.name} does not belong here")
         if kind == Kind.HEADER:
-            self.header = parse_json_object(block.payload, where)
+            self.header = checked_header(parse_json_object(block.payload, where), where)
         elif kind == Kind.BUNDLE:
             found, wanted = hashlib.sha256(block.payload).hexdigest(), self.header.get("bundle_sha256")
             if wanted != found:

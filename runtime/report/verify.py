@@ -73,7 +73,7 @@ def file_kind(path: str | Path) -> str:
         kind = "registration"
     if kind is None:
         raise DamagedFileError(
-            f"{path}: it starts with {start!a}, which is no file of this project",
+            f"{path}: it starts with the bytes {start.hex(' ')}, which is no file of this project",
             remedy="allowed: bundles (.pans), recordings (.pansrec), profiles (.toml, or a shipped name), calibrations (.json)",
         )
     return kind

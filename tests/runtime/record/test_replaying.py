@@ -137,9 +137,9 @@ def test_a_header_with_a_profile_of_another_type_is_replayed(profile: object, wh
     [
         (without(Kind.COMMANDS), "the device was never armed"),
         (without(Kind.COMMANDS, Kind.MESSAGES), "the device was never armed"),
-        (event(b'{"why":"no kind"}'), "does not say of what kind"),
-        (event(b'{"kind":"gate_refused","decision":"7"}'), "names the decision '7'"),
-        (event(b'{"kind":"gate_refused","decision":-1}'), "names the decision -1"),
+        (event(b'{"why":"no kind"}'), "the event has no kind"),
+        (event(b'{"kind":"gate_refused","decision":"7"}'), "decision is '7', allowed: a whole number"),
+        (event(b'{"kind":"gate_refused","decision":-1}'), "decision is -1, allowed: a whole number"),
         (without(Kind.COMMANDS, Kind.MESSAGES, Kind.DECISIONS, Kind.TIMINGS), ""),  # it decided nothing
     ],
 )

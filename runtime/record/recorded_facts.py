@@ -1,7 +1,7 @@
-"""What the summary of a run must be where it is read from a file: types and ranges of the figures that words, pages and comparisons use.
+"""What header, events and summary of a recording must be where they are read: types and ranges of what words, pages and comparisons use.
 
-`checked_summary` refuses anything else as damage. A key that is not named here may have any value, and only those of a run that ended with
-a verdict have to be there: recordings of earlier versions lack later ones, a part that was full has none.
+`checked_summary` and its siblings refuse anything else as damage. A key that is not named here may have any value, and of a summary only
+those of a run that ended with a verdict have to be there: recordings of earlier versions lack later ones, a part that was full has none.
 """
 
 from __future__ import annotations
@@ -81,6 +81,43 @@ _SHAPES: dict[str, Any] = {
     "expected": (None, {"accuracy": (None, SHARE), "clicks": (None, FIGURE), "photons": (None, FIGURE)}),
     "dark": {**_DARK, "alarm": str, "findings": list, "channels": Each(list, _DARK)},
 }
+
+_HEADER = {
+    **dict.fromkeys(("created_utc", "command", "device_url"), str),
+    **dict.fromkeys(("simulated", "virtual_time"), bool),
+    "versions": dict,
+    "config": {"flow": {"settings": {"gate_classes": Each(list, str)}}},
+}
+NUMBER = Range(0, (1 << 63) - 1, whole=True)  # of an exposure, a decision, a tick
+_EVENT = {
+    "kind+": str,
+    **dict.fromkeys(("tick", "decision", "first_decision", "decisions", "exposures"), NUMBER),
+    **dict.fromkeys(("dark_exposure", "since_dark_exposure"), NUMBER),
+}
+_OF_A_KIND = {  # what events of a kind must be besides
+    "dark_state": {
+        **{"state+": str, "channels+": Each(list, NUMBER), "dark_exposure+": NUMBER},
+        **{"rate": FIGURE, "expected": FIGURE, "words": str, "level": str},
+    },
+    "part": {
+        **{"number+": Range(1, 1 << 53, whole=True), "first_decision+": NUMBER},
+        **{"before": (None, dict), "deleted": (None, {"parts": COUNT})},
+    },
+}
+
+
+def checked_header(header: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return the header of a recording; DamagedFileError if it cannot be one."""
+    if misfit := _misfit(header, _HEADER, "the header"):
+        raise DamagedFileError(f"{where}: {misfit}")
+    return header
+
+
+def checked_event(event: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return an event of a recording; DamagedFileError if it cannot be one."""
+    if misfit := _misfit(event, _EVENT, "the event") or _misfit(event, _OF_A_KIND.get(event["kind"], {}), "the event"):
+        raise DamagedFileError(f"{where}: {misfit}")
+    return event
 
 
 def checked_summary(summary: Any, where: str) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from pans.runtime.cli import main
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.record import read_recording
 from pans.runtime.record.format import Kind
-from pans.runtime.record.recorded_summary import checked_summary
+from pans.runtime.record.recorded_facts import checked_summary
 
 STORED = Path(__file__).parent.parent / "report"
 
