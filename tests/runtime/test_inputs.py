@@ -5,6 +5,7 @@ import json
 import os
 import struct
 import zipfile
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,8 @@ def test_ranges() -> None:
     for allowed, value in wrong:
         with pytest.raises(ValueError, match=r"x is .*allowed: a"):
             allowed.checked(value, "x")
+    with pytest.raises(ValueError, match=r"^x is 1979-05-27, allowed: a number"):  # as TOML has dates
+        FINITE.checked(date(1979, 5, 27), "x")
 
 
 NOT_JSON = [
@@ -98,3 +101,24 @@ def test_an_archive_that_unpacks_to_far_more_than_itself_is_refused_before_it_is
         read_arrays(tmp_path / "a.npz", None, 1 << 30)
     np.savez(tmp_path / "a.npz", images=np.zeros((65, 1024, 1024), np.uint8))
     assert read_arrays(tmp_path / "a.npz", None, 1 << 30)["images"].nbytes == 65 << 20
+
+
+def test_texts_of_no_characters_are_refused(tmp_path: Path) -> None:
+    """numpy reads such an array, and Python cannot make a text of it."""
+    for dtype in ("<U2", ">U2"):
+        names = np.array(["ab", "c"], dtype)
+        np.savez(tmp_path / "a.npz", classes=names, images=np.zeros((2, 2, 2), np.uint8))
+        assert read_arrays(tmp_path / "a.npz", ["classes"], 1 << 20)["classes"].tolist() == ["ab", "c"]
+        names.view(f"{dtype[0]}u4")[0] = 0x7FFFFFFF
+        np.savez(tmp_path / "a.npz", classes=names, images=np.zeros((2, 2, 2), np.uint8))
+        with pytest.raises(ValueError, match=r"classes holds the character 2147483647, allowed: 0 to 1114111"):
+            read_arrays(tmp_path / "a.npz", ["classes"], 1 << 20)
+
+
+@pytest.mark.parametrize("name", ["x.pans", "x.pansrec", "x"])
+def test_foreign_bytes_are_named_as_numbers(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / name).write_bytes(b"PANSX\x05\x00\xff" + bytes(64))
+    assert main(["verify", str(tmp_path / name)]) == 2
+    said = "".join(capsys.readouterr())
+    assert "it starts with the bytes 50 41 4e 53 58 05 00 ff" in said
+    assert "b'" not in said

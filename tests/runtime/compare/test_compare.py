@@ -4,15 +4,19 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import small_files
 from browser import browser, clipped, console, look, serious, unreachable
 from commands import Pans, fixed_run, words_of
 
 from pans.runtime.cli import main
 from pans.runtime.compare import compare, mcnemar_exact, read_side
+from pans.runtime.errors import DamagedFileError
 from pans.runtime.record import read_recording
+from pans.runtime.record.format import Kind
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +144,16 @@ def test_what_is_no_run_is_refused(what: str, runs: Path, tmp_path: Path) -> Non
     else:
         place.write_text('{"a": 1}' if what == "other json" else "{")
     assert main(["compare", str(place), str(runs / "a")]) == 2
+
+
+@pytest.mark.parametrize("config", [None, {}, {"tick_hz": "a"}])
+def test_a_header_without_the_devices_clock_is_damage(config: Any, runs: Path, tmp_path: Path) -> None:
+    blocks = small_files.blocks_of((runs / "a" / "run.pansrec").read_bytes())
+    header = {key: value for key, value in json.loads(blocks[0][1]).items() if key != "config"}
+    blocks[0] = Kind.HEADER, json.dumps(header if config is None else header | {"config": config}).encode()
+    (tmp_path / "x.pansrec").write_bytes(small_files.sealed(blocks))
+    with pytest.raises(DamagedFileError, match=r"its header has no config\.tick_hz that can be"):
+        read_side(tmp_path / "x.pansrec")
 
 
 def test_the_page_in_a_browser(runs: Path, tmp_path: Path) -> None:

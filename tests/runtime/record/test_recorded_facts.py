@@ -99,3 +99,33 @@ def test_a_recording_with_any_summary_is_read_or_refused(tmp_path: Path, capsys:
             code = main(["report", str(path), "-o", str(tmp_path / "page.html"), "--force"])
             assert code in (0, 1, 2), capsys.readouterr().err
     assert refused > 100
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "said"),
+    [
+        (Kind.HEADER, {"created_utc": {}}, "created_utc is {}, allowed: a text"),
+        (Kind.HEADER, {"simulated": "no"}, "simulated is 'no', allowed: true or false"),
+        (Kind.HEADER, {"config": {"flow": {"settings": {"gate_classes": 3}}}}, "gate_classes is 3, allowed: a list"),
+        (Kind.EVENTS, {"kind": "blame", "decisions": "x"}, "decisions is 'x', allowed: a whole number"),
+        (Kind.EVENTS, {"kind": "dark_state", "state": "hot", "channels": [0]}, "has no dark_exposure"),
+        (
+            Kind.EVENTS,
+            {"kind": "part", "number": 0, "first_decision": 0},
+            "number is 0, allowed: a whole number from 1",
+        ),
+    ],
+)
+def test_header_and_events_are_checked_where_they_are_read(
+    kind: Kind, change: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    path = small_files.record_run(tmp_path)
+    blocks = small_files.blocks_of(path.read_bytes())
+    header = json.loads(blocks[0][1]) | (change if kind == Kind.HEADER else {})
+    blocks[0] = Kind.HEADER, json.dumps(header).encode()
+    if kind == Kind.EVENTS:
+        blocks.insert(-1, (kind, json.dumps(change).encode() + b"\n"))
+    path.write_bytes(small_files.sealed(blocks))
+    with pytest.raises(DamagedFileError) as caught:
+        list(read_recording(path).events())
+    assert said in caught.value.message
