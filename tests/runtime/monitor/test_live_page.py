@@ -79,7 +79,7 @@ class Served:
         self.process.stdin.flush()
 
     def ask(self, words: str, *headers: str) -> str:
-        with socket.create_connection(("127.0.0.1", self.port), timeout=30) as client:
+        with socket.create_connection(("127.0.0.1", self.port), timeout=120) as client:
             client.sendall("\r\n".join((f"{words} HTTP/1.1", "Connection: close", *headers, "", "")).encode())
             return b"".join(iter(lambda: client.recv(1 << 16), b"")).decode()
 
