@@ -14,8 +14,8 @@ from pans.runtime.errors import DamagedFileError
 from pans.runtime.ranges import Range, number_text
 
 COUNT = Range(0, 1 << 53, whole=True)
-FIGURE = Range(0, 1e15)  # photons, microseconds, seconds
-SIGNED = Range(-1e15, 1e15)
+FIGURE = Range(0, 1e26)  # photons, microseconds, seconds; 2^64 ticks of a clock of 1 Hz are 2e25 us
+SIGNED = Range(-1e26, 1e26)
 SHARE = Range(0, 1)
 END_OF_INTERVAL = Range(-1e-9, 1 + 1e-9)  # rounding may lead a little beyond a share
 OBJECTS = Range(0, (1 << 32) - 1, whole=True)  # a decision has its object as u32
@@ -88,7 +88,7 @@ _HEADER = {
     "versions": dict,
     "config": {"flow": {"settings": {"gate_classes": Each(list, str)}}},
 }
-NUMBER = Range(0, (1 << 63) - 1, whole=True)  # of an exposure, a decision, a tick
+NUMBER = Range(0, (1 << 64) - 1, whole=True)  # of an exposure, a decision, a tick
 _EVENT = {
     "kind+": str,
     **dict.fromkeys(("tick", "decision", "first_decision", "decisions", "exposures"), NUMBER),
