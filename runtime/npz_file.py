@@ -87,7 +87,7 @@ def npy_header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dt
     try:
         shape, fortran, dtype = read_header(file)
     except Exception as error:  # numpy hands the text to Python's parser and tokenizer, with the errors of both
-        raise ValueError(f"{name} has a header that cannot be read: {error}") from error
+        raise ValueError(f"{name} has a header that cannot be read") from error
     if any(isinstance(size, bool) or size < 0 for size in shape):
         raise ValueError(f"{name} has the shape {shape}, allowed: whole numbers from 0")
     return shape, fortran, dtype

@@ -171,7 +171,10 @@ def _decisions_of(recording: Recording, plan: Plan, clicks: ClickList) -> NDArra
     config = recording.header["config"]
     if "flow" in config:
         return np.ma.array(clicks.exposure, mask=np.full(len(clicks.exposure), True))
-    shots = SHOTS.checked(config["shots"], "shots")
+    try:
+        shots = SHOTS.checked(config["shots"], "shots")
+    except (KeyError, ValueError) as error:
+        raise DamagedFileError(f"{recording.path}: its header has no config.shots that can be: {error}") from error
     _, window_at = visit_maps(plan, shots)
     per_visit, visit = plan.shots_per_cycle * plan.cycles_per_object // shots, len(window_at)
     fields, nobody = ("index", "tick", "exposure_index", "shot"), np.full((1, 4), -1)
