@@ -63,7 +63,7 @@ _SHAPES: dict[str, Any] = {
     "expected_off_stderr": (None, SIGNED),
     **dict.fromkeys(_TEXTS, str),
     **dict.fromkeys(("simulated", "link_lost"), bool),
-    "faults": Each(list, str),
+    **dict.fromkeys(("faults", "warnings", "calibration_warnings"), Each(list, str)),
     "figures_of": Each(dict, str),
     **dict.fromkeys(("late_cause", "stream", "aborted", "gates"), Each(dict, COUNT)),
     "page_faults": Each(dict, FIGURE),
@@ -86,7 +86,10 @@ _HEADER = {
     **dict.fromkeys(("created_utc", "command", "device_url"), str),
     **dict.fromkeys(("simulated", "virtual_time"), bool),
     "versions": dict,
-    "config": {"flow": {"settings": {"gate_classes": Each(list, str)}}},
+    "config": {
+        "flow": {"settings": {"gate_classes": Each(list, str)}},
+        "dark": (None, {"guard": (None, {"afterpulses": COUNT, "expected": Each(list, SHARE)})}),
+    },
 }
 NUMBER = Range(0, (1 << 64) - 1, whole=True)  # of an exposure, a decision, a tick
 _EVENT = {

@@ -48,6 +48,7 @@ def test_keys_of_later_versions_may_be_missing(whole: dict[str, Any]) -> None:
         ("abstained", 1 << 50, "decisions abstained"),
         ("faults", "none", "faults is 'none', allowed: a list"),
         ("faults", [1], "faults: 0 is 1, allowed: a text"),
+        ("warnings", 0.5, "warnings is 0.5, allowed: a list"),
         ("latency_us", {"p50": 1.0}, "latency_us has no p99"),
         ("latency_us", None, "latency_us is None, allowed: an object"),
         ("device", [], "device is [], allowed: an object"),
@@ -107,6 +108,7 @@ def test_a_recording_with_any_summary_is_read_or_refused(tmp_path: Path, capsys:
         (Kind.HEADER, {"created_utc": {}}, "created_utc is {}, allowed: a text"),
         (Kind.HEADER, {"simulated": "no"}, "simulated is 'no', allowed: true or false"),
         (Kind.HEADER, {"config": {"flow": {"settings": {"gate_classes": 3}}}}, "gate_classes is 3, allowed: a list"),
+        (Kind.HEADER, {"config": {"dark": "2.4.6"}}, "dark is '2.4.6', allowed: an object"),
         (Kind.EVENTS, {"kind": "blame", "decisions": "x"}, "decisions is 'x', allowed: a whole number"),
         (Kind.EVENTS, {"kind": "dark_state", "state": "hot", "channels": [0]}, "has no dark_exposure"),
         (
