@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from .still import Scene
 
+# Of cells, fields or bars per second: below, times in ticks pass what 53 bits hold, and a run would wait for the first one without end.
+MIN_HZ = 1e-3
 MAX_RATE_HZ = 1e6
 MAX_SPEED_HZ = 1e7  # fields or bars per second
 MAX_SPREAD = 0.5

@@ -46,8 +46,8 @@ _RULES: dict[str, dict[str, Key]] = {
     "cells": {
         "images": Key("text"),
         "leave_out": Key("names", required=False),
-        "rate_hz": Key("number", high=moving.MAX_RATE_HZ, low=0, above=True),
-        "velocity_fields_per_s": Key("number", high=moving.MAX_SPEED_HZ, low=0, above=True),
+        "rate_hz": Key("number", moving.MIN_HZ, moving.MAX_RATE_HZ),
+        "velocity_fields_per_s": Key("number", moving.MIN_HZ, moving.MAX_SPEED_HZ),
         "velocity_spread": Key("number", 0, moving.MAX_SPREAD, required=False),
         "offset_px": Key("whole", 0, moving.MAX_OFFSET_PX, required=False),
         "background_transmission": Key("number", 0, 1, required=False),
@@ -57,7 +57,7 @@ _RULES: dict[str, dict[str, Key]] = {
     "tape": {
         "bars": Key("whole", 1, moving.MAX_BARS),
         "pixels_per_bar": Key("whole", 1, moving.MAX_PIXELS_PER_BAR),
-        "speed_bars_per_s": Key("number", 0, moving.MAX_SPEED_HZ, above=True),
+        "speed_bars_per_s": Key("number", moving.MIN_HZ, moving.MAX_SPEED_HZ),
         "jitter_bars": Key("number", 0, moving.MAX_JITTER_BARS, required=False),
         "jitter_time_s": Key("number", 0, MAX_TIME_S, above=True, required=False),
         "target": Key("text", required=False),

@@ -141,8 +141,9 @@ WRONG = [
     ('kind = "cell"', r':1:1: kind must be "still" or "cells" or "tape", found the text "cell"'),
     (CELLS + "rate = 3\n", r":5:1: rate is not a key of a scene of kind cells"),
     (CELLS.replace("rate_hz = 1000\n", ""), r":1:1: rate_hz is missing"),
-    (CELLS.replace("1000", "0"), r":3:1: rate_hz must be a number above 0 and at most 1000000, found 0"),
-    (CELLS.replace("1000", "nan"), r":3:1: rate_hz must be a number above 0"),
+    (CELLS.replace("1000", "0"), r":3:1: rate_hz must be a number from 0.001 to 1000000, found 0"),
+    (CELLS.replace("1000", "5e-324"), r":3:1: rate_hz must be a number from 0.001"),  # a run would never begin
+    (CELLS.replace("1000", "nan"), r":3:1: rate_hz must be a number from 0.001"),
     (CELLS.replace("1000", "true"), r":3:1: rate_hz must be .*, found the boolean true"),
     (CELLS + "offset_px = 1.0\n", r":5:1: offset_px must be a whole number from 0 to 64, found 1.0"),
     (CELLS + "offset_px = 5\n", r":2:1: the cells need pictures higher than offset_px = 5, found 5 rows"),
