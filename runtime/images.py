@@ -46,10 +46,8 @@ STRIP_ROWS = 64  # rows that are converted at a time, where a copy of the whole 
 # What is opened, by content: Pillow knows some forty more formats, of which one starts another program and several have decoders that
 # take damaged files for sound ones. BMP, GIF, PNG and PPM are unpacked row by row; for the others see `_bytes_to_unpack`.
 FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
-WEBP_BYTES, PROGRESSIVE_BYTES = (
-    12,
-    6,
-)  # per pixel beside the picture: three canvases of RGBA; all coefficients, 16 bits of 3 colours
+# Per pixel, beside the picture: three canvases of RGBA; all coefficients of a progressive JPEG, 16 bits of 3 colours.
+WEBP_BYTES, PROGRESSIVE_BYTES = 12, 6
 TIFF_BITS, TIFF_STRIP_ROWS, TIFF_TILE_WIDTH, TIFF_TILE_ROWS = 258, 278, 322, 323  # tags
 SIDE_PX = 32  # longer side of images that are made from photos, unless another is asked for
 LEAST_CUT = 0.01  # of the area: less is rounding to whole pixels, and is not told
@@ -330,9 +328,8 @@ def _opened(path: Path, *, shrinks: bool) -> Iterator[Any]:
             if (size := os.fstat(file.fileno()).st_size) > PICTURE_BYTES_MAX:  # some decoders read the file at once
                 found = f"{path}: {size >> 20} MiB, allowed: {PICTURE_BYTES_MAX >> 20} MiB"
                 raise UsageError(found, remedy="make the image smaller, or compress it")
-            warnings.simplefilter(
-                "ignore"
-            )  # of damage, with Pillow's own lines of code; and of size, where the limit here is lower
+            # Pillow warns of damage, with its own lines of code, and of a size that is above the limit here.
+            warnings.simplefilter("ignore")
             with Image.open(file, formats=FORMATS) as picture:
                 _demand_small(path, picture, shrinks)
                 yield picture
@@ -346,9 +343,8 @@ def _opened(path: Path, *, shrinks: bool) -> Iterator[Any]:
         raise DamagedFileError(f"{path}: {what}", remedy=remedy) from error
     except Image.DecompressionBombError as error:
         raise UsageError(f"{path}: {error}", remedy="make the image smaller") from error
-    except (
-        Exception
-    ) as error:  # a damaged file makes the decoders raise anything: IndexError, struct.error, RuntimeError, MemoryError
+    except Exception as error:
+        # A damaged file makes the decoders raise anything: IndexError, struct.error, RuntimeError, MemoryError.
         what, remedy = str(error) or type(error).__name__, "repair it, or move it elsewhere"
         raise DamagedFileError(f"{path}: not an image that can be read: {what}", remedy=remedy) from error
 

@@ -88,10 +88,9 @@ __all__ = [
 
 _trained = {name for name, (module, _) in _HOMES.items() if module.startswith("pans.trainer")}
 _lacks = {package for package in ("torch", "onnx", "sklearn") if find_spec(package) is None}
+# `from pans import *`, `help(pans)` and `inspect` load each name, and would end at one whose extra is not installed.
 for _name in _trained if _lacks - {"sklearn"} else {"PansClassifier"} if _lacks else ():
-    __all__.remove(
-        _name
-    )  # `from pans import *`, `help(pans)` and `inspect` load each, and would end at one whose extra is not installed
+    __all__.remove(_name)
 
 
 class MissingExtraError(UsageError, AttributeError):
