@@ -126,7 +126,7 @@ def checked_event(event: dict[str, Any], where: str) -> dict[str, Any]:
 def checked_summary(summary: Any, where: str) -> dict[str, Any]:
     """Return the summary of a run as it was read from `where`; DamagedFileError if it cannot be one."""
     if not isinstance(summary, dict):
-        raise DamagedFileError(f"{where}: expected the summary of a run, an object, found a {type(summary).__name__}")
+        raise DamagedFileError(f"{where}: the summary of a run is {ascii(summary)[:40]}, allowed: an object")
     if misfit := _misfit(summary, _SHAPES, "the summary") or next(_contradictions(summary), ""):
         raise DamagedFileError(f"{where}: {misfit}")
     return summary

@@ -202,9 +202,11 @@ def _rebuilt(recording: Recording, bundle: Bundle, pictures: ClickLog | None) ->
         core.guard = guard
         return core, sent
     except _NOT_REBUILT as error:
-        raise DamagedFileError(
-            f"{recording.path}: the run cannot be rebuilt: {error or type(error).__name__}"
-        ) from error
+        # Python's own words of a fact of another type say nothing to a reader.
+        why = (
+            "a fact of another type" if isinstance(error, (AttributeError, TypeError)) else error or "a fact is missing"
+        )
+        raise DamagedFileError(f"{recording.path}: the run cannot be rebuilt: {why}") from error
 
 
 def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
