@@ -240,8 +240,8 @@ class MixedHead:
 
 
 POLICIES = ("warn", "tables", "mask", "abstain")
-# Dark exposures of which none was out of reach of a click: so many in a row come about by chance once in a million runs
-# where a fourth is out of reach: 0.75^48.
+# From so many dark exposures on, it is a fault if each followed a click. If one in four usually does not, that happens by chance once
+# in a million runs: 0.75^48.
 UNWATCHED_MOST = 48
 MAX_FINDINGS = 1000  # kept for the summary; the recording has them all
 
@@ -509,7 +509,7 @@ class DarkGuard:
             return ""
         return (
             f"none of {report.exposures} dark exposures could be watched: each came within {self._afterpulses} exposures of a click; "
-            "put dark slots behind slots that seldom click, or give more of them (--dark-slots)"
+            "use more dark slots (--dark-slots), or put them after patterns that seldom click"
         )
 
 

@@ -38,9 +38,8 @@ class WalkFigures:
     illumination_mean: float | None  # per decision, photoelectrons per unit transmission, of the states that were shown
     abstained_below_confidence: int
     late_slots: int  # that stayed dark because the host named no state in time
-    turn_us: (
-        dict[str, float | None] | None
-    )  # from a block's arrival until the next state's name had left; host-driven only
+    # From a block's arrival until the next state's name had left; None unless the host drives.
+    turn_us: dict[str, float | None] | None
     turn_budget_us: float | None  # from the end of an exposure to the beginning of the next one
     expected: dict[str, Any] | None  # as the bundle says it: for its profile, task and split
     # measured accuracy less the expected one, in standard errors, on the same profile
@@ -255,7 +254,7 @@ def exposure_fault(timing: Mapping[str, Any], received: int = 0) -> str:
     if timing.get("within") is not False:
         if not timing.get("untold"):
             return ""
-        told = f"the device told of {timing['exposures']} exposures by EXPOSED, and of {timing['untold']} more that ended it told nothing"
+        told = f"EXPOSED reported {timing['exposures']} exposures, but {timing['untold']} more had ended"
         return f"{told}: pans conform --rule 15.1 tries it"
     allowed_us = timing["tolerance_us"]
     worst = ((what, timing[f"worst_{what}_exposure"], timing[f"worst_{what}_us"]) for what in ("start", "length"))

@@ -219,7 +219,7 @@ class HostSession:
         self._retry_due_ns = now_ns + self._retry_after_ns
 
     def _repeat(self) -> None:
-        """Send what is not acknowledged again, once in an output: a backlog of old ACKs would repeat all of it every 10 ms."""
+        """Send unacknowledged commands again, once per output: otherwise a backlog of old ACKs repeats them all every 10 ms."""
         if not self._repeats:
             self._repeats = True
             self._output.extend(frame for _, frame in self._unacknowledged)
