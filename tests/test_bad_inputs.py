@@ -17,16 +17,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pans.runtime import SHIPPED
-from pans.runtime.cli import main
-from pans.runtime.cli.command import parser_of
-from pans.runtime.cli.finding import find_commands, load_command
-from pans.runtime.errors import UsageError
-from pans.runtime.instrument.calibration import sealed
-from pans.runtime.instrument.profile import profile_text
+from pans.app.command import parser_of
+from pans.app.find_commands import find_commands, load_command
+from pans.app.main import main
+from pans.base import SHIPPED
+from pans.base.errors import UsageError
+from pans.instrument.calibration_file import sealed
+from pans.instrument.profile import profile_text
 
 LIMIT_S = 60  # only against waiting for ever: a busy machine may take its time
-SLOW = ("torch", "optuna", "pans.trainer.train.loop")  # loaded before the limit counts, where they are installed
+SLOW = (
+    "torch",
+    "optuna",
+    "pans_trainer.train.gradient.loop",
+)  # loaded before the limit counts, where they are installed
 FAST = "sim:oled-qcmos?pace=fast"
 GOOD = {  # a command line of each command that would work, with its required arguments
     "demo": "--pace fast --seconds 0.01 --out new", "run": f"b.pans --device {FAST} --decisions 1 --out new",

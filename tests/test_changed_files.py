@@ -30,12 +30,12 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from thirds import write_thirds
 
-from pans.firmware_sim.testing import small_automaton_bundle, small_setup
-from pans.runtime.bundle.model import bundle_bytes
-from pans.runtime.cli import main
-from pans.runtime.container import canonical_json
-from pans.runtime.instrument.profile import profile_text
-from pans.runtime.record import read_recording
+from pans.app.main import main
+from pans.base.files.container import canonical_json
+from pans.bundle.sensor import bundle_bytes
+from pans.instrument.profile import profile_text
+from pans.record.reading import read_recording
+from pans_sim.testing import small_automaton_bundle, small_setup
 
 FINE = {0, 1, 2, 3, 4}  # 70 is a fault of pans
 MORE_MIB = 300  # than the program takes by itself, which with torch is another 300

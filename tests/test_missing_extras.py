@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from commands import fixed_run
 
-from pans.runtime.cli import main
-from pans.runtime.offered import install
+from pans.app.main import main
+from pans.base.console.extras import install
 
 BLOCKED = (
     "torch",
@@ -55,8 +55,8 @@ CHILD = """
 import contextlib, io, json, sys
 
 sys.modules |= dict.fromkeys(json.loads(sys.argv[1]))  # None: cannot be imported
-from pans.runtime.cli import main
-from pans.runtime.offered import install
+from pans.app.main import main
+from pans.base.console import install
 
 found = {}
 for line in json.loads(sys.argv[2]):

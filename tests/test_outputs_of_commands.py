@@ -1,15 +1,15 @@
 """Every command that writes: it replaces nothing, never writes into an input, and refuses before it does anything."""
 
 import shutil
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import Pans, fixed_run
 
-from pans.runtime import SHIPPED
-from pans.runtime.cli import main
+from pans.app.find_commands import find_commands
+from pans.app.main import main
+from pans.base import SHIPPED
 
 DEVICE = "sim:oled-qcmos?pace=fast&scene=uniform"
 COMMANDS = {  # words, what is there already, what else is read
@@ -41,7 +41,7 @@ COMMANDS = {  # words, what is there already, what else is read
     "tune": (f"tune b.pans --device {DEVICE} -o OUT", "OUT", "b.pans"),
 }
 WRITES_NO_FILE = {"verify", "info", "simulate", "instrument", "devices", "doctor", "baseline", "completion", "runs"}
-CHECKED_ELSEWHERE = {"demo", "sweep", "conform"}  # tests/runtime/commands/test_run_files.py, below; conform writes none
+CHECKED_ELSEWHERE = {"demo", "sweep", "conform"}  # tests/runtime/app/run/test_run_files.py, below; conform writes none
 
 
 @pytest.fixture
@@ -100,13 +100,13 @@ def test_no_command_writes_into_its_input(name: str, folder: Path, pans: Pans) -
 
 def test_every_command_is_in_one_of_these_lists() -> None:
     known = {words.split()[0] for words, *_ in COMMANDS.values()} | WRITES_NO_FILE | CHECKED_ELSEWHERE
-    assert known == {point.name for point in entry_points(group="pans.commands")}
+    assert known == {*find_commands()}
 
 
 def test_a_sweep_appends_to_no_foreign_file(folder: Path, pans: Pans) -> None:
     pytest.importorskip("optuna", reason="needs the sweep extra")
-    from pans.runtime.errors import UsageError
-    from pans.trainer.commands.sweep import open_storage
+    from pans.base.errors import UsageError
+    from pans_trainer.commands.sweep import open_storage
 
     for text in ("precious\n", "[1]\n", '{"a": 1}\n'):
         Path("journal").write_text(text)

@@ -5,7 +5,6 @@ A line `<!-- options of pans NAME -->` becomes both; a command that cannot be lo
 
 import argparse
 import re
-from importlib.metadata import entry_points
 from typing import Any
 
 COMMON = (
@@ -28,9 +27,10 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def options_table(name: str) -> str:
     """Return the examples of `pans NAME` and its options, in Markdown."""
-    from pans.runtime.cli.command import parser_of
+    from pans.app.command import parser_of
+    from pans.app.find_commands import find_commands
 
-    (point,) = entry_points(group="pans.commands", name=name)
+    point = find_commands()[name]
     try:
         command = point.load()
         parser = parser_of(name, command)

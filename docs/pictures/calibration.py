@@ -14,7 +14,9 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from pans.runtime.core.calibration import (
+from pans.base.numbers import CHI2_95, jeffreys_interval
+from pans.calibrate.estimate import Counts, fit_light, log_likelihood
+from pans.calibrate.measurement import (
     LADDER,
     TELLING,
     Design,
@@ -23,11 +25,9 @@ from pans.runtime.core.calibration import (
     design_run,
     profile_level,
 )
-from pans.runtime.instrument.click_law import click_law, click_probability
-from pans.runtime.instrument.estimate import Counts, fit_light, log_likelihood
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.intervals import CHI2_95, jeffreys_interval
-from pans.runtime.wire.messages import DARK_PATTERN
+from pans.instrument.click_law import click_law, click_probability
+from pans.instrument.profile import Profile, load_profile
+from pans.protocol.wire import DARK_PATTERN
 
 
 def drawn(truth: Profile, design: Design, seed: int) -> Counts:

@@ -13,10 +13,9 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from pans.firmware_sim.scene.detector_kernels import click_thresholds, plain_words
-from pans.firmware_sim.scene.detector_model import CLICK_STREAM, stream_key
-from pans.runtime.instrument.channel_health import ChannelHealth
-from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
+from pans.decide.dark import ChannelHealth, ChannelWatch, WatchSettings
+from pans_sim.scene.detector_kernels import click_thresholds, plain_words
+from pans_sim.scene.detector_model import CLICK_STREAM, stream_key
 
 RATE, CHANNELS, STEP = 0.01, 4, 20
 LEGS = ((12_000, 1.0), (6_000, 2.0), (6_000, 1.0), (300, 20.0), (6_000, 1.0))

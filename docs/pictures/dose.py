@@ -10,14 +10,14 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.imaging import NO_BLEACHING
-from pans.trainer.commands.evaluate import dose_curve_words
-from pans.trainer.evaluate.dose import dose_curve
-from pans.trainer.evaluate.held_out import held_out_of, measure
-from pans.trainer.evaluate.pictures import draw_dose
-from pans.trainer.export.ordering import information_order, reordered
-from pans.trainer.options import Conditions
+from pans.bundle.sensor import load_bundle
+from pans.instrument.optics import NO_BLEACHING
+from pans_trainer.commands.evaluate import dose_curve_words
+from pans_trainer.evaluate.dose import dose_curve
+from pans_trainer.evaluate.held_out import held_out_of, measure
+from pans_trainer.evaluate.pictures import draw_dose
+from pans_trainer.export.ordering import information_order, reordered
+from pans_trainer.options import Conditions
 
 if __name__ == "__main__":
     objects = int(sys.argv[1]) if len(sys.argv) > 1 else None

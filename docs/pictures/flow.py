@@ -11,14 +11,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from pans.runtime.core.decision import NO_LABEL
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.flow.make import recorded_flow_core
-from pans.runtime.flow.matching import abort_reason
-from pans.runtime.record import read_recording
-from pans.runtime.record.sent_plan import sent_to_device
-from pans.runtime.wire.messages import MessageType, decode_frames, decode_mark, unpack_body
-from pans.trainer.figures import new_figure, save_figure
+from pans.bundle.backends import NO_LABEL, make_decider
+from pans.decide.flow import abort_reason, recorded_flow_core
+from pans.protocol.wire import MessageType, decode_frames, decode_mark, unpack_body
+from pans.record.reading import read_recording, sent_to_device
+from pans_trainer.figures import new_figure, save_figure
 
 recording = read_recording(Path(sys.argv[1]))
 first = int(sys.argv[2]) if len(sys.argv) > 2 else 0

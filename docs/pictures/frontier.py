@@ -14,8 +14,8 @@ from typing import Any
 
 from matplotlib.ticker import NullFormatter
 
-from pans.trainer.figures import new_figure, save_figure
-from pans.trainer.reproduce.curves import error_of
+from pans_trainer.figures import new_figure, save_figure
+from pans_trainer.reproduce.curves import error_of
 
 HERE = Path(__file__).parent
 # name, colour, and where the name stands in each panel (x, accuracy, horizontal alignment)

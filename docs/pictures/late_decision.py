@@ -9,14 +9,14 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-from pans.firmware_sim.ports.serve import open_sim
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.live import RunOptions, run_live
-from pans.runtime.timing import causes
-from pans.runtime.timing.causes import IDLE, OVERSLEPT, Facts, Verdict
-from pans.trainer.figures import new_figure, save_figure
+from pans.bundle.backends import make_decider
+from pans.decide.still import Core
+from pans.live.loop import run_live
+from pans.live.options import RunOptions
+from pans.live.timing import IDLE, OVERSLEPT, Facts, Verdict, causes
+from pans_sim.ports.serve import open_sim
+from pans_sim.testing import small_setup
+from pans_trainer.figures import new_figure, save_figure
 
 CASES = {
     "stall:60ms/400ms": "the link stalls",

@@ -6,14 +6,14 @@ before as after the loss that passes the threshold of one false alarm per week. 
 
 import numpy as np
 
-from pans.firmware_sim import scenes
-from pans.runtime import SHIPPED
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.core.plan import build_plan
-from pans.runtime.decide.expectation import pattern_light
-from pans.runtime.instrument.click_law import both_chances, click_law, object_transmission
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.instrument.state_watch import LOOK_S, TOLERATED, WEEK_S, found_at
+from pans.base import SHIPPED
+from pans.bundle.backends import pattern_light
+from pans.bundle.sensor import load_bundle
+from pans.decide.dark import LOOK_S, TOLERATED, WEEK_S, found_at
+from pans.decide.plan import build_plan
+from pans.instrument.click_law import both_chances, click_law, object_transmission
+from pans.instrument.profile import load_profile
+from pans_sim import scenes
 
 WALKS = (2_500, 5_000, 10_000, 20_000, 50_000, 100_000, 1_000_000)
 LOSSES = np.arange(0.01, 0.6, 0.01)

@@ -12,13 +12,13 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from pans.firmware_sim.device.view import View
-from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene import open_scene
-from pans.firmware_sim.scene.marks import MARK_EXPOSURE, MARK_HALF, MARK_OBJECT, MARK_PHOTONS, MARK_TRUTH
-from pans.firmware_sim.scene.moving import Cells
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.wire.commands import PARALLEL
+from pans.instrument.profile import load_profile
+from pans.protocol.wire import PARALLEL
+from pans_sim.device.view import View
+from pans_sim.scene import open_scene
+from pans_sim.scene.marks import MARK_EXPOSURE, MARK_HALF, MARK_OBJECT, MARK_PHOTONS, MARK_TRUTH
+from pans_sim.scene.moving import Cells
+from pans_sim.scene.program import Program
 
 matplotlib.use("Agg")
 from matplotlib import pyplot

@@ -8,12 +8,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from pans.runtime.bundle.model import load_bundle
-from pans.trainer.commands.evaluate import optics_curve_words
-from pans.trainer.evaluate.held_out import held_out_of
-from pans.trainer.evaluate.optics import misalignment_curves
-from pans.trainer.evaluate.pictures import draw_optics
-from pans.trainer.options import Conditions
+from pans.bundle.sensor import load_bundle
+from pans_trainer.commands.evaluate import optics_curve_words
+from pans_trainer.evaluate.held_out import held_out_of
+from pans_trainer.evaluate.optics import misalignment_curves
+from pans_trainer.evaluate.pictures import draw_optics
+from pans_trainer.options import Conditions
 
 OBJECTS = 2000
 

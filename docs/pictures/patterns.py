@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from walk import lit
 
-from pans.firmware_sim.scene import load_scene
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.commands.run import DEMO_SCENE
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.figures import new_figure, save_figure
+from pans.app.run import DEMO_SCENE
+from pans.bundle.sensor import load_bundle
+from pans.instrument.profile import load_profile
+from pans_sim.scene import load_scene
+from pans_trainer.evaluate.accuracy import light_of
+from pans_trainer.figures import new_figure, save_figure
 
 
 def main() -> None:

@@ -16,17 +16,15 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from pans.runtime.bundle import load_bundle
-from pans.runtime.bundle.automaton import log_scores
-from pans.runtime.bundle.model import word_means
-from pans.runtime.decide.expectation import expected_walk
-from pans.runtime.detector import afterpulses_of
-from pans.runtime.instrument.click_law import object_transmission
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.refit.choosing import choose, kinds_for
-from pans.runtime.refit.evidence import evidence_of, log_softmax
-from pans.trainer.evaluate.accuracy import exposure_of, light_of, outcome_law_of
-from pans.trainer.tasks import load_task
+from pans.bundle.automaton import log_scores
+from pans.bundle.backends import expected_walk
+from pans.bundle.sensor import load_bundle, word_means
+from pans.calibrate.refit import choose, evidence_of, kinds_for, log_softmax
+from pans.instrument.click_law import object_transmission
+from pans.instrument.detector import afterpulses_of
+from pans.instrument.profile import load_profile
+from pans_trainer.evaluate.accuracy import exposure_of, light_of, outcome_law_of
+from pans_trainer.tasks import load_task
 
 SIZES, DRAWS = (100, 200, 500, 1000, 2000, 4000), 10
 

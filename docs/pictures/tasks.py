@@ -13,9 +13,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.optics import incident_intensity
-from pans.trainer.tasks.generators import GENERATORS
-from pans.trainer.tasks.registry import draw_task, load_task
+from pans.bundle.sensor import incident_intensity
+from pans_trainer.tasks.generators import GENERATORS
+from pans_trainer.tasks.registry import draw_task, load_task
 
 PER_CLASS = 8
 DPI = 70

@@ -19,18 +19,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Rectangle
 from PIL import Image
 
-from pans.firmware_sim.scene import Scene, load_scene
-from pans.runtime import cli
-from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.bundle.model import Bundle
-from pans.runtime.commands.run import DEMO_DEFAULTS, DEMO_SCENE
-from pans.runtime.decide.expectation import pattern_light
-from pans.runtime.instrument.click_law import object_transmission
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.record import read_recording
-from pans.runtime.record.exposures import iter_exposures
-from pans.runtime.record.sent_plan import recorded_plan
-from pans.trainer.figures import drawn, save_figure
+from pans.app.main import main
+from pans.app.run import DEMO_DEFAULTS, DEMO_SCENE
+from pans.bundle.automaton import Automaton
+from pans.bundle.backends import pattern_light
+from pans.bundle.sensor import Bundle
+from pans.instrument.click_law import object_transmission
+from pans.instrument.profile import load_profile
+from pans.record.reading import iter_exposures, read_recording, recorded_plan
+from pans_sim.scene import Scene, load_scene
+from pans_trainer.figures import drawn, save_figure
 
 HERE, WIDTH = Path(__file__).parent, 8.9  # inches: 801 pixels, so that 16 points are 9 pixels high on a phone
 SURE = 0.9
@@ -76,7 +74,7 @@ class Walk:
 def demo_walk() -> Walk:
     """Run the demo and return the walk to be shown."""
     with TemporaryDirectory() as folder:
-        cli.main(["demo", "--pace", "fast", "--out", f"{folder}/demo"])
+        main(["demo", "--pace", "fast", "--out", f"{folder}/demo"])
         recording = read_recording(f"{folder}/demo/run.pansrec")
         bundle, decisions = recording.bundle(), recording.decisions()
         seen = list(iter_exposures(recording, recorded_plan(recording)))

@@ -17,22 +17,23 @@ import subprocess
 import sys
 import tomllib
 from contextlib import suppress
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 from documents import EXAMPLES, SHELL, Block, blocks, indented, pages, pans_commands, sentences, spans
 from tree import ROOT
 
-from pans.runtime import cli
+from pans.app.command import parser_of as command_parser
+from pans.app.find_commands import find_commands
+from pans.app.main import main
 
-COMMANDS = {point.name: point for point in entry_points(group="pans.commands")}
+COMMANDS = find_commands()
 MOST_WORDS = 40  # of a sentence outside measurements and results, which are mostly figures
 
 
 def parser_of(name: str) -> argparse.ArgumentParser:
     """The parser of one command, as `pans` itself makes it."""
-    return cli.command.parser_of(name, COMMANDS[name].load())
+    return command_parser(name, COMMANDS[name].load())
 
 
 def check(words: list[str], where: str, whole: bool) -> None:
@@ -73,17 +74,29 @@ def test_every_command_is_on_the_page_of_commands() -> None:
 
 def test_every_key_of_a_summary_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (ROOT / "docs/reference/exit-codes.md").read_text(encoding="utf-8")
-    assert cli.main(["demo", "--pace", "fast", "--seconds", "1", "--out", str(tmp_path / "demo"), "--json"]) == 0
+    assert main(["demo", "--pace", "fast", "--seconds", "1", "--out", str(tmp_path / "demo"), "--json"]) == 0
     assert [key for key in json.loads(capsys.readouterr().out) if f"`{key}`" not in text] == []
 
 
-def test_every_package_has_a_page_of_its_interface() -> None:
-    layers = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["pans"]["layers"]
-    names = {f"{top}.{package}".rstrip(".") for top, packages in layers.items() for package in packages}
+def test_every_face_has_a_place_in_the_interface() -> None:
+    rooms = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["pans"]["rooms"]
+    names = {f"{top}.{room}".rstrip(".") for top, some in rooms.items() for room in some if room != "commands"}
     files = (ROOT / "docs/reference/api").glob("*.md")
     shown = {line for page in files for line in page.read_text(encoding="utf-8").splitlines()}
-    hidden = {name for name in names if name.endswith(".commands") or name.startswith("hw_profiles")}
-    assert {f"::: pans.{name}" for name in names - hidden} <= shown
+    assert {f"::: {name}" for name in names} <= shown
+
+
+def test_what_the_architecture_names_is_there() -> None:
+    text = "".join(
+        (ROOT / name).read_text(encoding="utf-8") for name in ("docs/explanation/architecture.md", "CONTRIBUTING.md")
+    )
+    named = re.findall(r"`((?:runtime|trainer|firmware_sim|tests|docs|hw_profiles)/[\w./-]+)(?::([\w.]+))?`", text)
+    assert len(named) > 40
+    for path, name in named:
+        assert (ROOT / path).exists(), path
+        source = (ROOT / path).read_text(encoding="utf-8") if name else ""
+        for part in name.split(".") if name else ():
+            assert re.search(rf"(?m)^\s*(?:def|class) {part}\b|^{part}\b.* = ", source), f"{path}: no {part}"
 
 
 @pytest.mark.parametrize("name", ["README.md", "CHANGELOG.md", "CONTRIBUTING.md"])
@@ -156,7 +169,7 @@ def run_block(block: Block) -> int:
 
 def status(words: list[str]) -> int:
     try:
-        return cli.main(words)
+        return main(words)
     except SystemExit as end:
         return int(end.code or 0)
 

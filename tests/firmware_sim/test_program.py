@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pans.firmware_sim.program import Exposures, Program
-from pans.runtime.wire.commands import SEQUENTIAL
-from pans.runtime.wire.schema import LARGEST_TICK
+from pans.protocol.wire.commands import SEQUENTIAL
+from pans.protocol.wire.schema import LARGEST_TICK
+from pans_sim.scene.program import Exposures, Program
 
 LONGEST_CYCLE, MOST_CYCLES = 1 << 48, (1 << 32) - 1  # docs/reference/protocol.md
 

@@ -12,10 +12,11 @@ from lab_automaton import ABSTAINS, read_automaton, walk_again
 from lab_bundle import read_bundle
 from lab_recording import read_recording
 
-from pans.runtime.bundle import Automaton, bundle_bytes, write_bundle
-from pans.runtime.cli import main
-from pans.runtime.decide import make_decider
-from pans.runtime.decide.automaton import AutomatonDecider
+from pans.app.main import main
+from pans.bundle.automaton import Automaton
+from pans.bundle.backends import make_decider
+from pans.bundle.backends.automaton import AutomatonDecider
+from pans.bundle.sensor import bundle_bytes, write_bundle
 
 AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=12), random_automaton(2, slots=5, channels=2)]
 COUNTED = [random_automaton(3, slots=6, outcomes=3), random_automaton(4, slots=4, outcomes=16)]  # photon numbers

@@ -21,11 +21,11 @@ from lab_firmware import SAFE, Firmware
 from lab_light import Light
 from lab_recording import read_recording
 
-from pans.firmware_sim.conform import conform
-from pans.runtime.cli import main
-from pans.runtime.instrument import load_profile
-from pans.runtime.live import LiveRun, Observers, RunResult
-from pans.runtime.wire.commands import Gate
+from pans.app.main import main
+from pans.instrument.profile import load_profile
+from pans.live.loop import LiveRun, Observers, RunResult
+from pans.protocol.wire.commands import Gate
+from pans_sim.conform import conform
 
 HERE = Path(__file__).parent
 ARM, STOP, RESET, GATE = 3, 4, 5, 6

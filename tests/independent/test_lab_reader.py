@@ -17,19 +17,20 @@ from lab_decisions import decide_again
 from lab_recording import NO_NUMBER, read_recording
 from tree import ROOT
 
-from pans.runtime.bundle import Bundle, load_bundle, write_bundle
-from pans.runtime.bundle.layers import quantise_head
-from pans.runtime.cli import EXIT_DEVICE, main
-from pans.runtime.errors import UsageError
-from pans.runtime.record import read_recording as our_reader
-from pans.runtime.record.exposures import click_list
-from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.record.tables import click_table
+from pans.app.main import main
+from pans.base.errors import EXIT_DEVICE, UsageError
+from pans.bundle.heads.layers import quantise_head
+from pans.bundle.sensor import Bundle, load_bundle, write_bundle
+from pans.record.reading import read_recording as our_reader
+from pans.record.reading.exposures import click_list
+from pans.record.reading.sent_plan import recorded_plan
+from pans.record.tables import to_frame, to_xarray
+from pans.record.tables.tables import click_table
 
 D_F, CLASSES, LEVELS = 6, 4, 16
 EXPOSURE_US = 100.0
 PEAK_HZ = 20_000.0
-FASHION = ROOT / "runtime" / "shipped" / "fashion10.pans"
+FASHION = ROOT / "runtime/pans/shipped" / "fashion10.pans"
 TROUBLE = "loss:0.02,flip:0.01,duplicate:0.03,reorder:0.03,drip:0.02,stall:300ms/900ms,disconnect:100ms/1500ms,reset:0ms/2500ms"
 
 
@@ -144,7 +145,7 @@ def test_frames_hold_what_the_lab_reads(tmp_path: Path) -> None:
     write_bundle(small_bundle(case.backend), tmp_path / "small.pans")
     path = record(tmp_path, case, tmp_path / "small.pans")
     lab, ours = read_recording(path.read_bytes()), our_reader(path)
-    frame, data = ours.to_frame(), ours.to_xarray()
+    frame, data = to_frame(ours), to_xarray(ours)
     columns = {"decision": "index", "exposure": "exposure_index", "first_shot": "shot"}
     for name in ("decision", "tick", "exposure", "object", "first_shot", "clicks", "flags"):
         assert frame[name].tolist() == data[name].values.tolist() == lab.rows[columns.get(name, name)].tolist()
@@ -162,7 +163,7 @@ def test_frames_hold_what_the_lab_reads(tmp_path: Path) -> None:
     assert frame.latency_us.isna().all()  # there is none in virtual time
     assert np.isnan(data.latency_us.values).all()
     # the same file, as one of a run in real time
-    real = replace(ours, header={**ours.header, "virtual_time": False}, summary={}).to_frame()
+    real = to_frame(replace(ours, header={**ours.header, "virtual_time": False}, summary={}))
     assert real.latency_us.isna().tolist() == frame.index.isna().tolist() == (~timed).tolist()
     assert real.latency_us[timed].to_numpy() == pytest.approx((times[:, 3] - times[:, 1]) / 1000, abs=6e-4)
     zero_ns = min(sent for sent, _ in lab.commands)
@@ -172,7 +173,7 @@ def test_frames_hold_what_the_lab_reads(tmp_path: Path) -> None:
     np.testing.assert_array_equal(data.time.values, shown)
     assert (frame.attrs["units"]["latency_us"], data.latency_us.attrs["units"]) == ("us", "us")
     with pytest.raises(UsageError, match="decisions or clicks"):
-        ours.to_frame("photons")
+        to_frame(ours, "photons")
 
 
 def test_a_head_of_hundreds_of_units(tmp_path: Path) -> None:

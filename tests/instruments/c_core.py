@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from pans.firmware_sim.device import readings
-from pans.firmware_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES
-from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, PatternMemory, Refused
-from pans.firmware_sim.device.view import View
-from pans.firmware_sim.lab.core import Core, Hardware, find_compiler, limits_of, states_of
-from pans.firmware_sim.program import Program, States
-from pans.firmware_sim.scene.detector import sample_clicks
-from pans.firmware_sim.scene.detector_model import detector_model, first_click_probability
-from pans.firmware_sim.scene.light import LightTable
-from pans.firmware_sim.scene.scene_file import open_scene
-from pans.runtime.instrument.profile import Profile
-from pans.runtime.wire.commands import MODES, PatternChunk
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN
+from pans.instrument.profile import Profile
+from pans.protocol.wire import ADAPTIVE_PATTERN, DARK_PATTERN
+from pans.protocol.wire.commands import MODES, PatternChunk
+from pans_sim.device import readings
+from pans_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES
+from pans_sim.device.upload import MAX_PATTERN_PIXELS, PatternMemory, Refused
+from pans_sim.device.view import View
+from pans_sim.pc_instrument.core import Core, Hardware, find_compiler, limits_of, states_of
+from pans_sim.scene.detector import sample_clicks
+from pans_sim.scene.detector_model import detector_model, first_click_probability
+from pans_sim.scene.light import LightTable
+from pans_sim.scene.program import Program, States
+from pans_sim.scene.scene_file import open_scene
 
 COMPILER = find_compiler()
 

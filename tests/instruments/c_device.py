@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from c_core import COMPILER, CDevice
 
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.scene.moving import SceneFile
-from pans.firmware_sim.scene.still import scene_from_arrays
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.link.fit import upload_commands
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, pack_command
-from pans.runtime.wire.messages import Frame, MessageType, Opcode
+from pans.live.device_check import upload_commands
+from pans.protocol.wire import Frame, MessageType, Opcode
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Arm, pack_command
+from pans_sim.device.instrument import Instrument
+from pans_sim.scene.moving import SceneFile
+from pans_sim.scene.still import scene_from_arrays
+from pans_sim.testing import small_setup
 
 MODES = ("sequential", "parallel", "device-driven", "host-driven")
 NONCE = 7

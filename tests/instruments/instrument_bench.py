@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.scene.still import load_scene
-from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.core.plan import Plan
-from pans.runtime.core.plan_codec import plan_commands
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, Show, mask_chunks, pack_command
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, Opcode
+from pans.bundle.automaton import Automaton
+from pans.decide.plan.plan import Plan
+from pans.decide.plan.plan_codec import plan_commands
+from pans.instrument.profile import Profile, load_profile
+from pans.protocol.wire import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, Opcode
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Arm, PatternChunk, PlanChunk, Show, mask_chunks, pack_command
+from pans_sim.device.instrument import Instrument
+from pans_sim.scene.still import load_scene
 
 NONCE = 0x11223344
 POWER_ON = 1000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pans.runtime.errors import LinkError
+from pans.base.errors import LinkError
 
 
 class LockStepLink:

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 from c_core import CDevice
 
-from pans.firmware_sim.conform import Finding, conform
-from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
-from pans.firmware_sim.lab.core import FOLDER, build_library
-from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.runtime.instrument.profile import load_profile
+from pans.instrument.profile import load_profile
+from pans_sim.conform import Finding, conform
+from pans_sim.device.clock import DeviceClock, SteppedDevice
+from pans_sim.pc_instrument.core import FOLDER, build_library
+from pans_sim.ports.virtual import START_NS, VirtualLink
 
 PIECE = 64  # bytes that a slow line takes at once
 

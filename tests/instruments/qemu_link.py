@@ -1,6 +1,6 @@
 """The reference firmware as an Arm image in QEMU: how it is built, a link to it in virtual time, and the log of a run without a host.
 
-The board is firmware_sim/reference/mps2. With lockstep.c it runs in lock-step: its time stands still while the host works, so that nothing
+The board is firmware_sim/pans_sim/reference/mps2. With lockstep.c its time stands still while the host works, so that nothing
 depends on how busy the machine is. `open_qemu` opens `qemu:IMAGE.elf`.
 """
 
@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from lock_step import LockStepLink, open_links
 
-from pans.firmware_sim import device
-from pans.runtime.errors import LinkError
+from pans.base.errors import LinkError
+from pans_sim import device
 
 FOLDER = Path(device.__file__).parents[1] / "reference"
 COMPILER, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"

@@ -18,7 +18,7 @@ import numpy as np
 from lock_step import LockStepLink, open_links
 from qemu_link import FOLDER
 
-from pans.runtime.errors import LinkError
+from pans.base.errors import LinkError
 
 BENCH = Path(__file__).parent / "rp2040" / "bench.mjs"
 NEEDED = ("PICO_SDK_PATH", "PANS_RP2040JS", "PANS_RP2040_BOOTROM")

@@ -6,5 +6,5 @@ from numba import njit
 
 
 def called(kernel: Any) -> Any:
-    """Return an inner kernel (wire/inner.py) with a way in from Python."""
+    """Return an inner kernel (base/machine/jit.py) with a way in from Python."""
     return njit(nogil=True)(kernel.py_func) if hasattr(kernel, "py_func") else kernel

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
-from pans.runtime.bundle import Automaton
+from pans.bundle.automaton import Automaton
 
 
 class Walk(NamedTuple):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pans.runtime.bundle.layers import STEP_MAX, Int8Head
+from pans.bundle.heads.layers import STEP_MAX, Int8Head
 
 
 def word_of(clicks: Sequence[int]) -> int:

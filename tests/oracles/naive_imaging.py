@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.imaging import Imaging
+from pans.instrument.optics import Imaging
 
 FINE, PAD = 16, 7  # points per pixel and axis; pixels around the object
 

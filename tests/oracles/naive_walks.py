@@ -1,4 +1,4 @@
-"""Walks of an automaton as plain loops over exposures, from the definition: the oracle of firmware_sim/device/walking.py."""
+"""Walks of an automaton as plain loops over exposures, from the definition: the oracle of firmware_sim/pans_sim/device/walking.py."""
 
 import math
 from collections.abc import Callable

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from pans.runtime.core.plan import ADAPTIVE_PATTERN, Plan
-from pans.runtime.wire.messages import DARK_PATTERN
+from pans.decide.plan.plan import Plan
+from pans.protocol.wire import ADAPTIVE_PATTERN, DARK_PATTERN
 
 
 def count_visits(

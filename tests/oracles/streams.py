@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from pans.runtime.core.decision import DECISION_DTYPE
-from pans.runtime.core.still import Core
-from pans.runtime.kernel.calls import Limits, StreamCore
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.framing import FrameDecoder
-from pans.runtime.wire.messages import ClickBlock, DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
+from pans.decide.decision import DECISION_DTYPE
+from pans.decide.kernel.calls import Limits, StreamCore
+from pans.decide.still.core import Core
+from pans.protocol.wire import DeviceState, MessageType, StateReason
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.framing import FrameDecoder
+from pans.protocol.wire.messages import ClickBlock, FrameBlock, Mark, Status
 
 SESSION = 7
 MOST_SENT = 1 << 15

@@ -23,25 +23,25 @@ from typing import Any
 import pytest
 from tree import ROOT
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.shell import TcpPort, serve
-from pans.firmware_sim.scene.still import load_scene
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.bundle.model import write_bundle
-from pans.runtime.decide import Verdict
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.wire.messages import DeviceState, StateReason
+from pans.bundle.backends import Verdict
+from pans.bundle.sensor.bundle import write_bundle
+from pans.instrument.profile import load_profile
+from pans.protocol.wire import DeviceState, StateReason
+from pans_sim.device.clock import DeviceClock
+from pans_sim.device.instrument import Instrument
+from pans_sim.ports.shell import TcpPort, serve
+from pans_sim.scene.still import load_scene
+from pans_sim.testing import small_setup
 
 # stage -> where the child is met: module, class or "" and name; the call before which it waits
 STAGES = {
-    "opening": ("pans.runtime.commands.one_run", "", "open_link", 1),
-    "handshake": ("pans.runtime.link.connection", "Connection", "handshake", 1),
-    "upload": ("pans.runtime.link.connection", "Connection", "upload", 1),
-    "armed": ("pans.runtime.live.run", "LiveRun", "iterate", 1),
-    "running": ("pans.runtime.live.run", "LiveRun", "iterate", 60),
-    "stopping": ("pans.runtime.live.run", "LiveRun", "stop", 1),
-    "closing": ("pans.runtime.record.recorder", "Recorder", "close", 1),
+    "opening": ("pans.app.run.one_run", "", "open_link", 1),
+    "handshake": ("pans.live.connection", "Connection", "handshake", 1),
+    "upload": ("pans.live.connection", "Connection", "upload", 1),
+    "armed": ("pans.live.run", "LiveRun", "iterate", 1),
+    "running": ("pans.live.run", "LiveRun", "iterate", 60),
+    "stopping": ("pans.live.run", "LiveRun", "stop", 1),
+    "closing": ("pans.record.recorder", "Recorder", "close", 1),
 }
 HANGS = ("python", "native", "file")
 HANGS_AFTER = 30  # decisions
@@ -167,7 +167,7 @@ def _child(words: list[str], stage: str, pipes: Any, folder: str, environment: d
     faulthandler.enable()
     os.environ.update(environment)
     sys.path.insert(0, f"{folder}/packages")
-    from pans.runtime.cli import main
+    from pans.app.main import main
 
     if environment.get("HANG") == "file":
         _hang_in_writes()
@@ -179,7 +179,7 @@ def _child(words: list[str], stage: str, pipes: Any, folder: str, environment: d
 
 
 def _hang_in_writes() -> None:
-    from pans.runtime.record.recorder import Recorder
+    from pans.record.recorder import Recorder
 
     original, writes = Recorder._write, [0]
 

@@ -9,13 +9,14 @@ import numpy as np
 from bundles import made_bundle
 from models import model
 
-from pans.runtime.bundle.automaton import reachable_automaton
-from pans.runtime.bundle.model import BackEnd, Bundle, make_bundle
-from pans.runtime.bundle.optics import Analyser
-from pans.runtime.container import FILE_MAX_BYTES, JSON_VALUES_MAX, MIB
-from pans.runtime.core.decision import DECISION_DTYPE
-from pans.runtime.record import Recorder
-from pans.runtime.record.format import TIMING_RUN_DTYPE
+from pans.base.files.container import FILE_MAX_BYTES, JSON_VALUES_MAX, MIB
+from pans.bundle.automaton import reachable_automaton
+from pans.bundle.sensor import Bundle
+from pans.bundle.sensor.analyser import Analyser
+from pans.bundle.sensor.bundle import BackEnd, make_bundle
+from pans.decide.decision import DECISION_DTYPE
+from pans.record.reading.format import TIMING_RUN_DTYPE
+from pans.record.recorder import Recorder
 
 ROOM = FILE_MAX_BYTES - MIB  # for the arrays, beside header and golden vectors
 LIGHT: dict[str, Any] = {"levels": 65536, "photons_per_level": 1e-5}

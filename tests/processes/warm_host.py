@@ -3,17 +3,17 @@
 import tempfile
 from pathlib import Path
 
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.commands import one_run as one_run
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.link import serial as serial
-from pans.runtime.record import Recorder
-from pans.runtime.report import summary as summary
-from pans.runtime.report import words as words
-from pans.runtime.timing import ledger as ledger
-from pans.runtime.watch import watchers as watchers
-from pans.runtime.wire import FrameDecoder
+from pans.app.run import one_run as one_run
+from pans.bundle.backends.choose import make_decider
+from pans.decide.still.core import Core
+from pans.live.timing import ledger as ledger
+from pans.live.watch import watchers as watchers
+from pans.protocol.links import serial as serial
+from pans.protocol.wire import FrameDecoder
+from pans.record.recorder import Recorder
+from pans.report.summary import summary as summary
+from pans.report.summary import words as words
+from pans_sim.testing import small_setup
 
 _, _bundle, _plan = small_setup("sequential")
 Core(_plan, make_decider(_bundle), 1, 1).warm_up()

@@ -14,15 +14,15 @@ from automata import automaton_bundle, diamond, random_automaton
 from tree import ROOT
 
 import pans
-from pans.runtime.errors import UsageError
-from pans.runtime.offered import INSTALLS, install
+from pans.base.console.extras import INSTALLS, install
+from pans.base.errors import UsageError
 
 DEVICE = "sim:oled-qcmos?scene=fashion200&seed=1&pace=fast"
 
 
 def test_a_run_leaves_a_recording_that_replays_and_a_page(tmp_path: Path) -> None:
     done = pans.run("fashion10", DEVICE, decisions=40, out=tmp_path)
-    assert (done.summary.verdict, done.summary.tally.decisions, done.confusion.sum()) == ("PASS", 40, 40)
+    assert (done.summary.verdict, done.summary.decisions, done.confusion.sum()) == ("PASS", 40, 40)
     assert "SIMULATED" in done.report.read_text()
     assert done.recording is not None
     recording = pans.load_recording(done.recording)
@@ -68,7 +68,7 @@ def test_without_its_extra_a_name_says_what_to_install_and_help_works(
 ) -> None:
     hidden = f"import pydoc, sys; sys.modules |= dict.fromkeys({missing}); import pans"
     there = f"from pans import *; print({name!r} in globals(), hasattr(pans, {name!r}), getattr(pans, {name!r}, None))"
-    code = f"{hidden}; {there}; print(*dir(pans)); print(pydoc.render_doc(pans)); "
+    code = f"{hidden}; {there}; print(*dir(pans)); print(pydoc.plain(pydoc.render_doc(pans))); "
     for ask, error in ((f"from pans import {name}", "ImportError"), (f"pans.{name}", "MissingExtraError")):
         done = subprocess.run([sys.executable, "-c", code + ask], capture_output=True, text=True)
         found, names, told = done.stdout.split("\n", 2)

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene.still import load_scene
-from pans.runtime.cli import main
-from pans.runtime.container import open_regular, parse_json_object
-from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
-from pans.runtime.npz_file import read_arrays
-from pans.runtime.ranges import FINITE, WHOLE, Range
-from pans.runtime.record.pictures import _images
-from pans.runtime.report.verify import verify_file
+from pans.app.main import main
+from pans.base.errors import ConfigError, DamagedFileError, UsageError
+from pans.base.files.container import open_regular, parse_json_object
+from pans.base.files.npz import read_arrays
+from pans.base.numbers.ranges import FINITE, WHOLE, Range
+from pans.record.replay import _images
+from pans.report.files.verify import verify_file
+from pans_sim.scene.still import load_scene
 
 
 def test_ranges() -> None:

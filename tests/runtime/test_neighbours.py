@@ -14,10 +14,10 @@ import pytest
 from lab_frames import MARK, open_body
 from lab_recording import Recording, read_recording
 
-from pans.runtime.cli import main
-from pans.runtime.core.decision import Decision, Output
-from pans.runtime.errors import LinkError, PansError, UsageError
-from pans.runtime.watch.osc import PER_DATAGRAM, OscSender
+from pans.app.main import main
+from pans.base.errors import LinkError, PansError, UsageError
+from pans.decide.decision import Decision, Output
+from pans.live.watch.osc import PER_DATAGRAM, OscSender
 
 PARALLEL = "sim:oled-qcmos?scene=fashion200&seed=1&pace="
 STALLS = "faults=stall:20ms/200ms"  # work that is late
@@ -121,7 +121,7 @@ def test_a_plan_of_bluesky(bundle: str, device: str, number: int, options: dict[
     assert documents[1][1]["configuration"]["pans"]["data"]["pans-simulated"] is True
 
     rows, recording = recorded(tmp_path / "run" / "run.pansrec")
-    assert detector.outcome.summary.tally.decisions == len(rows)
+    assert detector.outcome.summary.decisions == len(rows)
     marks = [body for _, body in recording.messages if open_body(body)[0] == MARK]
     photons = {object_: light for _, object_, *_, light in (struct.unpack("<IIhHQQf", mark[8:]) for mark in marks)}
     ends_ns = {found: end_ns for found, end_ns, *_ in recording.timings}

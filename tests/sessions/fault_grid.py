@@ -17,19 +17,20 @@ import numpy as np
 from run_books import DeviceLog, LoggedInstrument, ObservedLink, SlowReads
 from run_judge import Judge
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.ports.faults import NAMES, parse_faults
-from pans.firmware_sim.ports.faulty import FaultyDevice
-from pans.firmware_sim.ports.virtual import START_NS
-from pans.firmware_sim.scene.still import scene_from_arrays
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.core.decision import Output
-from pans.runtime.core.plan import Plan
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import LinkError
-from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
-from pans.runtime.record import Recorder
+from pans.base.errors import LinkError
+from pans.bundle.backends.choose import make_decider
+from pans.decide.decision import Output
+from pans.decide.plan.plan import Plan
+from pans.decide.still.core import Core
+from pans.live.loop import LiveRun, Observers, Recovery, RunResult, run_live
+from pans.live.options import RunOptions
+from pans.record.recorder import Recorder
+from pans_sim.device.clock import DeviceClock
+from pans_sim.ports.faults import NAMES, parse_faults
+from pans_sim.ports.faulty import FaultyDevice
+from pans_sim.ports.virtual import START_NS
+from pans_sim.scene.still import scene_from_arrays
+from pans_sim.testing import small_setup
 
 SHOTS = 1
 MODES = (

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 from mutated_sessions import Mutation, Session, Stage, mutate
 
-from pans.firmware_sim.device.instrument import Instrument
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, unpack_command
-from pans.runtime.wire.framing import Frame, FrameDecoder, encode_frame
-from pans.runtime.wire.messages import DeviceState, MessageType, StateReason
-from pans.runtime.wire.session import STREAM_TYPES
+from pans.protocol.session import STREAM_TYPES
+from pans.protocol.wire import DeviceState, MessageType, StateReason
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Arm, unpack_command
+from pans.protocol.wire.framing import Frame, FrameDecoder, encode_frame
+from pans_sim.device.instrument import Instrument
 
 MODES = ("sequential", "parallel", "device-driven", "device-driven-counts", "device-driven-detectors")
 OBJECTS = 40

@@ -16,21 +16,23 @@ from typing import Any, NamedTuple
 import msgpack
 import numpy as np
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.firmware_sim.scene.still import Scene, scene_from_arrays
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import PansError
-from pans.runtime.live import RunOptions, run_live
-from pans.runtime.record import Recorder, read_recording
-from pans.runtime.record.replaying import replay
-from pans.runtime.report.summary import Summary, summarise
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.framing import Frame, FrameDecoder, encode_frame
-from pans.runtime.wire.schema import ALL_MESSAGES, AUTOMATON_MESSAGES, Field, wrong_facts
+from pans.base.errors import PansError
+from pans.bundle.backends.choose import make_decider
+from pans.decide.still.core import Core
+from pans.live.loop import run_live
+from pans.live.options import RunOptions
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.framing import Frame, FrameDecoder, encode_frame
+from pans.protocol.wire.schema import ALL_MESSAGES, AUTOMATON_MESSAGES, Field, wrong_facts
+from pans.record.reading import read_recording
+from pans.record.recorder import Recorder
+from pans.record.replay import replay
+from pans.report.summary.summary import Summary, summarise
+from pans_sim.device.clock import DeviceClock
+from pans_sim.device.instrument import Instrument
+from pans_sim.ports.virtual import START_NS, VirtualLink
+from pans_sim.scene.still import Scene, scene_from_arrays
+from pans_sim.testing import small_setup
 
 COMMANDS = ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE", "READ_COUNTS", "LOAD_COUNT_STATES")
 BODIES = {  # of commands: which of them holds the layout, and where in the payload it begins; of rows, the first

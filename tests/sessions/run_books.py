@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.device.stream_buffer import StreamBuffer
-from pans.firmware_sim.ports.virtual import VirtualLink
-from pans.runtime.link.base import Link
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Gate, unpack_command
-from pans.runtime.wire.session import ANSWER_TYPES, STREAM_TYPES
+from pans.protocol.links.base import Link
+from pans.protocol.session import ANSWER_TYPES, STREAM_TYPES
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Gate, unpack_command
+from pans_sim.device.clock import DeviceClock, SteppedDevice
+from pans_sim.device.instrument import Instrument
+from pans_sim.device.stream_buffer import StreamBuffer
+from pans_sim.ports.virtual import VirtualLink
 
 RECORDED = STREAM_TYPES | {wire.MessageType.STATUS, wire.MessageType.EXPOSED}
 WAITS_NS = (0, 300_000, 3_000_000, 16_000_000)  # USB's frame is 1 ms, a serial adapter's latency timer up to 16 ms

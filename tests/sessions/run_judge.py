@@ -17,12 +17,13 @@ from lab_decisions import decide_again
 from lab_recording import read_recording as read_again
 from run_books import STOPPED, DeviceLog, Emitted, Heard, ObservedLink, read_of
 
-from pans.runtime.bundle.model import Bundle, bundle_bytes
-from pans.runtime.live import RunResult
-from pans.runtime.record import Recording, read_recording
-from pans.runtime.record.replaying import replay
-from pans.runtime.wire.messages import STREAM_DECODERS, Frame, Mark, unpack_body
-from pans.runtime.wire.session import STREAM_TYPES
+from pans.bundle.sensor import Bundle, bundle_bytes
+from pans.live.loop import RunResult
+from pans.protocol.session import STREAM_TYPES
+from pans.protocol.wire import Frame, unpack_body
+from pans.protocol.wire.messages import STREAM_DECODERS, Mark
+from pans.record.reading import Recording, read_recording
+from pans.record.replay import replay
 
 MAX_VIOLATIONS = 20
 DECODED = ("frames", "crc_errors", "cobs_errors", "short_frames", "oversized_frames")

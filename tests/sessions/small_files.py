@@ -18,23 +18,24 @@ from typing import Any
 import numpy as np
 from thirds import write_thirds
 
-from pans.firmware_sim.scene.scene_file import open_scene
-from pans.firmware_sim.testing import small_automaton_bundle, small_setup
-from pans.runtime.bundle.model import BackEnd, Bundle, load_bundle, make_bundle, write_bundle
-from pans.runtime.bundle.optics import Analyser
-from pans.runtime.container import block_ends, canonical_json, file_prologue
-from pans.runtime.core.plan import build_plan
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import DamagedFileError, PlanError, UsageError
-from pans.runtime.flow.settings import flow_limits, read_flow
-from pans.runtime.instrument.calibration import load_calibration, now_utc, save_calibration
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.record import read_recording
-from pans.runtime.record.format import FORMAT_VERSION, MAGIC, Kind
-from pans.runtime.record.log import LogReader
-from pans.runtime.record.replaying import replay
-from pans.runtime.record.sent_plan import never_armed, recorded_plan
-from pans.runtime.report.file_facts import file_facts
+from pans.base.errors import DamagedFileError, PlanError, UsageError
+from pans.base.files.container import block_ends, canonical_json, file_prologue
+from pans.bundle.backends.choose import make_decider
+from pans.bundle.sensor import Bundle
+from pans.bundle.sensor.analyser import Analyser
+from pans.bundle.sensor.bundle import BackEnd, load_bundle, make_bundle, write_bundle
+from pans.decide.flow.settings import flow_limits, read_flow
+from pans.decide.plan.plan import build_plan
+from pans.instrument.calibration_file import load_calibration, now_utc, save_calibration
+from pans.instrument.profile import Profile, load_profile
+from pans.record.reading import read_recording
+from pans.record.reading.decision_log import LogReader
+from pans.record.reading.format import FORMAT_VERSION, MAGIC, Kind
+from pans.record.reading.sent_plan import never_armed, recorded_plan
+from pans.record.replay import replay
+from pans.report.files.facts import file_facts
+from pans_sim.scene.scene_file import open_scene
+from pans_sim.testing import small_automaton_bundle, small_setup
 
 RUN_EVERY = 20  # accepted bundles: one in that many, told by its bytes, is run through the whole loop
 RUN_PROFILES = ("ideal", "oled-qcmos", "dmd-spad")  # the last follows automata of 1-bit patterns
@@ -80,8 +81,8 @@ def passive_bundle() -> Bundle:
 
 
 def _record(folder: Path, bundle: Path, profile: str, device: str, **more: Any) -> Path:
-    from pans.runtime.commands.one_run import run_once
-    from pans.runtime.live import RunOptions
+    from pans.app.run.one_run import run_once
+    from pans.live.options import RunOptions
 
     options = RunOptions(
         bundle=bundle,

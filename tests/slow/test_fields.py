@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mutated_sessions import LAYOUTS, MISSING, STAMP, Mutation, Stage
 
-from pans.runtime.wire.schema import FACTS
+from pans.protocol.wire.schema import FACTS
 
 pytestmark = pytest.mark.slow
 

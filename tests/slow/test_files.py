@@ -14,14 +14,14 @@ import small_files
 from changed_files import changed_bundle, changed_calibration, changed_recording, changed_toml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tree import ROOT
 
-from pans.firmware_sim import __file__ as SIMULATOR
-from pans.firmware_sim.testing import small_automaton_bundle, small_setup
-from pans.hw_profiles import __file__ as PROFILES
-from pans.runtime import SHIPPED
-from pans.runtime.bundle.model import bundle_bytes
-from pans.runtime.errors import PansError
-from pans.runtime.report.verify import verify_file
+from pans.base import SHIPPED
+from pans.base.errors import PansError
+from pans.bundle.sensor import bundle_bytes
+from pans.report.files.verify import verify_file
+from pans_sim import __file__ as SIMULATOR
+from pans_sim.testing import small_automaton_bundle, small_setup
 
 pytestmark = pytest.mark.slow
 ANSWER_S, MEMORY_MIB = 2.0, 400  # of processor time for one answer, and more than before; the files have up to 140 kB
@@ -63,7 +63,7 @@ def sound(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, l
     shipped = {
         "bundle": [SHIPPED / "fashion10.pans"],
         "recording": [make(tmp_path_factory.mktemp("run")) for make in makers],
-        "profile": sorted(Path(PROFILES).parent.glob("*.toml")),
+        "profile": sorted(ROOT / "hw_profiles".glob("*.toml")),
         "scene": sorted((Path(SIMULATOR).parent / "scenes").glob("*.toml")),
         "flow": sorted(SHIPPED.glob("flow-*.toml")),
     }

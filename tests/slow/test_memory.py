@@ -12,7 +12,8 @@ from pathlib import Path
 import large_files as large
 import pytest
 
-from pans.runtime.bundle.model import Bundle, write_bundle
+from pans.bundle.sensor import Bundle
+from pans.bundle.sensor.bundle import write_bundle
 
 MOST_MIB = 400
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -21,7 +22,7 @@ IDEAL, FOLLOWING = "sim:ideal?scene=uniform&pace=fast", "sim:dmd-spad?scene=unif
 # VmHWM: ru_maxrss would begin with that of the process that started this one
 CODE = """
 import json, sys
-from pans.runtime.cli import main
+from pans.app.main import main
 code = main(sys.argv[1:])
 status = dict(line.split(":", 1) for line in open("/proc/self/status"))
 print(json.dumps([code, int(status["VmHWM"].split()[0]) / 1024]))

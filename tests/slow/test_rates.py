@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pans.runtime.bench.loop import slot_profile
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.core.plan import build_plan
-from pans.runtime.record import read_recording
+from pans.app.bench.loop import slot_profile
+from pans.bundle.sensor.bundle import load_bundle
+from pans.decide.plan.plan import build_plan
+from pans.record.reading import read_recording
 
 HOST, DEVICE = 0, 1  # cores
 POSSIBLE = sys.platform == "linux" and {HOST, DEVICE} <= os.sched_getaffinity(0) and os.geteuid() == 0
@@ -28,7 +28,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not POSSIBLE, reason="needs Linux, two cores and the right to real-time priority"),
 ]
-PANS = [sys.executable, "-c", "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))"]
+PANS = [sys.executable, "-c", "import sys; from pans.app.main import main; sys.exit(main(sys.argv[1:]))"]
 OBJECT_SLOT_US = 1000 / 11  # ten patterns and a dark slot make a millisecond
 DEADLINE_US = 1000.0
 OURS = 1e-5  # share of the decisions that may be late without a gap of the machine

@@ -17,18 +17,20 @@ from pathlib import Path
 import pytest
 from host_process import STAGES, Host, Lit, lit_instrument, start_host, until
 
-from pans.firmware_sim.ports.serve import open_sim
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.bundle.model import bundle_bytes
-from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING
-from pans.runtime.core.decision import Output
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.live import LiveRun, Observers, RunOptions, run_live
-from pans.runtime.record import Recorder, read_recording
-from pans.runtime.record.replaying import replay
-from pans.runtime.report.verify import verify_file
-from pans.runtime.wire.messages import DeviceState, StateReason
+from pans.base.errors import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING
+from pans.bundle.backends.choose import make_decider
+from pans.bundle.sensor import bundle_bytes
+from pans.decide.decision import Output
+from pans.decide.still.core import Core
+from pans.live.loop import LiveRun, Observers, run_live
+from pans.live.options import RunOptions
+from pans.protocol.wire import DeviceState, StateReason
+from pans.record.reading import read_recording
+from pans.record.recorder import Recorder
+from pans.record.replay import replay
+from pans.report.files.verify import verify_file
+from pans_sim.ports.serve import open_sim
+from pans_sim.testing import small_setup
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forkserver and signals")
 LEASE_MS = 400

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pans.runtime import SHIPPED
-from pans.runtime.record import read_recording
-from pans.runtime.record.parts import parts_in
-from pans.runtime.record.replaying import replay
-from pans.runtime.report.verify import verify_parts
+from pans.base import SHIPPED
+from pans.record.reading import read_recording
+from pans.record.reading.parts import parts_in
+from pans.record.replay import replay
+from pans.report.files.verify import verify_parts
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")]
 FAULTS = (
@@ -67,7 +67,7 @@ def test_a_long_run_with_faults_stays_flat_and_ends_well(tmp_path: Path) -> None
     words = ["run", str(SHIPPED / "fashion10.pans"), "--device", DEVICE, "--trials", "5", "--out", str(out), "--json"]
     words += ["--rotate-mb", str(ROTATE_MB), "--keep-mb", str(KEEP_MB), "--state", str(state)]
     words += ["--metrics", f"127.0.0.1:{port}", "--reconnect-s", "20"]
-    call = [sys.executable, "-c", "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))", *words]
+    call = [sys.executable, "-c", "import sys; from pans.app.main import main; sys.exit(main(sys.argv[1:]))", *words]
     samples = []
     with (tmp_path / "stderr").open("w") as errors:
         process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=errors, text=True)

@@ -19,15 +19,16 @@ import pytest
 from power_cut import Files, disk_of, states
 from storage import Ended, Fault, FaultyStorage, compiler
 
-from pans.runtime import SHIPPED
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.cli import main
-from pans.runtime.errors import DamagedFileError
-from pans.runtime.instrument.calibration import load_calibration
-from pans.runtime.record import read_recording
-from pans.runtime.report.verify import verify_file
-from pans.runtime.watch.state_file import FORMAT, read_state
-from pans.runtime.wire.messages import FrameDecoder, MessageType, Opcode, decode_command
+from pans.app.main import main
+from pans.base import SHIPPED
+from pans.base.errors import DamagedFileError
+from pans.bundle.sensor.bundle import load_bundle
+from pans.instrument.calibration_file import load_calibration
+from pans.live.watch.state_file import FORMAT, read_state
+from pans.protocol.wire import FrameDecoder, MessageType, Opcode
+from pans.protocol.wire.messages import decode_command
+from pans.record.reading import read_recording
+from pans.report.files.verify import verify_file
 
 pytestmark = [
     pytest.mark.slow,

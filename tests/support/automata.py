@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from bundles import made_bundle
 
-from pans.runtime.bundle import Automaton, Bundle, reachable_automaton
+from pans.bundle.automaton import Automaton, reachable_automaton
+from pans.bundle.sensor import Bundle
 
 EXPECTED: dict[str, Any] = {
     **{"profile": "ideal", "task": "test", "split": "test", "objects": 100},

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
+from pans.bundle.automaton import Automaton
+from pans.bundle.sensor import Bundle
+from pans.bundle.sensor.bundle import BackEnd, Shown, make_bundle
 
 
 def made_bundle(d_f: int = 2, n_classes: int = 2, **facts: Any) -> Bundle:

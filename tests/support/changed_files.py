@@ -12,8 +12,8 @@ import small_files
 from bundles import resealed
 from hypothesis import strategies as st
 
-from pans.runtime.container import canonical_json
-from pans.runtime.record.format import Kind
+from pans.base.files.container import canonical_json
+from pans.record.reading.format import Kind
 
 _HEAD = struct.Struct("<8sII")
 HEADER_BYTES = 200  # where most formats say what they hold

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from pans.runtime import SHIPPED
-from pans.runtime.cli import main
+from pans.app.main import main
+from pans.base import SHIPPED
 
 
 def json_of(capsys: pytest.CaptureFixture[str], command: str, *words: Any, code: int | None = 0) -> dict[str, Any]:

@@ -5,14 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.core.decision import Output, joined
-from pans.runtime.core.plan import NO_SHOT, Plan
-from pans.runtime.decide.verdict import Decider, Verdict
-from pans.runtime.flow.core import FlowCore
-from pans.runtime.flow.make import make_flow_core
-from pans.runtime.flow.settings import FlowSettings
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, Frame, FrameBlock, FrameDecoder, Mark
+from pans.bundle.backends.verdict import Decider, Verdict
+from pans.decide.decision import Output, joined
+from pans.decide.flow.core import FlowCore
+from pans.decide.flow.make import make_flow_core
+from pans.decide.flow.settings import FlowSettings
+from pans.decide.plan.plan import NO_SHOT, Plan
+from pans.protocol.wire import DARK_PATTERN, NO_OBJECT, Frame, FrameDecoder
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.messages import FrameBlock, Mark
 
 N_FEATURES = 10
 PERIOD_TICKS = 200  # 2 us at 100 MHz

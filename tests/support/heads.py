@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from bundles import made_bundle
 
-from pans.runtime.bundle.layers import Layer
-from pans.runtime.bundle.model import Bundle
+from pans.bundle.heads.layers import Layer
+from pans.bundle.sensor import Bundle
 
 
 def random_layers(sizes: list[int], seed: int = 0) -> tuple[Layer, ...]:

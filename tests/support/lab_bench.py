@@ -14,15 +14,17 @@ from lab_light import Light
 from lab_recording import read_recording
 from tree import ROOT
 
-from pans.runtime.bundle import load_bundle
-from pans.runtime.core import Core, build_plan
-from pans.runtime.decide import make_decider
-from pans.runtime.instrument import load_profile
-from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_live
-from pans.runtime.record import Recorder
+from pans.bundle.backends import make_decider
+from pans.bundle.sensor import load_bundle
+from pans.decide.plan import build_plan
+from pans.decide.still import Core
+from pans.instrument.profile import load_profile
+from pans.live.loop import Observers, Recovery, RunResult, run_live
+from pans.live.options import RunOptions
+from pans.record.recorder import Recorder
 
-FASHION = ROOT / "runtime" / "shipped" / "fashion10.pans"
-SCENE = ROOT / "firmware_sim" / "scenes" / "fashion200.npz"
+FASHION = ROOT / "runtime/pans/shipped" / "fashion10.pans"
+SCENE = ROOT / "firmware_sim/pans_sim/scenes" / "fashion200.npz"
 LEVELS, D_F, EXPOSURE_US = 124, 10, 200.0
 TOP = 0.0975609756097561 * (LEVELS - 1)  # photoelectrons of the brightest pixel in one exposure of fashion10
 PEAK_HZ = TOP / (EXPOSURE_US * 1e-6)

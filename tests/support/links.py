@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pans.firmware_sim.ports.shell import open_port, serve
+from pans_sim.ports.shell import open_port, serve
 
 
 @contextmanager

@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from pans.firmware_sim.device.view import View
-from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.moving import Cells, Change, SceneFile, Tape
-from pans.firmware_sim.scene.still import Scene, scene_from_arrays
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import PARALLEL, Arm
+from pans.instrument.profile import Profile, load_profile
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import PARALLEL, Arm
+from pans_sim.device.view import View
+from pans_sim.scene.moving import Cells, Change, SceneFile, Tape
+from pans_sim.scene.program import Program
+from pans_sim.scene.still import Scene, scene_from_arrays
 
 FLOW = load_profile("flow-snspd")
 TICK_HZ = FLOW.clock.tick_hz

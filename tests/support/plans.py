@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pans.runtime.bundle import Automaton
-from pans.runtime.core.plan import ADAPTIVE_PATTERN, NO_SHOT, Plan
-from pans.runtime.wire.messages import DARK_PATTERN
+from pans.bundle.automaton import Automaton
+from pans.decide.plan.plan import NO_SHOT, Plan
+from pans.protocol.wire import ADAPTIVE_PATTERN, DARK_PATTERN
 
 
 def shot_major(n_features: int, shots: int, dark_first: bool = True) -> Plan:

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pans.firmware_sim.ports.serve import open_sim
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.bundle.model import bundle_bytes
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
-from pans.runtime.record import PartLimits, Recorder
-from pans.runtime.record.log import LogEncoder
+from pans.bundle.backends.choose import make_decider
+from pans.bundle.sensor import bundle_bytes
+from pans.decide.still.core import Core
+from pans.live.loop import LiveRun, Observers, Recovery, RunResult, run_live
+from pans.live.options import RunOptions
+from pans.record.reading.decision_log import LogEncoder
+from pans.record.recorder import PartLimits, Recorder
+from pans_sim.ports.serve import open_sim
+from pans_sim.testing import small_setup
 
 
 class Disk:
@@ -71,7 +72,7 @@ def record_small(
 
         observers, recovery = Observers(wait, prepared), Recovery.of(link, url, 10.0)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("pans.runtime.live.run.FLUSH_EVERY_NS", 20_000_000)
+            patch.setattr("pans.live.run.FLUSH_EVERY_NS", 20_000_000)
             result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
         result.decisions_sha256 = recorder.close({"decisions": result.tally.decisions})
     return result

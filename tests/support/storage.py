@@ -92,7 +92,7 @@ def compiler() -> str:
 
 def _serve(shim: str, folder: str) -> None:
     """Answer questions on stdin: one JSON object per line."""
-    from pans.runtime.cli import main
+    from pans.app.main import main
 
     faults = ctypes.CDLL(shim)
     answers = os.fdopen(os.dup(1), "w")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from bundles import made_bundle
 
-from pans.runtime.bundle.model import write_bundle
+from pans.bundle.sensor.bundle import write_bundle
 
 SIDE = 16
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from tree import ROOT
 
-from pans.trainer.tasks.registry import Objects, Task
+from pans_trainer.tasks.registry import Objects, Task
 
 
 @pytest.fixture
 def short_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last stage of a training takes 1500 steps however small the task is; tests that ask for no good head take 30."""
-    from pans.trainer.train import head_fit
+    from pans_trainer.train.gradient import head_fit
 
     monkeypatch.setattr(head_fit, "STEPS", 30)
 
@@ -69,7 +69,7 @@ def random_machine(seed: int = 0, bits: bool = False, shared: bool = False) -> A
     """Three levels of 1, 2 and 3 states on 5 pixels, four classes; a leaf behind level 0, two behind level 1, five behind level 2."""
     import torch
 
-    from pans.trainer.adaptive.machine import Bits, Grey, Level, Machine
+    from pans_trainer.train.automaton.machine import Bits, Grey, Level, Machine
 
     random = torch.Generator().manual_seed(seed)
     successors = [[[0], [1]], [[2, 0], [1, 4]], [[0, 2, 4], [1, 3, 0]]]

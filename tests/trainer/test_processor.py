@@ -11,17 +11,17 @@ import pytest
 import torch
 from trainings import practice_folder
 
-from pans.runtime.bundle.model import load_bundle
-from pans.trainer import processor
-from pans.trainer.device import product_dtype
-from pans.trainer.processor import FASTER, LIMITS, Trial, choose
+from pans.bundle.sensor.bundle import load_bundle
+from pans_trainer import processor
+from pans_trainer.device import product_dtype
+from pans_trainer.processor import FASTER, LIMITS, Trial, choose
 
 REFUSING = Path(__file__).parents[1] / "support" / "refusing_torch"
 AMX = {"ONEDNN_MAX_CPU_ISA": "AVX512_CORE_BF16"}
 QUICK = ("--encoder", "automaton", "--exposures", "3", "--states", "4", "--epochs", "2", "--photons", "5")
 TRIED = 2  # of the environments: of those behind them, which is the fastest is a matter of the hour
 SETTLE = (
-    f"from pans.trainer import processor as p; p.LIMITS = p.LIMITS[:{TRIED}]; c = p.settle(); "
+    f"from pans_trainer import processor as p; p.LIMITS = p.LIMITS[:{TRIED}]; c = p.settle(); "
     "print(c.products, sorted(c.limits.values()))"
 )
 
@@ -125,7 +125,7 @@ def test_training_and_convolutions_run_where_torch_refuses(tmp_path):
     assert "products" in said
     assert "ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16" in said
     assert "ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16" in load_bundle(out)[0].provenance["trained_with"]
-    convolve = "from pans.trainer.baselines.networks import FrameNet; import torch; "
+    convolve = "from pans_trainer.baselines.networks import FrameNet; import torch; "
     convolve += "FrameNet((28, 28), 10)(torch.rand(3, 784)).sum().backward()"
     ran(env, "-c", convolve)
 

@@ -11,15 +11,15 @@ from c_device import needs_compiler
 from mutants import Mutant, built, c_core, tried
 from tree import ROOT
 
-from pans.firmware_sim.conform import RULES, Finding, conform
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.ports.serve import SimOptions, build_instrument
-from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.runtime.cli import main
-from pans.runtime.errors import LinkError
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.wire.framing import FrameDecoder
-from pans.runtime.wire.messages import MessageType, Opcode
+from pans.app.main import main
+from pans.base.errors import LinkError
+from pans.instrument.profile import load_profile
+from pans.protocol.wire import MessageType, Opcode
+from pans.protocol.wire.framing import FrameDecoder
+from pans_sim.conform import RULES, Finding, conform
+from pans_sim.device.clock import DeviceClock
+from pans_sim.ports.serve import SimOptions, build_instrument
+from pans_sim.ports.virtual import START_NS, VirtualLink
 
 BEYOND = {"2.8", "4.20"}  # no link can show them
 LONG = {number for number, rule in RULES.items() if rule.long}
@@ -120,7 +120,7 @@ def test_a_device_that_goes_away_leaves_the_findings_before(
     def opened(url: str) -> VirtualLink:
         return Leaving(*build_instrument(SimOptions("ideal", "uniform"), START_NS), url)
 
-    monkeypatch.setattr("pans.firmware_sim.commands.conform.open_link", opened)
+    monkeypatch.setattr("pans_sim.commands.conform.open_link", opened)
     rules = [word for number in ("4.1", "4.12", "5.1") for word in ("--rule", number)]
     words = ["conform", "sim:ideal", "--pixels", "16", *rules]
     assert main([*words, "--json"]) == 3

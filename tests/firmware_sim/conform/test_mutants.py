@@ -9,12 +9,12 @@ import pytest
 from c_device import needs_compiler
 from mutants import Mutant, broken_by, c_core, tried
 
-from pans.firmware_sim.conform import RULES
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.virtual import START_NS
-from pans.firmware_sim.scene.scene_file import open_scene
-from pans.runtime.instrument.profile import load_profile
+from pans.instrument.profile import load_profile
+from pans_sim.conform import RULES
+from pans_sim.device.clock import DeviceClock
+from pans_sim.device.instrument import Instrument
+from pans_sim.ports.virtual import START_NS
+from pans_sim.scene.scene_file import open_scene
 
 SOUND = ("1.1", "2.1", "4.1", "6.1")  # rules that no fault of the quick set touches
 SLOW_LINE = 100_000  # bytes per second: a fifth of what the fastest stream of rule 6.6 brings

@@ -14,14 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instrument_bench import IDEAL, Bench, of_type, plan, run_hosted, stamps_and_readings
 
-from pans.firmware_sim.device import readings
-from pans.firmware_sim.scene.moving import Change, SceneFile
-from pans.firmware_sim.scene.still import scene_from_arrays
-from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.core.plan import Plan, build_plan
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import (
+from pans.bundle.automaton import Automaton
+from pans.decide.plan.plan import Plan, build_plan
+from pans.instrument.profile import Profile, load_profile
+from pans.protocol.wire import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import (
     Arm,
     MaskChunk,
     PatternChunk,
@@ -31,7 +29,9 @@ from pans.runtime.wire.commands import (
     pack_command,
     state_dtype,
 )
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
+from pans_sim.device import readings
+from pans_sim.scene.moving import Change, SceneFile
+from pans_sim.scene.still import scene_from_arrays
 
 IMAGES = np.random.default_rng(3).integers(0, 256, (5, 2, 3)).astype(np.uint8)
 SCENE = scene_from_arrays("five", IMAGES, np.arange(5) % 3, ("c0", "c1", "c2"))
@@ -198,9 +198,9 @@ def test_a_broken_off_walk_is_sent_as_far_as_it_went() -> None:
 def test_many_objects_and_patterns_need_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Objects are computed when they come; a walk is the same whether one, a few or all of them are kept."""
     whole = run(*bright(six_states()), cycles=40)[:2]
-    monkeypatch.setattr("pans.firmware_sim.device.walking.BLOCK_ENTRIES", 6)  # two objects at a time
-    monkeypatch.setattr("pans.firmware_sim.device.walking.MAX_BLOCKS", 1)
-    monkeypatch.setattr("pans.firmware_sim.device.readings.MAX_THRESHOLDS", 1)
+    monkeypatch.setattr("pans_sim.device.walking.BLOCK_ENTRIES", 6)  # two objects at a time
+    monkeypatch.setattr("pans_sim.device.walking.MAX_BLOCKS", 1)
+    monkeypatch.setattr("pans_sim.device.readings.MAX_THRESHOLDS", 1)
     bench, made = bright(six_states())
     assert np.array_equal(np.stack(whole), np.stack(run(bench, made, 40)[:2]))
     assert len(bench.device._light[1]._blocks) == 1

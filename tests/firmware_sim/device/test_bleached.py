@@ -8,21 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pans.firmware_sim.device.bleached import Sample, bleached_photoelectrons
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.device.view import View
-from pans.firmware_sim.device.walking import PatternLight
-from pans.firmware_sim.ports.serve import build_instrument, parse_sim_url
-from pans.firmware_sim.ports.virtual import START_NS
-from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.moving import SceneFile
-from pans.firmware_sim.scene.optics import photons_per_level
-from pans.firmware_sim.scene.still import Scene, load_scene, scene_from_arrays
-from pans.runtime.errors import ConfigError, UsageError
-from pans.runtime.imaging import Bleaching, Imaging, met
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.wire.commands import SEQUENTIAL
-from pans.runtime.wire.messages import DARK_PATTERN
+from pans.base.errors import ConfigError, UsageError
+from pans.instrument.optics import Bleaching, Imaging, met
+from pans.instrument.profile import load_profile
+from pans.protocol.wire import DARK_PATTERN
+from pans.protocol.wire.commands import SEQUENTIAL
+from pans_sim.device.bleached import Sample, bleached_photoelectrons
+from pans_sim.device.instrument import Instrument
+from pans_sim.device.view import View
+from pans_sim.device.walking import PatternLight
+from pans_sim.ports.serve import build_instrument, parse_sim_url
+from pans_sim.ports.virtual import START_NS
+from pans_sim.scene.moving import SceneFile
+from pans_sim.scene.optics import photons_per_level
+from pans_sim.scene.program import Program
+from pans_sim.scene.still import Scene, load_scene, scene_from_arrays
 
 IDEAL = load_profile("ideal")
 RNG = np.random.default_rng(12)

@@ -14,20 +14,14 @@ from bundles import automaton_bundle
 from instrument_bench import Bench, of_type, run_hosted, stamps_and_readings
 from instrument_bench import plan as fixed_plan
 
-from pans.firmware_sim.scene.moving import Change, SceneFile
-from pans.firmware_sim.scene.still import scene_from_arrays
-from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.core.plan import Plan, build_plan
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import (
-    Arm,
-    PatternChunk,
-    ReadCounts,
-    announced_counts,
-    pack_command,
-)
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
+from pans.bundle.automaton import Automaton
+from pans.decide.plan.plan import Plan, build_plan
+from pans.instrument.profile import Profile, load_profile
+from pans.protocol.wire import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Arm, PatternChunk, ReadCounts, announced_counts, pack_command
+from pans_sim.scene.moving import Change, SceneFile
+from pans_sim.scene.still import scene_from_arrays
 
 IMAGES = np.random.default_rng(3).integers(0, 256, (5, 2, 3)).astype(np.uint8)
 SCENE = scene_from_arrays("five", IMAGES, np.arange(5) % 3, ("c0", "c1", "c2"))

@@ -10,21 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instrument_bench import IDEAL, NONCE, POWER_ON, Bench, greeted, of_type, plan, slots_at
 
-from pans.firmware_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES, GatePulse
-from pans.firmware_sim.device.upload import word_bytes
-from pans.firmware_sim.scene.still import scene_from_arrays
-from pans.runtime.instrument.click_law import click_law, click_probability, object_transmission
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, Gate, PatternChunk, pack_command
-from pans.runtime.wire.messages import (
-    DARK_PATTERN,
-    AckStatus,
-    DeviceState,
-    MessageType,
-    Opcode,
-    StateReason,
-)
+from pans.instrument.click_law import click_law, click_probability, object_transmission
+from pans.instrument.profile import load_profile
+from pans.protocol.wire import DARK_PATTERN, AckStatus, DeviceState, MessageType, Opcode, StateReason
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Arm, Gate, PatternChunk, pack_command
+from pans_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES, GatePulse
+from pans_sim.device.upload import word_bytes
+from pans_sim.scene.still import scene_from_arrays
 
 FULL = 65535
 

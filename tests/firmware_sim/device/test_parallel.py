@@ -11,27 +11,20 @@ import numpy as np
 import pytest
 from moving_scenes import CELLS, FLOW, PICTURES, TAPE, light_and_clicks, program, started, view_of
 
-from pans.firmware_sim.device import frame_writer, parallel
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.device.parallel import FrameRun, Stretch
-from pans.firmware_sim.device.sequential import Measurement
-from pans.firmware_sim.device.stream_buffer import StreamBuffer
-from pans.firmware_sim.device.view import View
-from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.marks import MARK_PHOTONS, Stamp
-from pans.firmware_sim.scene.moving import Cells, Change
-from pans.firmware_sim.scene.scene_file import open_scene
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import (
-    PARALLEL,
-    Arm,
-    Gate,
-    PatternChunk,
-    PlanChunk,
-    pack_command,
-)
-from pans.runtime.wire.messages import SLOT_DTYPE, DeviceState, Opcode
+from pans.instrument.profile import load_profile
+from pans.protocol.wire import SLOT_DTYPE, DeviceState, Opcode
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import PARALLEL, Arm, Gate, PatternChunk, PlanChunk, pack_command
+from pans_sim.device import frame_writer, parallel
+from pans_sim.device.instrument import Instrument
+from pans_sim.device.parallel import FrameRun, Stretch
+from pans_sim.device.sequential import Measurement
+from pans_sim.device.stream_buffer import StreamBuffer
+from pans_sim.device.view import View
+from pans_sim.scene.marks import MARK_PHOTONS, Stamp
+from pans_sim.scene.moving import Cells, Change
+from pans_sim.scene.program import Program
+from pans_sim.scene.scene_file import open_scene
 
 RNG = np.random.default_rng(5)
 SESSION = 7
@@ -40,7 +33,7 @@ CHANGES = (Change("dark", 0.0, 1.0, -1, 90.0), Change("drift", 0.0, 1.0, -1, -50
 
 
 class OneByOne(StreamBuffer):
-    """Every message for itself, through the encoders of pans.runtime.wire."""
+    """Every message for itself, through the encoders of pans.protocol.wire."""
 
     def put_due(self, run: Measurement | FrameRun, tick: int, session: int) -> list[bytes | memoryview]:
         return self.put_each(run, tick, session)

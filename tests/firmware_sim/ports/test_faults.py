@@ -11,15 +11,15 @@ import pytest
 from fault_grid import MODES, NEVER_ARMED, OFTEN, run_case
 from run_books import DeviceLog, ObservedLink
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.device.gates import Gates
-from pans.firmware_sim.ports import faulty as faulty_module
-from pans.firmware_sim.ports.faults import NAMES, NO_FAULTS, USUAL, Faults, Recurring, check_possible, parse_faults
-from pans.firmware_sim.ports.faulty import FaultCounters, FaultyDevice, Lane
-from pans.firmware_sim.ports.serve import open_sim, parse_sim_url
-from pans.runtime.errors import ConfigError, LinkError, UsageError
-from pans.runtime.live.reconnect import pauses_s
-from pans.runtime.record import Recorder
+from pans.base.errors import ConfigError, LinkError, UsageError
+from pans.live.reconnect import pauses_s
+from pans.record.recorder import Recorder
+from pans_sim.device.clock import DeviceClock
+from pans_sim.device.gates import Gates
+from pans_sim.ports import faulty as faulty_module
+from pans_sim.ports.faults import NAMES, NO_FAULTS, USUAL, Faults, Recurring, check_possible, parse_faults
+from pans_sim.ports.faulty import FaultCounters, FaultyDevice, Lane
+from pans_sim.ports.serve import open_sim, parse_sim_url
 
 MS = 1_000_000
 FRAMES = [bytes([number]) * (10 + number) + b"\0" for number in range(1, 41)]

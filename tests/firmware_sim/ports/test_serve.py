@@ -15,23 +15,24 @@ from typing import Any
 
 import pytest
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports import shell
-from pans.firmware_sim.ports.serve import ChildLink, SimOptions, build_instrument, open_sim, parse_sim_url
-from pans.firmware_sim.ports.shell import Port, TcpPort, open_port, serve
-from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.firmware_sim.scene.still import load_scene
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import ConfigError, LinkError, UsageError
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.link.base import Link, open_link
-from pans.runtime.link.connection import Connection
-from pans.runtime.live import Observers, RunOptions, RunResult, run_live
-from pans.runtime.timing.realtime import scheduled
-from pans.runtime.wire.messages import DeviceState
+from pans.base.errors import ConfigError, LinkError, UsageError
+from pans.base.machine.realtime import scheduled
+from pans.bundle.backends.choose import make_decider
+from pans.decide.still.core import Core
+from pans.instrument.profile import load_profile
+from pans.live.connection import Connection
+from pans.live.loop import Observers, RunResult, run_live
+from pans.live.options import RunOptions
+from pans.protocol.links.base import Link, open_link
+from pans.protocol.wire import DeviceState
+from pans_sim.device.clock import DeviceClock
+from pans_sim.device.instrument import Instrument
+from pans_sim.ports import shell
+from pans_sim.ports.serve import ChildLink, SimOptions, build_instrument, open_sim, parse_sim_url
+from pans_sim.ports.shell import Port, TcpPort, open_port, serve
+from pans_sim.ports.virtual import START_NS, VirtualLink
+from pans_sim.scene.still import load_scene
+from pans_sim.testing import small_setup
 
 PATIENCE_S = 20.0
 FAST = "sim:ideal?scene=uniform&pace=fast"
@@ -310,7 +311,7 @@ def test_closing_a_link_does_not_wait_for_a_child_that_hangs() -> None:
 
 
 def test_the_child_ends_when_its_parent_dies() -> None:
-    code = "import os, sys; from pans.firmware_sim.ports.serve import open_sim\n"
+    code = "import os, sys; from pans_sim.ports.serve import open_sim\n"
     code += "link = open_sim('sim:ideal?scene=uniform'); print(link._child.pid, flush=True); os._exit(9)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None
@@ -330,10 +331,10 @@ def test_the_child_ends_when_its_parent_dies() -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to catch")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("how", [["-m", "pans.firmware_sim"], ["-m", "pans.runtime.cli", "simulate"]])
+@pytest.mark.parametrize("how", [["-m", "pans_sim"], ["-m", "pans.app", "simulate"]])
 def test_simulate_prints_its_url_and_serves_until_told_to_end(how: list[str], number: int, code: int) -> None:
-    if "pans.runtime.cli" in how:
-        how = ["-c", "import sys; from pans.runtime.cli import main; sys.exit(main())", "simulate"]
+    if "pans.app" in how:
+        how = ["-c", "import sys; from pans.app.main import main; sys.exit(main())", "simulate"]
     words = [sys.executable, *how, "--profile", "ideal", "--scene", "uniform", "--listen", "tcp:0"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
         try:
@@ -349,7 +350,7 @@ def test_simulate_prints_its_url_and_serves_until_told_to_end(how: list[str], nu
 
 
 def test_a_mistake_on_the_command_line_is_told() -> None:
-    words = [sys.executable, "-m", "pans.firmware_sim", "--profile", "nowhere"]
+    words = [sys.executable, "-m", "pans_sim", "--profile", "nowhere"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 2
     assert done.stdout == ""
@@ -357,7 +358,7 @@ def test_a_mistake_on_the_command_line_is_told() -> None:
 
 
 def test_the_simulator_starts_lean() -> None:
-    code = "import sys, pans.firmware_sim.commands; print([m for m in sys.modules if '.' not in m])"
+    code = "import sys, pans_sim.commands; print([m for m in sys.modules if '.' not in m])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     for heavy in ("numba", "onnxruntime", "rich", "torch", "usb"):
         assert f"'{heavy}'" not in done.stdout

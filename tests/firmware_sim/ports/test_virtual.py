@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from pans.firmware_sim.ports.serve import open_sim
-from pans.runtime.errors import LinkError
-from pans.runtime.link.connection import Connection
-from pans.runtime.link.reader import count_delimiters
+from pans.base.errors import LinkError
+from pans.live.connection import Connection
+from pans.protocol.links.reader import count_delimiters
+from pans_sim.ports.serve import open_sim
 
 URL = "sim:ideal?scene=uniform&pace=fast"
 

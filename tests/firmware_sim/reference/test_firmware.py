@@ -11,9 +11,9 @@ import pytest
 from c_core import COMPILER
 from c_device import NONCE, Pair, needs_compiler
 
-from pans.firmware_sim.lab.core import FOLDER, core_sources
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.messages import MessageType, Opcode
+from pans.protocol.wire import MessageType, Opcode
+from pans.protocol.wire import messages as wire
+from pans_sim.pc_instrument.core import FOLDER, core_sources
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZERS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")

@@ -18,7 +18,7 @@ from commands import json_of
 from lock_step import open_links, register
 from qemu_link import CPUS, build, canned_log, instructions
 
-from pans.runtime.instrument.profile import profile_text
+from pans.instrument.profile import profile_text
 
 pytestmark = pytest.mark.skipif(bool(qemu_link.missing()), reason=f"{qemu_link.missing()} is not installed")
 

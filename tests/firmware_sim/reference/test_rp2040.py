@@ -16,13 +16,13 @@ from commands import json_of
 from lock_step import open_links, register
 from rp2040_link import BENCH, Rp2040Link, build, missing, open_rp2040, symbols
 
-from pans.firmware_sim.conform.bench import Bench
-from pans.runtime.errors import LinkError
-from pans.runtime.instrument.profile import load_profile, profile_text
-from pans.runtime.wire.commands import Arm, Gate, PlanChunk, pack_command, unpack_command
-from pans.runtime.wire.framing import Frame, FrameDecoder
-from pans.runtime.wire.messages import decode_command
-from pans.runtime.wire.schema import DeviceState, MessageType, Opcode
+from pans.base.errors import LinkError
+from pans.instrument.profile import load_profile, profile_text
+from pans.protocol.wire.commands import Arm, Gate, PlanChunk, pack_command, unpack_command
+from pans.protocol.wire.framing import Frame, FrameDecoder
+from pans.protocol.wire.messages import decode_command
+from pans.protocol.wire.schema import DeviceState, MessageType, Opcode
+from pans_sim.conform.bench import Bench
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=f"not here: {missing()}")]
 

@@ -8,9 +8,9 @@ import struct
 import pytest
 from c_device import MODES, NONCE, Pair, needs_compiler, strange_frames
 
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Gate, Show, pack_command
-from pans.runtime.wire.messages import MessageType, Opcode
+from pans.protocol.wire import MessageType, Opcode
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Gate, Show, pack_command
 
 pytestmark = needs_compiler
 

@@ -8,11 +8,11 @@ import naive_detector as naive
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene.detector import sample_clicks, uniform_numbers
-from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.runtime.instrument.dead_time import DeadTime
-from pans.runtime.instrument.profile import load_profile
+from pans.instrument.click_law import ClickLaw
+from pans.instrument.detector.dead_time import DeadTime
+from pans.instrument.profile import load_profile
+from pans_sim.scene.detector import sample_clicks, uniform_numbers
+from pans_sim.scene.detector_model import DetectorModel, detector_model
 
 N = 200_000
 QUIET = ClickLaw()

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene.detector import sample_clicks, uniform_numbers
-from pans.firmware_sim.scene.detector_kernels import click_thresholds, sample_words
-from pans.firmware_sim.scene.detector_model import DetectorModel
-from pans.runtime.instrument.click_law import ClickLaw
+from pans.instrument.click_law import ClickLaw
+from pans_sim.scene.detector import sample_clicks, uniform_numbers
+from pans_sim.scene.detector_kernels import click_thresholds, sample_words
+from pans_sim.scene.detector_model import DetectorModel
 
 PLAIN = DetectorModel(ClickLaw())
 

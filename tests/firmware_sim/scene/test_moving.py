@@ -25,29 +25,29 @@ from moving_scenes import (
 )
 from naive_moving import mean_light, shifted, tape_field
 
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.device.parallel import FrameRun
-from pans.firmware_sim.device.sequential import Measurement
-from pans.firmware_sim.device.view import View
-from pans.firmware_sim.program import Exposures, Program
-from pans.firmware_sim.scene import cells as cells_module
-from pans.firmware_sim.scene import shifts
-from pans.firmware_sim.scene.cells import CellFlow
-from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
-from pans.firmware_sim.scene.marks import MARK_PHOTONS
-from pans.firmware_sim.scene.moving import Cells, Change, SceneFile, Tape
-from pans.firmware_sim.scene.optics import expected_photoelectrons, photons_per_level
-from pans.firmware_sim.scene.scene_file import open_scene
-from pans.firmware_sim.scene.shifts import ShiftTable, shift_table
-from pans.firmware_sim.scene.still import scene_from_arrays
-from pans.firmware_sim.scene.tape import BarTable, TapeFlow
-from pans.runtime.errors import ConfigError
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.runtime.instrument.dead_time import DeadTime
-from pans.runtime.instrument.profile import ObjectModulator, load_profile
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm
+from pans.base.errors import ConfigError
+from pans.instrument.click_law import ClickLaw
+from pans.instrument.detector.dead_time import DeadTime
+from pans.instrument.profile import ObjectModulator, load_profile
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Arm
+from pans_sim.device.instrument import Instrument
+from pans_sim.device.parallel import FrameRun
+from pans_sim.device.sequential import Measurement
+from pans_sim.device.view import View
+from pans_sim.scene import cells as cells_module
+from pans_sim.scene import shifts
+from pans_sim.scene.cells import CellFlow
+from pans_sim.scene.changes import Changes
+from pans_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
+from pans_sim.scene.marks import MARK_PHOTONS
+from pans_sim.scene.moving import Cells, Change, SceneFile, Tape
+from pans_sim.scene.optics import expected_photoelectrons, photons_per_level
+from pans_sim.scene.program import Exposures, Program
+from pans_sim.scene.scene_file import open_scene
+from pans_sim.scene.shifts import ShiftTable, shift_table
+from pans_sim.scene.still import scene_from_arrays
+from pans_sim.scene.tape import BarTable, TapeFlow
 
 
 def flow(what: Any = CELLS, plan: Program | None = None, seed: int = 7) -> Any:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene import optics
-from pans.firmware_sim.scene.optics import expected_photoelectrons, photons_per_level
-from pans.firmware_sim.scene.still import Scene, load_scene, scene_from_arrays
-from pans.runtime.imaging import Imaging, imaging_of
-from pans.runtime.instrument.click_law import object_transmission
-from pans.runtime.instrument.profile import ObjectModulator, Profile, load_profile
+from pans.instrument.click_law import object_transmission
+from pans.instrument.optics import Imaging, imaging_of
+from pans.instrument.profile import ObjectModulator, Profile, load_profile
+from pans_sim.scene import optics
+from pans_sim.scene.optics import expected_photoelectrons, photons_per_level
+from pans_sim.scene.still import Scene, load_scene, scene_from_arrays
 
 RNG = np.random.default_rng(5)
 SCENE: Scene = scene_from_arrays("noise", RNG.integers(0, 256, (9, 7, 6), dtype=np.uint8), None, ())

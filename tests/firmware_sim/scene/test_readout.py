@@ -10,16 +10,16 @@ import pytest
 from readout_events import jittered, telegraph
 from single_events import crosstalk_on, rounds_of
 
-from pans.firmware_sim.scene.changes import Changes, Telegraph
-from pans.firmware_sim.scene.detector import sample_clicks
-from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
-from pans.firmware_sim.scene.drawing import moved_parts
-from pans.firmware_sim.scene.moving import Change
-from pans.firmware_sim.scene.scene_file import reading_changes, scene_on_table
-from pans.runtime.detector import Afterpulses
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
-from pans.runtime.instrument.profile import Profile, load_profile
+from pans.decide.dark.cusum import ChannelWatch, WatchSettings
+from pans.instrument.click_law import ClickLaw
+from pans.instrument.detector import Afterpulses
+from pans.instrument.profile import Profile, load_profile
+from pans_sim.scene.changes import Changes, Telegraph
+from pans_sim.scene.detector import sample_clicks
+from pans_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
+from pans_sim.scene.drawing import moved_parts
+from pans_sim.scene.moving import Change
+from pans_sim.scene.scene_file import reading_changes, scene_on_table
 
 SIGMAS = 4.5
 SEQUENCE = (1.5, 0.1, 0.02, 0.8, 3.0, 0.05, 0.3, 0.0)  # mean photoelectrons of exposures one after the other

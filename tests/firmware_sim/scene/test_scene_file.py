@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene.moving import ALL_CHANNELS, Cells, Change, Tape
-from pans.firmware_sim.scene.scene_file import open_scene
-from pans.firmware_sim.scene.still import Scene, shipped_scene_files
-from pans.runtime.errors import ConfigError
+from pans.base.errors import ConfigError
+from pans_sim.scene.moving import ALL_CHANNELS, Cells, Change, Tape
+from pans_sim.scene.scene_file import open_scene
+from pans_sim.scene.still import Scene, shipped_scene_files
 
 CELLS = """kind = "cells"
 images = "mine.npz"

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector_model import detector_model, first_click_probability
-from pans.firmware_sim.scene.scene_file import scene_on_table
-from pans.firmware_sim.scene.still import Scene
-from pans.runtime.instrument.profile import Optics, load_profile
+from pans.instrument.profile import Optics, load_profile
+from pans_sim.scene.changes import Changes
+from pans_sim.scene.detector_model import detector_model, first_click_probability
+from pans_sim.scene.scene_file import scene_on_table
+from pans_sim.scene.still import Scene
 
 
 def profile(**optics: float):  # type: ignore[no-untyped-def]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene import still as scene_module
-from pans.firmware_sim.scene.still import load_scene, shipped_scenes
-from pans.runtime.errors import ConfigError
+from pans.base.errors import ConfigError
+from pans_sim.scene import still as scene_module
+from pans_sim.scene.still import load_scene, shipped_scenes
 
 IMAGES = np.arange(3 * 4 * 5, dtype=np.uint8).reshape(3, 4, 5)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-SCENE = Path(__file__).parents[3] / "firmware_sim" / "scenes" / "fashion200.npz"
+SCENE = Path(__file__).parents[3] / "firmware_sim/pans_sim/scenes" / "fashion200.npz"
 DRIFT_PPM, OFFSET_PS = 40, 7_000_000_000_000
 SYNCH_V = CLICK_V = 2.5
 

@@ -7,9 +7,19 @@ import numpy as np
 import pytest
 from automata import EXPECTED, automaton_bundle, diamond, early_leaf, random_automaton
 
-from pans.runtime.bundle import Automaton, reachable_automaton, stopped, with_expected
-from pans.runtime.bundle.automaton import SLOTS_MAX, capped, golden_nodes, greatest_light, walk_nodes, words_to
-from pans.runtime.errors import UsageError
+from pans.base.errors import UsageError
+from pans.bundle.automaton import (
+    SLOTS_MAX,
+    Automaton,
+    capped,
+    golden_nodes,
+    greatest_light,
+    reachable_automaton,
+    stopped,
+    walk_nodes,
+    words_to,
+)
+from pans.bundle.sensor import with_expected
 
 HALF = [0.5, 0.5]
 

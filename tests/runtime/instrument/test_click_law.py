@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pans.runtime.instrument.click_law import (
+from pans.instrument.click_law import (
     ClickLaw,
     CountLaw,
     both_chances,
@@ -24,7 +24,7 @@ from pans.runtime.instrument.click_law import (
     object_transmission,
     survival_coefficients,
 )
-from pans.runtime.instrument.profile import load_profile
+from pans.instrument.profile import load_profile
 
 mpmath = pytest.importorskip("mpmath", reason="needs the test extra")
 

@@ -12,16 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tree import ROOT
 
-from pans.runtime.errors import ConfigError
-from pans.runtime.instrument.checked_toml import key_positions, position_of, read_toml
-from pans.runtime.instrument.profile import (
-    MAX_PROFILE_BYTES,
-    load_profile,
-    parse_profile,
-    profile_template,
-    shipped_profiles,
-)
-from pans.runtime.instrument.profile_schema import SCHEMA
+from pans.base.errors import ConfigError
+from pans.base.files.toml_file import key_positions, position_of, read_toml
+from pans.instrument.profile import MAX_PROFILE_BYTES, load_profile, parse_profile, profile_template, shipped_profiles
+from pans.instrument.profile_schema import SCHEMA
 
 GOOD = """\
 [profile]

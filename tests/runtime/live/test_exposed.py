@@ -13,22 +13,25 @@ import numpy as np
 import pytest
 from commands import fixed_run, json_of, page_of, words_of
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.runtime.core.follower import Place, exposure_timing
-from pans.runtime.core.still import Core
-from pans.runtime.live import RunOptions, RunResult, run_live
-from pans.runtime.pages.run import advice_on
-from pans.runtime.record import Recorder, read_recording
-from pans.runtime.record.replaying import replay
-from pans.runtime.record.sent_plan import sent_to_device
-from pans.runtime.report.summary import exposure_fault, find_faults
-from pans.runtime.report.words import exposure_words
-from pans.runtime.timing.ledger import TimingLedger
-from pans.runtime.wire.messages import Exposed, Frame, MessageType, encode_exposed, unpack_body
-from pans.runtime.wire.schema import EXPOSED_SCHEMA
-from pans.runtime.wire.session import STREAM_TYPES
+from pans.decide.follower import Place, exposure_timing
+from pans.decide.still.core import Core
+from pans.live.loop import RunResult, run_live
+from pans.live.options import RunOptions
+from pans.live.timing.ledger import TimingLedger
+from pans.protocol.session import STREAM_TYPES
+from pans.protocol.wire import Frame, MessageType, unpack_body
+from pans.protocol.wire.messages import Exposed, encode_exposed
+from pans.protocol.wire.schema import EXPOSED_SCHEMA
+from pans.record.reading import read_recording
+from pans.record.reading.sent_plan import sent_to_device
+from pans.record.recorder import Recorder
+from pans.record.replay import replay
+from pans.report.pages.run import advice_on
+from pans.report.summary.summary import exposure_fault, find_faults
+from pans.report.summary.words import exposure_words
+from pans_sim.device.clock import DeviceClock
+from pans_sim.device.instrument import Instrument
+from pans_sim.ports.virtual import START_NS, VirtualLink
 
 FRAMES = 900
 MOST = 40  # ticks
@@ -159,7 +162,7 @@ def test_the_tail_of_a_stream_that_broke_off_need_not_be_told_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     core, frames = talkative(tmp_path)
-    monkeypatch.setattr("pans.runtime.core.follower.TAIL_US", 40_000.0)
+    monkeypatch.setattr("pans.decide.follower.TAIL_US", 40_000.0)
     last = max(at for at, frame in enumerate(frames) if frame.type == MessageType.EXPOSED)
     whole = [frame for frame in frames[:last] if frame.type != MessageType.STATUS]
     for kept, is_told in ((frames[:last], True), (whole, True), ([f for f in whole if f.type in STREAM_TYPES], False)):

@@ -14,26 +14,29 @@ import pytest
 from commands import Pans
 from links import served
 
-from pans.firmware_sim.ports.serve import build_instrument, open_sim, parse_sim_url
-from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import ConfigError, PlanError
-from pans.runtime.flow.core import FlowCore
-from pans.runtime.flow.make import build_flow_plan, plan_flow
-from pans.runtime.flow.settings import FlowSettings, flow_of_header, read_flow
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.link import connection
-from pans.runtime.link.base import open_link
-from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, run_live
-from pans.runtime.live.dark_run import DarkRun
-from pans.runtime.live.flow_run import FlowRun
-from pans.runtime.record import Recorder, read_recording
-from pans.runtime.record.exposures import click_list
-from pans.runtime.record.replaying import replay
-from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.record.tables import click_table
-from pans.runtime.wire.messages import DARK_PATTERN
-from pans.trainer.export.tape_bundle import Tape, exact_table, tape_bundle
+from pans.base.errors import ConfigError, PlanError
+from pans.bundle.backends.choose import make_decider
+from pans.bundle.sensor import Bundle
+from pans.bundle.sensor.bundle import load_bundle, write_bundle
+from pans.decide.flow.core import FlowCore
+from pans.decide.flow.make import build_flow_plan, plan_flow
+from pans.decide.flow.settings import FlowSettings, flow_of_header, read_flow
+from pans.instrument.profile import load_profile
+from pans.live import connection
+from pans.live.dark_run import DarkRun
+from pans.live.flow_run import FlowRun
+from pans.live.loop import LiveRun, Observers, Recovery, run_live
+from pans.live.options import RunOptions
+from pans.protocol.links.base import open_link
+from pans.protocol.wire import DARK_PATTERN
+from pans.record.reading import read_recording
+from pans.record.reading.exposures import click_list
+from pans.record.reading.sent_plan import recorded_plan
+from pans.record.recorder import Recorder
+from pans.record.replay import replay
+from pans.record.tables.tables import click_table
+from pans_sim.ports.serve import build_instrument, open_sim, parse_sim_url
+from pans_trainer.export.tape_bundle import Tape, exact_table, tape_bundle
 
 PROFILE = load_profile("flow-snspd")
 

@@ -14,20 +14,21 @@ import numpy as np
 import pytest
 from links import Stepped, served
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.ports.serve import SimOptions, build_instrument, open_sim
-from pans.runtime.core.decision import Action
-from pans.runtime.errors import DeviceError, LinkError, UsageError
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.link.base import open_link
-from pans.runtime.link.connection import Connection
-from pans.runtime.live.gates import MAX_WAITING, GateQueue, SecondInstrument, idle_plan, open_actuator
-from pans.runtime.live.journal import Journal
-from pans.runtime.timing.clock import ClockModel
-from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, Gate, pack_command
-from pans.runtime.wire.messages import Ack, AckStatus, DeviceState, FrameDecoder, MessageType, Opcode
-from pans.runtime.wire.session import COMMAND_WINDOW, HostSession
+from pans.base.errors import DeviceError, LinkError, UsageError
+from pans.decide.decision import Action
+from pans.instrument.profile import load_profile
+from pans.live.connection import Connection
+from pans.live.gates import MAX_WAITING, GateQueue, SecondInstrument, idle_plan, open_actuator
+from pans.live.journal import Journal
+from pans.protocol.clock import ClockModel
+from pans.protocol.links.base import open_link
+from pans.protocol.session import COMMAND_WINDOW, HostSession
+from pans.protocol.wire import AckStatus, DeviceState, FrameDecoder, MessageType, Opcode
+from pans.protocol.wire import messages as wire
+from pans.protocol.wire.commands import Arm, Gate, pack_command
+from pans.protocol.wire.messages import Ack
+from pans_sim.device.clock import DeviceClock
+from pans_sim.ports.serve import SimOptions, build_instrument, open_sim
 
 MS = 1_000_000
 PROFILE = load_profile("flow-snspd")

@@ -13,25 +13,27 @@ from heads import onnx_chain, random_layers
 from links import Wrapped
 from small_files import small_calibration
 
-from pans.firmware_sim.ports.serve import open_sim
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.bundle.model import Bundle, write_bundle
-from pans.runtime.core.decision import Decision
-from pans.runtime.core.plan import build_plan
-from pans.runtime.core.plan_codec import plan_chunks, plan_from_chunks
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import DeviceError, LinkError
-from pans.runtime.instrument.calibration import load_calibration
-from pans.runtime.instrument.channel_health import DarkReport
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.instrument.state_watch import StateWatch
-from pans.runtime.link.base import Link
-from pans.runtime.live import RunOptions, RunResult, run_live
-from pans.runtime.live.dark_run import DarkRun
-from pans.runtime.live.journal import Journal
-from pans.runtime.record import read_recording
-from pans.runtime.wire import messages as wire
+from pans.base.errors import DeviceError, LinkError
+from pans.bundle.backends.choose import make_decider
+from pans.bundle.sensor import Bundle
+from pans.bundle.sensor.bundle import write_bundle
+from pans.decide.dark.health import DarkReport
+from pans.decide.dark.state_watch import StateWatch
+from pans.decide.decision import Decision
+from pans.decide.plan.plan import build_plan
+from pans.decide.plan.plan_codec import plan_chunks, plan_from_chunks
+from pans.decide.still.core import Core
+from pans.instrument.calibration_file import load_calibration
+from pans.instrument.profile import load_profile
+from pans.live.dark_run import DarkRun
+from pans.live.journal import Journal
+from pans.live.loop import RunResult, run_live
+from pans.live.options import RunOptions
+from pans.protocol.links.base import Link
+from pans.protocol.wire import messages as wire
+from pans.record.reading import read_recording
+from pans_sim.ports.serve import open_sim
+from pans_sim.testing import small_setup
 
 PROFILE = load_profile("oled-qcmos")
 

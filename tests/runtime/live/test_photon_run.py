@@ -8,12 +8,12 @@ import pytest
 from bundles import made_bundle
 from commands import json_of
 
-from pans.runtime.bundle.model import load_bundle, write_bundle
-from pans.runtime.cli import main
-from pans.runtime.decide import make_decider
-from pans.runtime.record import read_recording
-from pans.runtime.record.exposures import click_list
-from pans.runtime.record.sent_plan import recorded_plan
+from pans.app.main import main
+from pans.bundle.backends import make_decider
+from pans.bundle.sensor.bundle import load_bundle, write_bundle
+from pans.record.reading import read_recording
+from pans.record.reading.exposures import click_list
+from pans.record.reading.sent_plan import recorded_plan
 
 N_OBJECTS, TRIALS, D_F, LARGEST = 60, 3, 3, 3
 PATTERNS = np.zeros((D_F, 16), np.int64)

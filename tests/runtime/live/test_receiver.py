@@ -5,11 +5,12 @@ from typing import Any
 
 import pytest
 
-from pans.runtime.core.decision import Action, Output
-from pans.runtime.errors import LinkError
-from pans.runtime.live import LiveRun
-from pans.runtime.live.receiver import Receiver, has_host_clock, why_fed
-from pans.runtime.wire.messages import DeviceState, Frame, FrameDecoder, StateReason, Status, encode_status
+from pans.base.errors import LinkError
+from pans.decide.decision import Action, Output
+from pans.live.loop import LiveRun
+from pans.live.receiver import Receiver, has_host_clock, why_fed
+from pans.protocol.wire import DeviceState, Frame, FrameDecoder, StateReason
+from pans.protocol.wire.messages import Status, encode_status
 
 
 def bare_run(step: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[LiveRun, list[tuple[int, int]]]:

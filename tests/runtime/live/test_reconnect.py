@@ -10,30 +10,25 @@ from typing import Any
 import pytest
 from links import Wrapped, served
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.device.upload import Refused
-from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.firmware_sim.scene.still import load_scene
-from pans.firmware_sim.testing import small_setup
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import LinkError
-from pans.runtime.link.base import open_link
-from pans.runtime.live import Observers, Recovery, RunOptions, run_live
-from pans.runtime.live.reconnect import MOST_FRUITLESS
-from pans.runtime.record import Recorder, read_recording
-from pans.runtime.record.replaying import replay
-from pans.runtime.wire.messages import (
-    AckStatus,
-    CommandMessage,
-    FrameDecoder,
-    MessageType,
-    Opcode,
-    decode_command,
-    encode_welcome,
-)
-from pans.runtime.wire.session import STREAM_TYPES
+from pans.base.errors import LinkError
+from pans.bundle.backends.choose import make_decider
+from pans.decide.still.core import Core
+from pans.live.loop import Observers, Recovery, run_live
+from pans.live.options import RunOptions
+from pans.live.reconnect import MOST_FRUITLESS
+from pans.protocol.links.base import open_link
+from pans.protocol.session import STREAM_TYPES
+from pans.protocol.wire import AckStatus, FrameDecoder, MessageType, Opcode
+from pans.protocol.wire.messages import CommandMessage, decode_command, encode_welcome
+from pans.record.reading import read_recording
+from pans.record.recorder import Recorder
+from pans.record.replay import replay
+from pans_sim.device.clock import DeviceClock
+from pans_sim.device.instrument import Instrument
+from pans_sim.device.upload import Refused
+from pans_sim.ports.virtual import START_NS, VirtualLink
+from pans_sim.scene.still import load_scene
+from pans_sim.testing import small_setup
 
 FEW = 400
 

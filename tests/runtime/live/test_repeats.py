@@ -9,17 +9,19 @@ import fault_grid
 import pytest
 from commands import json_of, page_of, words_of
 
-from pans.firmware_sim.device.clock import DeviceClock
-from pans.firmware_sim.device.instrument import Instrument
-from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.runtime import SHIPPED
-from pans.runtime.live import RunOptions, RunResult, run_live
-from pans.runtime.record import Recorder, Recording, read_recording
-from pans.runtime.record.replaying import replay
-from pans.runtime.report.summary import contradictions_of, find_faults
-from pans.runtime.wire.framing import FrameDecoder, encode_frame
-from pans.runtime.wire.messages import MessageType
-from pans.runtime.wire.session import STREAM_TYPES
+from pans.base import SHIPPED
+from pans.live.loop import RunResult, run_live
+from pans.live.options import RunOptions
+from pans.protocol.session import STREAM_TYPES
+from pans.protocol.wire import MessageType
+from pans.protocol.wire.framing import FrameDecoder, encode_frame
+from pans.record.reading import Recording, read_recording
+from pans.record.recorder import Recorder
+from pans.record.replay import replay
+from pans.report.summary.summary import contradictions_of, find_faults
+from pans_sim.device.clock import DeviceClock
+from pans_sim.device.instrument import Instrument
+from pans_sim.ports.virtual import START_NS, VirtualLink
 
 FRAMES = 60  # stream messages of a session
 MOST_LATER = 40  # messages between the two
@@ -109,7 +111,7 @@ def session(path: Path, mode: str, how: int, seed: int, often: float) -> tuple[R
 def wrong_verdicts(folder: Path, sessions: int, monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[int]]:
     """Run so many sessions; return those whose verdict is wrong, and how many were of each kind of HOW."""
     wrong, kinds = [], [0] * len(HOW)
-    monkeypatch.setattr("pans.runtime.link.connection.secrets", SimpleNamespace(randbelow=random.Random(1).randrange))
+    monkeypatch.setattr("pans.live.connection.secrets", SimpleNamespace(randbelow=random.Random(1).randrange))
     modes = fault_grid.MODES
     for number in range(sessions):
         mode = modes[number % len(modes)]

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag
-from pans.runtime.live.tally import RunTally
+from pans.bundle.backends import NO_LABEL
+from pans.decide.decision import DECISION_DTYPE, Decision, DecisionFlag
+from pans.live.tally import RunTally
 
 NAN = float("nan")
 
@@ -70,7 +71,7 @@ def test_any_number_of_objects_fits_and_changes_no_figure(monkeypatch: pytest.Mo
     right = rng.random((500, 4)) < rng.random((500, 1))
     summaries = []
     for most in (1 << 14, 7):
-        monkeypatch.setattr("pans.runtime.live.tally.MAX_OBJECTS", most)
+        monkeypatch.setattr("pans.live.tally.MAX_OBJECTS", most)
         tally = RunTally(2, 1)
         for obj, row in enumerate(right):
             for trial, value in enumerate(row):

@@ -10,26 +10,28 @@ import pytest
 from automata import automaton_bundle, random_automaton
 from commands import Pans
 
-from pans.firmware_sim.ports.serve import SimOptions, build_instrument
-from pans.runtime.bundle.model import Bundle, write_bundle
-from pans.runtime.cli import main
-from pans.runtime.compare import compare, read_side
-from pans.runtime.core.decision import NO_LABEL, DecisionFlag
-from pans.runtime.core.plan import build_plan
-from pans.runtime.decide.expectation import expected_walk
-from pans.runtime.errors import DeviceError, PlanError
-from pans.runtime.instrument.click_law import click_law, object_transmission
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.link.fit import check_automaton
-from pans.runtime.pages.run import Decisions
-from pans.runtime.record import read_recording
-from pans.runtime.record.exposures import click_list
-from pans.runtime.record.parts import parts_in
-from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.record.tables import click_table
-from pans.runtime.wire.commands import count_announcement
-from pans.runtime.wire.messages import DARK_PATTERN
-from pans.runtime.wire.schema import AUTOMATON_SCHEMA
+from pans.app.main import main
+from pans.base.errors import DeviceError, PlanError
+from pans.bundle.backends import NO_LABEL
+from pans.bundle.backends.expectation import expected_walk
+from pans.bundle.sensor import Bundle
+from pans.bundle.sensor.bundle import write_bundle
+from pans.decide.decision import DecisionFlag
+from pans.decide.plan.plan import build_plan
+from pans.instrument.click_law import click_law, object_transmission
+from pans.instrument.profile import load_profile
+from pans.live.device_check import check_automaton
+from pans.protocol.wire import DARK_PATTERN
+from pans.protocol.wire.commands import count_announcement
+from pans.protocol.wire.schema import AUTOMATON_SCHEMA
+from pans.record.reading import read_recording
+from pans.record.reading.exposures import click_list
+from pans.record.reading.parts import parts_in
+from pans.record.reading.sent_plan import recorded_plan
+from pans.record.tables.tables import click_table
+from pans.report.compare import compare, read_side
+from pans.report.pages.run import Decisions
+from pans_sim.ports.serve import SimOptions, build_instrument
 
 N_OBJECTS = 24
 WALKS = ("object", "shot", "clicks", "label", "truth", "flags", "probability", "counts_crc", "exposures")

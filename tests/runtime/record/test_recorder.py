@@ -15,12 +15,13 @@ from automata import automaton_bundle
 from bundles import made_bundle
 from small_runs import Disk, fails, log_sha256
 
-from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
-from pans.runtime.errors import DamagedFileError, PansError, RecordingError, UsageError
-from pans.runtime.record import Recorder, Recording, read_recording
-from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind
-from pans.runtime.record.sent_plan import automaton_of
-from pans.runtime.timing.clock import CLOCK_DTYPE
+from pans.base.errors import DamagedFileError, PansError, RecordingError, UsageError
+from pans.decide.decision import DECISION_DTYPE, DecisionFlag
+from pans.protocol.clock import CLOCK_DTYPE
+from pans.record.reading import Recording, read_recording
+from pans.record.reading.format import TIMING_RUN_DTYPE, Kind
+from pans.record.reading.sent_plan import automaton_of
+from pans.record.recorder import Recorder
 
 HEADER = {"created_utc": "2025-01-01T00:00:00+00:00", "simulated": True, "seed": 7}
 

@@ -10,14 +10,15 @@ from commands import json_of
 from small_files import blocks_of, record_flow, record_passive, record_run, sealed, use_file
 from small_runs import record_small
 
-from pans.runtime.cli import main
-from pans.runtime.errors import DeviceError
-from pans.runtime.live import LiveRun
-from pans.runtime.record import Recorder, Recording, read_recording
-from pans.runtime.record.format import Kind
-from pans.runtime.record.replaying import replay
-from pans.runtime.report.verify import verify_file
-from pans.runtime.wire.messages import MessageType, Opcode, unpack_body
+from pans.app.main import main
+from pans.base.errors import DeviceError
+from pans.live.loop import LiveRun
+from pans.protocol.wire import MessageType, Opcode, unpack_body
+from pans.record.reading import Recording, read_recording
+from pans.record.reading.format import Kind
+from pans.record.recorder import Recorder
+from pans.record.replay import replay
+from pans.report.files.verify import verify_file
 
 ALL_FAULTS = "loss:0.01,duplicate:0.01,flip:0.01,stall:300ms/700ms"
 Change = Callable[[list[tuple[int, bytes]]], list[tuple[int, bytes]]]
@@ -33,8 +34,8 @@ def test_what_is_recorded_of_a_cut_run_is_decided_again(
     tmp_path: Path, faults: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Buffers are full now and then, each in its own time."""
-    monkeypatch.setattr("pans.runtime.record.recorder.BUFFER_ROWS", 23)
-    monkeypatch.setattr("pans.runtime.record.recorder._MESSAGE_BUFFER_BYTES", 3001)
+    monkeypatch.setattr("pans.record.recorder.BUFFER_ROWS", 23)
+    monkeypatch.setattr("pans.record.recorder._MESSAGE_BUFFER_BYTES", 3001)
     seed = random.SystemRandom().randrange(1 << 32)
     rng = random.Random(seed)
     path = tmp_path / "run.pansrec"

@@ -14,18 +14,18 @@ import torch
 from commands import Pans
 from trainings import kept_task
 
-from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_USAGE, main
-from pans.runtime.errors import UsageError
-from pans.trainer.baselines import bayes as baseline_bayes
-from pans.trainer.baselines import common as baselines
-from pans.trainer.baselines import rows as baseline_rows
-from pans.trainer.baselines.bayes import bayes, log_joint
-from pans.trainer.baselines.common import Light, Trials, detect, measure, run_trials, silent
-from pans.trainer.baselines.end_to_end import patterns_measured, train_conventionally
-from pans.trainer.baselines.networks import aware_net, clean_cnn, patterns, walsh
-from pans.trainer.evaluate.accuracy import Measured
-from pans.trainer.options import BaselineOptions
-from pans.trainer.tasks.registry import Objects, Task
+from pans.app.main import main
+from pans.base.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
+from pans_trainer.baselines import bayes as baseline_bayes
+from pans_trainer.baselines import common as baselines
+from pans_trainer.baselines import rows as baseline_rows
+from pans_trainer.baselines.bayes import bayes, log_joint
+from pans_trainer.baselines.common import Light, Trials, detect, measure, run_trials, silent
+from pans_trainer.baselines.end_to_end import patterns_measured, train_conventionally
+from pans_trainer.baselines.networks import aware_net, clean_cnn, patterns, walsh
+from pans_trainer.evaluate.accuracy import Measured
+from pans_trainer.options import BaselineOptions
+from pans_trainer.tasks.registry import Objects, Task
 
 SIDE = 8
 

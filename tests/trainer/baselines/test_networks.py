@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from pans.trainer.baselines.common import Light, measure, run_trials
-from pans.trainer.baselines.end_to_end import masks_measured, masks_that_stop, noisy, principal_masks, train_masks
-from pans.trainer.baselines.networks import aware_net, hadamard_12, pairs
-from pans.trainer.options import BaselineOptions
-from pans.trainer.tasks.registry import Objects, Task
+from pans_trainer.baselines.common import Light, measure, run_trials
+from pans_trainer.baselines.end_to_end import masks_measured, masks_that_stop, noisy, principal_masks, train_masks
+from pans_trainer.baselines.networks import aware_net, hadamard_12, pairs
+from pans_trainer.options import BaselineOptions
+from pans_trainer.tasks.registry import Objects, Task
 
 
 def test_the_matrix_is_hadamard_and_begins_with_the_constant() -> None:

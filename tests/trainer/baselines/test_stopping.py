@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from trainings import kept_task
 
-from pans.trainer.baselines.common import measure, silent
-from pans.trainer.baselines.networks import SHORTEST, exposure_net, log_chances
-from pans.trainer.baselines.stopping import (
+from pans_trainer.baselines.common import measure, silent
+from pans_trainer.baselines.networks import SHORTEST, exposure_net, log_chances
+from pans_trainer.baselines.stopping import (
     GRID,
     SURE,
     Arrivals,
@@ -21,7 +21,7 @@ from pans.trainer.baselines.stopping import (
     of_network,
     of_posterior,
 )
-from pans.trainer.tasks.registry import Objects, Task
+from pans_trainer.tasks.registry import Objects, Task
 
 FLOOR = 0.02
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pans.trainer.baselines.strings import Bars, at_clicks, at_photons, bounds, imaged, word_chances
-from pans.trainer.tasks.barcode import all_strings, weights
+from pans_trainer.baselines.strings import Bars, at_clicks, at_photons, bounds, imaged, word_chances
+from pans_trainer.tasks.barcode import all_strings, weights
 
 
 def has_target(bars):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from commands import Pans
 
-from pans.firmware_sim.scene.still import load_scene
-from pans.trainer.tasks.registry import draw_task
+from pans_sim.scene.still import load_scene
+from pans_trainer.tasks.registry import draw_task
 
 
 @pytest.mark.parametrize("part", ["test", "train"])

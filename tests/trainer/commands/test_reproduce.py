@@ -7,7 +7,7 @@ import sys
 import pytest
 from tree import ROOT
 
-from pans.trainer.commands.reproduce import NAMES
+from pans_trainer.commands.reproduce import NAMES
 
 
 def test_the_command_lists_collects_and_refuses(tmp_path, pans):
@@ -20,7 +20,7 @@ def test_the_command_lists_collects_and_refuses(tmp_path, pans):
 
 
 def test_pages_are_listed_without_torch():
-    words = "import sys; from pans.trainer.commands import reproduce; sys.exit('torch' in sys.modules)"
+    words = "import sys; from pans_trainer.commands import reproduce; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", words], check=False).returncode == 0
 
 

@@ -9,7 +9,7 @@ import pytest
 from databases import postgres_server
 
 optuna = pytest.importorskip("optuna", reason="needs the sweep extra")
-from pans.runtime.cli import main  # noqa: E402
+from pans.app.main import main  # noqa: E402
 
 
 @pytest.fixture(params=["journal", "postgresql"])
@@ -50,7 +50,7 @@ def test_two_workers_share_a_study_and_a_killed_one_costs_its_trial_alone(words,
         sys.executable,
         "-P",  # not the working folder: its metadata may be old
         "-c",
-        "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))",
+        "import sys; from pans.app.main import main; sys.exit(main(sys.argv[1:]))",
         *words,
     ]
     killed = subprocess.Popen(
@@ -72,8 +72,8 @@ def test_two_workers_share_a_study_and_a_killed_one_costs_its_trial_alone(words,
     "url", ["nonsense://x/y", "postgresql://lab:secret@127.0.0.1:1/none", "sqlite:////nowhere/at/all.db"]
 )
 def test_databases_that_cannot_be_opened_are_told_without_their_password(url):
-    from pans.runtime.errors import UsageError
-    from pans.trainer.commands.sweep import open_storage
+    from pans.base.errors import UsageError
+    from pans_trainer.commands.sweep import open_storage
 
     with pytest.raises(UsageError, match="--storage") as caught:
         open_storage(url)

@@ -13,8 +13,8 @@ from trainings import (
     short_fits,  # noqa: F401 - a fixture
 )
 
-from pans.runtime.bundle.model import load_bundle
-from pans.trainer.train import checkpoint
+from pans.bundle.sensor.bundle import load_bundle
+from pans_trainer.train.gradient import checkpoint
 
 SHORT = ["--encoder", "automaton", "--exposures", "4", "--states", "8", "--epochs", "2", "--batch", "64"]
 
@@ -70,7 +70,7 @@ AUTOMATON = ["--encoder", "automaton", "--photons", "3", "--exposures", "3", "--
 
 
 @pytest.mark.usefixtures("short_fits")
-@pytest.mark.parametrize(("module", "words"), [("train.loop", FIXED), ("adaptive.train", AUTOMATON)])
+@pytest.mark.parametrize(("module", "words"), [("train.gradient.loop", FIXED), ("train.automaton.train", AUTOMATON)])
 def test_a_terminated_training_says_so_and_goes_on(
     module: str, words: list[str], tmp_path: Path, pans: Pans, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -82,7 +82,7 @@ def test_a_terminated_training_says_so_and_goes_on(
         checkpoint.write_checkpoint(*given)
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(f"pans.trainer.{module}.write_checkpoint", killed)
+    monkeypatch.setattr(f"pans_trainer.{module}.write_checkpoint", killed)
     assert pans(*command, code=130)["error"]["exit"] == 130
     assert signal.getsignal(signal.SIGTERM) is before
     monkeypatch.undo()

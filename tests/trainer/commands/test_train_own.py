@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from trainings import practice_folder, practice_images
 
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.cli import main
-from pans.trainer.baselines import rows
-from pans.trainer.choose import own, recipe
-from pans.trainer.commands import train_own
-from pans.trainer.commands.arguments import curve
-from pans.trainer.tasks.registry import load_task
+from pans.app.main import main
+from pans.bundle.sensor.bundle import load_bundle
+from pans_trainer.baselines import rows
+from pans_trainer.commands import train_own
+from pans_trainer.commands.arguments import curve
+from pans_trainer.own_images import own, recipe
+from pans_trainer.tasks.registry import load_task
 
 QUICK = ["--exposures", "4", "--states", "8", "--epochs", "1"]
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from bundles import made_bundle
 
-from pans.runtime.bundle.model import write_bundle
-from pans.runtime.decide import make_decider
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate import evaluate
-from pans.trainer.evaluate.accuracy import among_classes, evaluate_exactly, evaluate_sampled, light_of
-from pans.trainer.evaluate.held_out import held_out_of
-from pans.trainer.options import Conditions
+from pans.bundle.backends import make_decider
+from pans.bundle.sensor.bundle import write_bundle
+from pans.instrument.profile import load_profile
+from pans_trainer.evaluate import evaluate
+from pans_trainer.evaluate.accuracy import among_classes, evaluate_exactly, evaluate_sampled, light_of
+from pans_trainer.evaluate.held_out import held_out_of
+from pans_trainer.options import Conditions
 
 RNG = np.random.default_rng(0)
 PROFILE = load_profile("oled-qcmos")
@@ -26,8 +26,8 @@ IMAGES = RNG.integers(0, 256, (60, 4, 5), dtype=np.uint8)
 
 def head_bundle():
     torch = pytest.importorskip("torch", reason="needs the train extra")
-    from pans.trainer.export.onnx_heads import head_onnx
-    from pans.trainer.model.heads import MlpHead
+    from pans_trainer.export.onnx_heads import head_onnx
+    from pans_trainer.model.heads import MlpHead
 
     graph, _ = head_onnx(MlpHead(3, 8, 3, torch.Generator().manual_seed(0)), np.full(3, 0.4))
     facts = {"name": "small", "task": "own", "classes": ("a", "b", "c"), "image_shape": (4, 5), "levels": 124}
@@ -114,7 +114,7 @@ def test_a_bundle_is_judged_by_one_call(own_task, tmp_path):
 
 def test_evaluation_loads_no_torch():
     code = (
-        "import sys, pans.trainer.commands, pans.trainer.evaluate, pans.trainer.tasks\n"
+        "import sys, pans_trainer.commands, pans_trainer.evaluate, pans_trainer.tasks\n"
         "assert 'torch' not in sys.modules and 'onnx' not in sys.modules"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

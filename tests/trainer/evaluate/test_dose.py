@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from bundles import automaton_bundle, made_bundle, six_states
 
-from pans.runtime.bundle.layers import Layer, reference_scores
-from pans.runtime.bundle.model import Bundle
-from pans.runtime.imaging import Bleaching
-from pans.runtime.instrument.click_law import object_transmission
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.refit.rebuild import chain_onnx
-from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.evaluate.dose import (
+from pans.bundle.heads.layers import Layer, reference_scores
+from pans.bundle.sensor import Bundle
+from pans.calibrate.refit.rebuild import chain_onnx
+from pans.instrument.click_law import object_transmission
+from pans.instrument.optics import Bleaching
+from pans.instrument.profile import load_profile
+from pans_trainer.evaluate.accuracy import light_of
+from pans_trainer.evaluate.dose import (
     caps_of,
     dose_curve,
     figures_of,
@@ -25,11 +25,11 @@ from pans.trainer.evaluate.dose import (
     training_readings,
     within_cap,
 )
-from pans.trainer.evaluate.held_out import HeldOut
-from pans.trainer.evaluate.pictures import draw_dose
-from pans.trainer.evaluate.walks import walks_of
-from pans.trainer.options import Conditions
-from pans.trainer.tasks.registry import Objects, Task
+from pans_trainer.evaluate.held_out import HeldOut
+from pans_trainer.evaluate.pictures import draw_dose
+from pans_trainer.evaluate.walks import walks_of
+from pans_trainer.options import Conditions
+from pans_trainer.tasks.registry import Objects, Task
 
 IDEAL = load_profile("ideal")
 RNG = np.random.default_rng(8)

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from pans.trainer.evaluate import information
+from pans_trainer.evaluate import information
 
 
 def h2(p: float) -> float:

@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from bundles import automaton_bundle, made_bundle, six_states
 
-from pans.runtime.bundle.model import Bundle, load_bundle
-from pans.runtime.errors import UsageError
-from pans.runtime.imaging import IDENTITY, Imaging, imaging_of, tolerance_of
-from pans.runtime.instrument.profile import Optics, load_profile
-from pans.trainer.commands.evaluate import other_answer
-from pans.trainer.evaluate import optics
-from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.evaluate.held_out import HeldOut, held_out_of
-from pans.trainer.evaluate.walks import measured_walks, walks_of
-from pans.trainer.options import Conditions
-from pans.trainer.tasks.registry import Objects, Task
+from pans.base.errors import UsageError
+from pans.bundle.sensor import Bundle
+from pans.bundle.sensor.bundle import load_bundle
+from pans.instrument.optics import IDENTITY, Imaging, imaging_of, tolerance_of
+from pans.instrument.profile import Optics, load_profile
+from pans_trainer.commands.evaluate import other_answer
+from pans_trainer.evaluate import optics
+from pans_trainer.evaluate.accuracy import light_of
+from pans_trainer.evaluate.held_out import HeldOut, held_out_of
+from pans_trainer.evaluate.walks import measured_walks, walks_of
+from pans_trainer.options import Conditions
+from pans_trainer.tasks.registry import Objects, Task
 
 IDEAL = load_profile("ideal")
 RNG = np.random.default_rng(2)

@@ -12,8 +12,8 @@ pytest.importorskip("sklearn")
 
 from trainings import short_fits  # noqa: F401  a fixture
 
-from pans.runtime.cli import main
-from pans.trainer.evaluate.pictures import tsne
+from pans.app.main import main
+from pans_trainer.evaluate.pictures import tsne
 
 RNG = np.random.default_rng(4)
 

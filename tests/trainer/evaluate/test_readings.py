@@ -9,13 +9,13 @@ import pytest
 from bundles import made_bundle
 from single_events import crosstalk_on
 
-from pans.firmware_sim.scene.detector import sample_clicks
-from pans.firmware_sim.scene.detector_model import detector_model
-from pans.runtime.core.calibration import CalibrationCore, calibration_exposure_us, counts_of, design_run, profile_level
-from pans.runtime.decide import make_decider
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.trainer.evaluate.accuracy import Light, decision_shares, evaluate_exactly, evaluate_sampled, light_of
-from pans.trainer.evaluate.readings import Numbers
+from pans.bundle.backends import make_decider
+from pans.calibrate.measurement import CalibrationCore, calibration_exposure_us, counts_of, design_run, profile_level
+from pans.instrument.profile import Profile, load_profile
+from pans_sim.scene.detector import sample_clicks
+from pans_sim.scene.detector_model import detector_model
+from pans_trainer.evaluate.accuracy import Light, decision_shares, evaluate_exactly, evaluate_sampled, light_of
+from pans_trainer.evaluate.readings import Numbers
 
 PROFILE = load_profile("dmd-qcmos")
 D_F, OUTCOMES, PIXELS = 2, 3, 16

@@ -12,14 +12,15 @@ import pytest
 from automata import automaton_bundle, random_automaton
 from commands import Pans
 
-from pans.runtime.bundle import Automaton, Bundle, with_expected, write_bundle
-from pans.runtime.decide import make_decider
-from pans.runtime.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate import evaluate
-from pans.trainer.evaluate.accuracy import outcome_law_of
-from pans.trainer.evaluate.walks import calibration_bins, confusion_of, expected_differences, measured_walks, walks_of
-from pans.trainer.options import Conditions
+from pans.bundle.automaton import Automaton
+from pans.bundle.backends import make_decider
+from pans.bundle.sensor import Bundle, expected_differences, with_expected, write_bundle
+from pans.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
+from pans.instrument.profile import load_profile
+from pans_trainer.evaluate import evaluate
+from pans_trainer.evaluate.accuracy import outcome_law_of
+from pans_trainer.evaluate.walks import calibration_bins, confusion_of, measured_walks, walks_of
+from pans_trainer.options import Conditions
 
 RNG = np.random.default_rng(0)
 PROFILE = load_profile("oled-qcmos")

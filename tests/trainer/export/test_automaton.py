@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from automata import automaton_bundle, random_automaton
 
-from pans.runtime.bundle import Automaton
-from pans.runtime.decide import make_decider
-from pans.runtime.errors import PansError
-from pans.trainer.export import automaton as export
+from pans.base.errors import PansError
+from pans.bundle.automaton import Automaton
+from pans.bundle.backends import make_decider
+from pans_trainer.export import automaton as export
 
 
 def nearly_even(automaton: Automaton) -> Automaton:

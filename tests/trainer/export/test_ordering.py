@@ -10,16 +10,17 @@ from bundles import made_bundle
 from commands import json_of
 from naive_decide import int8_reference
 
-from pans.runtime.bundle.layers import Layer, quantise_head, reference_scores
-from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.imaging import Bleaching
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.refit.rebuild import chain_onnx
-from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.evaluate.dose import of_first, plain_layers, training_readings
-from pans.trainer.export.ordering import information_order, reordered
-from pans.trainer.tasks.registry import Objects
+from pans.bundle.backends.choose import make_decider
+from pans.bundle.heads.layers import Layer, quantise_head, reference_scores
+from pans.bundle.sensor import Bundle, bundle_bytes, parse_bundle
+from pans.bundle.sensor.bundle import load_bundle
+from pans.calibrate.refit.rebuild import chain_onnx
+from pans.instrument.optics import Bleaching
+from pans.instrument.profile import Profile, load_profile
+from pans_trainer.evaluate.accuracy import light_of
+from pans_trainer.evaluate.dose import of_first, plain_layers, training_readings
+from pans_trainer.export.ordering import information_order, reordered
+from pans_trainer.tasks.registry import Objects
 
 IDEAL, COUNTING = load_profile("ideal"), load_profile("dmd-qcmos")
 OUTCOMES = 3

@@ -8,17 +8,17 @@ import pytest
 import torch
 from trainings import short_fits  # noqa: F401  a fixture
 
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.cli import main
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate.accuracy import evaluate_pictures, light_of
-from pans.trainer.export.writer import export_trained, reference_scores
-from pans.trainer.options import Options
-from pans.trainer.tasks.public_sets import PUBLIC_SETS
-from pans.trainer.tasks.registry import FIBRE_TASKS, Objects, Task, draw_task, physical_encoder, task_names
-from pans.trainer.train.data import encoder_input
-from pans.trainer.train.loop import train
+from pans.app.main import main
+from pans.bundle.backends.choose import make_decider
+from pans.bundle.sensor.bundle import load_bundle
+from pans.instrument.profile import load_profile
+from pans_trainer.evaluate.accuracy import evaluate_pictures, light_of
+from pans_trainer.export.writer import export_trained, reference_scores
+from pans_trainer.options import Options
+from pans_trainer.tasks.public_sets import PUBLIC_SETS
+from pans_trainer.tasks.registry import FIBRE_TASKS, Objects, Task, draw_task, physical_encoder, task_names
+from pans_trainer.train.gradient.data import encoder_input
+from pans_trainer.train.gradient.loop import train
 
 PROFILE = load_profile("ideal")
 pytestmark = pytest.mark.usefixtures("short_fits")

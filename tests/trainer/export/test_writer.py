@@ -10,25 +10,25 @@ from heads import head_bundle, random_layers
 from naive_decide import int8_reference
 from trainings import bars_task, short_fits  # noqa: F401 - a fixture
 
-from pans.runtime.bundle.layers import quantise_head
-from pans.runtime.bundle.layers import reference_scores as layer_scores
-from pans.runtime.bundle.model import Shown, load_bundle
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import PansError, UsageError
-from pans.runtime.imaging import imaging_of
-from pans.runtime.instrument.click_law import CountLaw
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.adaptive.train import train_automaton
-from pans.trainer.evaluate.accuracy import evaluate_exactly, light_of
-from pans.trainer.evaluate.held_out import HeldOut
-from pans.trainer.evaluate.optics import figures_under, misalignment_curves
-from pans.trainer.export import onnx_heads
-from pans.trainer.export.automaton import export_automaton
-from pans.trainer.export.onnx_heads import fold_normalisation, int8_onnx
-from pans.trainer.export.writer import Description, compare, export, export_trained, reference_scores
-from pans.trainer.model.heads import EPSILON, ConvHead, MlpHead
-from pans.trainer.options import AutomatonOptions, Conditions, Options, check_options
-from pans.trainer.train.loop import train
+from pans.base.errors import PansError, UsageError
+from pans.bundle.backends.choose import make_decider
+from pans.bundle.heads.layers import quantise_head
+from pans.bundle.heads.layers import reference_scores as layer_scores
+from pans.bundle.sensor.bundle import Shown, load_bundle
+from pans.instrument.click_law import CountLaw
+from pans.instrument.optics import imaging_of
+from pans.instrument.profile import load_profile
+from pans_trainer.evaluate.accuracy import evaluate_exactly, light_of
+from pans_trainer.evaluate.held_out import HeldOut
+from pans_trainer.evaluate.optics import figures_under, misalignment_curves
+from pans_trainer.export import onnx_heads
+from pans_trainer.export.automaton import export_automaton
+from pans_trainer.export.onnx_heads import fold_normalisation, int8_onnx
+from pans_trainer.export.writer import Description, compare, export, export_trained, reference_scores
+from pans_trainer.model.heads import EPSILON, ConvHead, MlpHead
+from pans_trainer.options import AutomatonOptions, Conditions, Options, check_options
+from pans_trainer.train.automaton.train import train_automaton
+from pans_trainer.train.gradient.loop import train
 
 RNG = np.random.default_rng(0)
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from trainings import random_machine
 
-from pans.runtime.detector import Afterpulses
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.runtime.instrument.click_law import click_probability as reference_probability
-from pans.trainer.adaptive.machine import Sight, forward
-from pans.trainer.evaluate.readings import Chain
-from pans.trainer.model import detection
+from pans.instrument.click_law import ClickLaw
+from pans.instrument.click_law import click_probability as reference_probability
+from pans.instrument.detector import Afterpulses
+from pans_trainer.evaluate.readings import Chain
+from pans_trainer.model import detection
+from pans_trainer.train.automaton.machine import Sight, forward
 
 PLAIN = ClickLaw()
 READ_NOISE = ClickLaw(dark_per_exposure=1.8e-5, read_noise_e=0.2, threshold_e=0.84)

@@ -5,16 +5,16 @@ import pytest
 import torch
 from trainings import random_machine
 
-from pans.runtime.bundle.optics import amplification
-from pans.runtime.imaging import Bleaching, Imaging, bleached, met
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.adaptive.machine import Aim, Sight, backward, forward
-from pans.trainer.model import encoders
-from pans.trainer.model.exposure import exposure_us_of, top_limits
-from pans.trainer.model.field_basis import discriminant_basis, in_pixels
-from pans.trainer.model.imaging import bleached_patterns, through
-from pans.trainer.options import Options
+from pans.bundle.sensor.analyser import amplification
+from pans.instrument.click_law import ClickLaw
+from pans.instrument.optics import Bleaching, Imaging, bleached, met
+from pans.instrument.profile import load_profile
+from pans_trainer.model import encoders
+from pans_trainer.model.exposure import exposure_us_of, top_limits
+from pans_trainer.model.field_basis import discriminant_basis, in_pixels
+from pans_trainer.model.imaging import bleached_patterns, through
+from pans_trainer.options import Options
+from pans_trainer.train.automaton.machine import Aim, Sight, backward, forward
 
 
 def encoder(limits=(0.1, 2.0), seed=0):

@@ -9,9 +9,9 @@ import pytest
 import torch
 from trainings import assert_slope
 
-from pans.runtime.instrument.click_law import ClickLaw, CountLaw, count_chances
-from pans.trainer.model.detection import click_probability, word_probabilities
-from pans.trainer.model.estimators import (
+from pans.instrument.click_law import ClickLaw, CountLaw, count_chances
+from pans_trainer.model.detection import click_probability, word_probabilities
+from pans_trainer.model.estimators import (
     CLICKS,
     ESTIMATORS,
     Readings,
@@ -21,9 +21,9 @@ from pans.trainer.model.estimators import (
     similarity_loss,
     squared_error,
 )
-from pans.trainer.model.heads import MlpHead, new_head
-from pans.trainer.model.ssim import ssim
-from pans.trainer.options import PICTURE_HEADS, Options
+from pans_trainer.model.heads import MlpHead, new_head
+from pans_trainer.model.ssim import ssim
+from pans_trainer.options import PICTURE_HEADS, Options
 
 READ_NOISE = ClickLaw(dark_per_exposure=1.8e-5, read_noise_e=0.2, threshold_e=0.84)
 D_F, N, CLASSES = 4, 6, 3

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from trainings import columns_task
 
-from pans.trainer.options import Options
-from pans.trainer.reproduce import active
-from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
-from pans.trainer.reproduce.printed import ACTIVE, ActiveRow
+from pans_trainer.options import Options
+from pans_trainer.reproduce import active
+from pans_trainer.reproduce.page import Asked, of_table, page_of, write_page
+from pans_trainer.reproduce.printed import ACTIVE, ActiveRow
 
 ROW = ActiveRow(3, 1.5, 9.0, (40.0,) * 4, (1.0,) * 4, (40.0,) * 4, (1.0,) * 4)
 

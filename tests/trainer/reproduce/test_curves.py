@@ -9,12 +9,12 @@ pytest.importorskip("matplotlib", reason="needs the plot extra")
 pytest.importorskip("sklearn", reason="needs the plot extra")
 from trainings import columns_task, short_fits  # noqa: F401 - a fixture
 
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.options import Options
-from pans.trainer.reproduce import curves, readouts, ways
-from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
-from pans.trainer.train.history import follow
-from pans.trainer.train.loop import train
+from pans.instrument.profile import load_profile
+from pans_trainer.options import Options
+from pans_trainer.reproduce import curves, readouts, ways
+from pans_trainer.reproduce.page import Asked, of_table, page_of, write_page
+from pans_trainer.train.gradient.history import follow
+from pans_trainer.train.gradient.loop import train
 
 
 @pytest.fixture(scope="module")

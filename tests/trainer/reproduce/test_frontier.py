@@ -6,16 +6,16 @@ from dataclasses import replace
 import pytest
 from trainings import columns_task
 
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.adaptive import train as adaptive_train
-from pans.trainer.options import METHODS, AutomatonOptions, BaselineOptions, Options, check_options
-from pans.trainer.reproduce import curves, ways
-from pans.trainer.reproduce.curves import EXACT, STOPPING
-from pans.trainer.reproduce.page import Asked, of_table, page_of, read_rows, write_page
-from pans.trainer.reproduce.printed import ACTIVE
-from pans.trainer.reproduce.ways import BY_SENT, Point
-from pans.trainer.tasks.registry import Task
+from pans.bundle.sensor.bundle import load_bundle
+from pans.instrument.profile import load_profile
+from pans_trainer.options import METHODS, AutomatonOptions, BaselineOptions, Options, check_options
+from pans_trainer.reproduce import curves, ways
+from pans_trainer.reproduce.curves import EXACT, STOPPING
+from pans_trainer.reproduce.page import Asked, of_table, page_of, read_rows, write_page
+from pans_trainer.reproduce.printed import ACTIVE
+from pans_trainer.reproduce.ways import BY_SENT, Point
+from pans_trainer.tasks.registry import Task
+from pans_trainer.train.automaton import train as adaptive_train
 
 QUICK = {"exposures": 4, "states": 3, "grow_epochs": 1, "tune_epochs": 1, "epochs": 1, "reroutes": 0}
 SENT = STOPPING + BY_SENT

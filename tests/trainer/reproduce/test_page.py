@@ -6,8 +6,8 @@ import re
 import pytest
 from tree import ROOT
 
-from pans.runtime.errors import UsageError
-from pans.trainer.reproduce.page import (
+from pans.base.errors import UsageError
+from pans_trainer.reproduce.page import (
     NAMES,
     Asked,
     Column,

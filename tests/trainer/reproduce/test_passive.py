@@ -11,20 +11,20 @@ import torch
 from trainings import columns_task
 from tree import ROOT
 
-from pans.runtime.cli import main
-from pans.runtime.cli.command import parser_of
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.commands.train import TRAIN
-from pans.trainer.commands.trainings import fixed_options
-from pans.trainer.device import one_thread
-from pans.trainer.model.heads import MlpHead
-from pans.trainer.options import Options
-from pans.trainer.reproduce import passive, scenes
-from pans.trainer.reproduce.page import Asked, page_of, write_page
-from pans.trainer.reproduce.printed import PASSIVE, recipe
-from pans.trainer.tasks.registry import Objects, Task, draw_task
-from pans.trainer.train import exact_search
-from pans.trainer.train.data import TrainingData
+from pans.app.command import parser_of
+from pans.app.main import main
+from pans.instrument.profile import load_profile
+from pans_trainer.commands.train import TRAIN
+from pans_trainer.commands.trainings import fixed_options
+from pans_trainer.device import one_thread
+from pans_trainer.model.heads import MlpHead
+from pans_trainer.options import Options
+from pans_trainer.reproduce import passive, scenes
+from pans_trainer.reproduce.page import Asked, page_of, write_page
+from pans_trainer.reproduce.printed import PASSIVE, recipe
+from pans_trainer.tasks.registry import Objects, Task, draw_task
+from pans_trainer.train.gradient import exact_search
+from pans_trainer.train.gradient.data import TrainingData
 
 CELLS = PASSIVE["cells"].rows[0]
 CURVE = [

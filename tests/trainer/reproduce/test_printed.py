@@ -2,10 +2,10 @@
 
 import pytest
 
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.options import check_options
-from pans.trainer.reproduce import active, curves, passive, sequence
-from pans.trainer.reproduce.printed import ACTIVE, PASSIVE, recipe
+from pans.instrument.profile import load_profile
+from pans_trainer.options import check_options
+from pans_trainer.reproduce import active, curves, passive, sequence
+from pans_trainer.reproduce.printed import ACTIVE, PASSIVE, recipe
 
 IDEAL = load_profile("ideal")
 

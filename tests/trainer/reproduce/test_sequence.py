@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pans.trainer.reproduce import sequence
-from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
-from pans.trainer.tasks.registry import Objects
+from pans_trainer.reproduce import sequence
+from pans_trainer.reproduce.page import Asked, of_table, page_of, write_page
+from pans_trainer.tasks.registry import Objects
 
 
 def test_a_window_moves_down_from_field_to_field():

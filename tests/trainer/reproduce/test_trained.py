@@ -8,15 +8,15 @@ import pytest
 from bundles import made_bundle
 from heads import onnx_chain
 
-from pans.runtime.bundle.layers import Layer
-from pans.runtime.bundle.model import load_bundle, write_bundle
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate.accuracy import decision_shares, evaluate_exactly, light_of
-from pans.trainer.options import plain_options
-from pans.trainer.reproduce import active, trained
-from pans.trainer.reproduce.page import Asked, of_table, page_of, write_page
-from pans.trainer.reproduce.printed import ACTIVE
-from pans.trainer.tasks.registry import Objects, Task
+from pans.bundle.heads.layers import Layer
+from pans.bundle.sensor.bundle import load_bundle, write_bundle
+from pans.instrument.profile import load_profile
+from pans_trainer.evaluate.accuracy import decision_shares, evaluate_exactly, light_of
+from pans_trainer.options import plain_options
+from pans_trainer.reproduce import active, trained
+from pans_trainer.reproduce.page import Asked, of_table, page_of, write_page
+from pans_trainer.reproduce.printed import ACTIVE
+from pans_trainer.tasks.registry import Objects, Task
 
 CLASSES = ("T-shirt/top", "Trouser", "Pullover", "Dress", "Coat", "Sandal", "Shirt", "Sneaker", "Bag", "Ankle boot")
 

@@ -8,8 +8,8 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 
 import numpy as np
 
-from pans.trainer.tasks.changes import Variation, distorted, enlarged, shifted, varied, with_copies
-from pans.trainer.tasks.registry import Objects, Task
+from pans_trainer.tasks.changes import Variation, distorted, enlarged, shifted, varied, with_copies
+from pans_trainer.tasks.registry import Objects, Task
 
 
 def objects(n: int, side: int = 28) -> Objects:

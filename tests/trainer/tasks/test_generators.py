@@ -5,11 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from pans.trainer.tasks import barcode as task_barcode
-from pans.trainer.tasks import draw, fields
-from pans.trainer.tasks.draw import CHUNK
-from pans.trainer.tasks.generators import GENERATORS
-from pans.trainer.tasks.registry import draw_task, load_task
+from pans_trainer.tasks import barcode as task_barcode
+from pans_trainer.tasks import draw, fields
+from pans_trainer.tasks.draw import CHUNK
+from pans_trainer.tasks.generators import GENERATORS
+from pans_trainer.tasks.registry import draw_task, load_task
 
 SCENES = [name for name in GENERATORS if name != "barcode"]
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pans.runtime.bundle.optics import phase_mask, scatter
-from pans.runtime.errors import DamagedFileError, PansError, UsageError
-from pans.trainer.tasks import registry as tasks
-from pans.trainer.tasks.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
-from pans.trainer.tasks.registry import FIBRE_TASKS, fold_tasks, load_task, path_from, remembered_task, task_names
+from pans.base.errors import DamagedFileError, PansError, UsageError
+from pans.bundle.sensor.analyser import phase_mask, scatter
+from pans_trainer.tasks import registry as tasks
+from pans_trainer.tasks.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
+from pans_trainer.tasks.registry import FIBRE_TASKS, fold_tasks, load_task, path_from, remembered_task, task_names
 
 RNG = np.random.default_rng(0)
 
@@ -203,7 +203,7 @@ def test_public_sets_are_the_pinned_ones(name, data_dir):
 def test_a_lab_s_own_task_is_found_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "labtask.py").write_text(
         "import numpy as np\n"
-        "from pans.trainer.tasks.registry import Objects, Task\n"
+        "from pans_trainer.tasks.registry import Objects, Task\n"
         "def make(seed, top=1):\n"
         "    part = Objects(np.full((4, 3, 5), seed, np.uint8), np.array([0, 1, 0, top]))\n"
         "    return Task('lab', ('a', 'b'), part, part, '0' * 64, 'by hand')\n"
@@ -275,7 +275,7 @@ def test_the_speckle_by_the_definition_of_the_fourier_transform():
 
 def test_the_release_normalises_every_batch_by_itself():
     pytest.importorskip("torch", reason="needs the train extra")
-    from pans.trainer.reproduce.passive import release_intensity
+    from pans_trainer.reproduce.passive import release_intensity
 
     batched = release_intensity(IMAGES, batch=2)
     for start in (0, 2, 4):

@@ -1,1 +1,0 @@
-../../runtime/api/__init__.py

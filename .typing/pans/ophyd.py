@@ -1,1 +1,0 @@
-../../runtime/api/ophyd.py

@@ -1,1 +1,0 @@
-../../tests/runtime/typed_use.py

@@ -1,5 +1,0 @@
-"""Speed beside error. Each benchmark is an entry point (`pans.benches`): `BenchOptions` in, rows out. Begin with `rows.py`."""
-
-from .rows import BenchOptions, Row
-
-__all__ = ["BenchOptions", "Row"]

@@ -1,0 +1,69 @@
+"""The machine below Python: compiled kernels and real-time privileges.
+
+jit.py has the decorators of kernels and their cache, jit_bytes.py bytes in kernels, realtime.py the priority of a process.
+"""
+
+from typing import TYPE_CHECKING
+
+from pans.base import loaded_later
+
+from .realtime import (
+    FIFO_PRIORITY,
+    GRANTED,
+    ThreadCounts,
+    arm_realtime,
+    bound,
+    busy_core,
+    check_core,
+    cores_of,
+    fault_words,
+    first_line,
+    held_heap,
+    isolated_cores,
+    lacking,
+    load_average,
+    locked_memory,
+    scheduled,
+    shallow_idle,
+    steal_ms,
+    usable_cores,
+)
+
+if TYPE_CHECKING:
+    from .jit import FOLDER, inner, kernel_folder, njit, outer
+    from .jit_bytes import as_float32, bare, copy_span, load4, load8, spin
+
+__all__ = [
+    "FIFO_PRIORITY",
+    "FOLDER",
+    "GRANTED",
+    "ThreadCounts",
+    "arm_realtime",
+    "as_float32",
+    "bare",
+    "bound",
+    "busy_core",
+    "check_core",
+    "copy_span",
+    "cores_of",
+    "fault_words",
+    "first_line",
+    "held_heap",
+    "inner",
+    "isolated_cores",
+    "kernel_folder",
+    "lacking",
+    "load4",
+    "load8",
+    "load_average",
+    "locked_memory",
+    "njit",
+    "outer",
+    "scheduled",
+    "shallow_idle",
+    "spin",
+    "steal_ms",
+    "usable_cores",
+]
+
+__getattr__ = loaded_later(__name__, "jit", "jit_bytes")

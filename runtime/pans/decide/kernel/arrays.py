@@ -1,0 +1,95 @@
+"""The arrays of the kernel: what goes into a call, what both ends keep, and the rings that a call fills."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+OVERSLEPT_NS = 500_000  # a timer that fires later than this was not the timer's fault
+
+U8 = npt.NDArray[np.uint8]
+I64 = npt.NDArray[np.int64]
+
+# control, int64 (N_CONTROL,). What the caller sets: the descriptor, and whether it is read (0: what is decoded already, and no more);
+# until when, how long after a block the next one is overdue (0: nobody asks), how long bytes are waited for awake at first, how many
+# messages may come; whether a stream is open, whether SHOW is sent, whether commands wait in the session; most rows of one block;
+# waits that lie closer together are one
+FD, READS, DUE_NS, PATIENCE_NS, EAGER_NS, BUDGET, OPEN, DRIVES, WAITING, BLOCK_ROWS, FLOOR_NS = range(11)
+STOP = 11  # a flag that anybody may set: the call ends
+# what both ends keep: the next decoded body and how many there are, when they were read, when a block came last; the session's
+# window of commands (next id, the oldest without an answer, since when that counts); what SHOW named last
+PLACE, N_BODIES, ARRIVAL_NS, BLOCK_NS, NEXT_ID, OLDEST_ID, OLDEST_NS, SENT_EXPOSURE, SENT_STATE = range(12, 21)
+# of bytes that were read elsewhere: the next read, and where it begins
+NEXT_READ, READ_AT = range(21, 23)
+# the id of the first command that this call may send; whether a pulse is asked for, so that the call ends with the bytes read so far
+FIRST_ID, URGENT = range(23, 25)
+ADDS = 25  # set by the caller: the rings are filled behind what the last call brought
+# where the rings of waits and of arrivals stood when the call began: those before may have been looked at
+FIRST_NOTE, FIRST_ARRIVAL = range(26, 28)
+# what a call reports: errno, bytes of the last command that were not sent, when anything of the session came last, and up to where each
+# ring is used
+ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(28, 39)
+
+# steps, int64 (n, N_STEP): one for each block
+ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)
+# messages, answers and shows, int64 (n, 4): where a body (of `shows`: a frame) stands in `kept`, the time at which it came or left, and
+# its type (of `shows`: the arrival that it answers; of `answers` REFUSAL where a SHOW was refused)
+BEGIN, END, TIME, WHAT = range(4)
+REFUSAL = -1
+
+ALL_TAKEN, DUE, FULL, ODD, GONE, SIGNALLED, BROKEN = range(7)  # why a call ended
+WHY = ("all taken", "due", "full", "odd", "gone", "signalled", "broken")
+
+KEPT_BYTES = 1 << 20
+MANY = 4096  # messages of one call: no more objects than marks are remembered (still/kernels.MARK_SLOTS)
+SHOW_BYTES = 64  # a SHOW command on the wire is shorter
+
+
+class Rings(NamedTuple):
+    """What a call fills: bytes as they came (bodies) and left (frames), uint8 (KEPT_BYTES,), and the rings of int64."""
+
+    kept: U8
+    steps: I64
+    messages: I64
+    answers: I64
+    shows: I64
+    notes: I64  # (n, 4): waits for bytes: began, asked until, ended
+    arrivals: I64
+
+
+class Decoder(NamedTuple):
+    """The arrays of a wire.framing.FrameDecoder."""
+
+    buffer: U8
+    bodies: I64
+    tally: I64
+
+
+class Drive(NamedTuple):
+    """What names the next state of a walk: by slot the steps before it, the slots of the steps, and the tails of SHOW by state.
+
+    `plain` is a SHOW command without its COBS, header and opcode set; arrays of length 0 where the host does not drive. `sizes` int64
+    (2,): slots of a cycle, walks of an object.
+    """
+
+    next_step: I64
+    slot_of: I64
+    tails: U8
+    plain: U8
+    sizes: I64
+
+
+def make_rings() -> Rings:
+    """Return rings in memory that has been touched."""
+    kept: U8 = np.full(KEPT_BYTES, 1, np.uint8)
+    messages, answers, shows, notes = (np.full((MANY, 4), 1, np.int64) for _ in range(4))
+    steps, arrivals = np.full((MANY, N_STEP), 1, np.int64), np.full(MANY, 1, np.int64)
+    return Rings(kept, steps, messages, answers, shows, notes, arrivals)
+
+
+def no_drive() -> Drive:
+    """Return the drive of a run that the host does not drive."""
+    nothing: I64 = np.zeros(0, np.int64)
+    return Drive(nothing, nothing, np.zeros((0, 0), np.uint8), np.zeros(0, np.uint8), np.ones(2, np.int64))

@@ -1,0 +1,375 @@
+"""`Kernel`: the calls of one connection's kernel, from bytes to rows; `StreamCore` does without a live run.
+
+`run` and `feed` say why a call ended; what came stands in properties that are valid until the next call. A replay, the benches and the
+tests drive a core by `StreamCore`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from pans.bundle.backends import Decider
+from pans.decide.decision import DECISION_DTYPE, CoreEvent, Output
+from pans.decide.plan.plan import Plan
+from pans.decide.still import kernels as core_kernels
+from pans.decide.still.core import Core
+from pans.decide.still.kernel_state import CoreState
+from pans.decide.still.kernels import DecisionTables
+from pans.protocol.session import STREAM_TYPES
+from pans.protocol.wire import CHUNK_BYTES, MARK_DTYPE, Frame, FrameDecoder, Messages, MessageType, unpack_body
+from pans.protocol.wire import kernels as place
+
+from . import arrays as ring
+from .arrays import I64, U8, Decoder, Drive, Rings, make_rings, no_drive
+
+NO_END = 1 << 62
+Bytes = bytes | bytearray | memoryview | U8
+
+
+class Limits(NamedTuple):
+    """When a call ends though all is ordinary: see state.py's control for the columns."""
+
+    due_ns: int = NO_END
+    patience_ns: int = 0
+    eager_ns: int = 0
+    budget: int = NO_END
+    floor_ns: int = 0
+
+
+class Counts(NamedTuple):
+    """What a call reports, in the order of state.py's control; `rows` of decisions beside it."""
+
+    errno: int
+    unsent: int
+    heard_ns: int
+    steps: int
+    messages: int
+    answers: int
+    shows: int
+    notes: int
+    arrivals: int
+    kept: int
+    rows: int
+
+
+class Steps(Protocol):
+    """The compiled steps of a core (still/kernel_state.CoreState, flow/core.FlowCore): they lend its state to kernels and take it back.
+
+    `walk` is a tuple of arrays of its own class, for which receive.py chooses the kernel; its `state` begins with the columns of
+    decide/still/kernels.py, its `rows` are decisions. `block_rows` are most of one block. `takes`: messages may be
+    taken now; `decides`: the kernel gives each label at once.
+    """
+
+    @property
+    def walk(self) -> Any: ...
+
+    @property
+    def takes(self) -> bool: ...
+
+    @property
+    def decides(self) -> bool: ...
+
+    @property
+    def block_rows(self) -> int: ...
+
+    def load(self) -> None: ...
+
+    def store(self) -> None: ...
+
+    def rows(self, first: int, stop: int) -> npt.NDArray[np.void]: ...
+
+
+NO_LIMITS = Limits()
+_NOTHING = Counts._make([0] * len(Counts._fields))
+
+
+class Kernel:
+    """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming.
+
+    `rows`, `blocks`, `messages` and the like give what lies from `begin` to `end`: after `run` all that came. After `run` with `more` the
+    new part lies behind `end` until `look` moves `end`; `done` moves `begin` to `end`.
+    """
+
+    def __init__(self, steps: Steps, decoder: FrameDecoder, drive: Drive | None = None) -> None:
+        from .receive import turn  # numba is loaded only by who decides in bulk
+
+        self.steps, self.decoder = steps, decoder
+        self.rings: Rings = make_rings()
+        self.said = self.begin = self.end = _NOTHING
+        self._kernel = turn
+        self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
+        self._drive = no_drive() if drive is None else drive
+        self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
+        self.state: I64 = steps.walk.state
+        self.control[ring.FD] = -1
+        self.control[ring.BLOCK_ROWS] = steps.block_rows
+        self.control[ring.SENT_EXPOSURE] = self.control[ring.SENT_STATE] = -1
+        self._scratch: I64 = np.zeros(4, np.int64)
+        self._decoder = Decoder(*decoder.arrays)
+        self._walk = steps.walk
+
+    def warm_up(self) -> None:
+        """Compile or load the kernels, before arming; nothing is read and nothing changes."""
+        self.run()
+
+    def drives(self, drive: Drive) -> None:
+        """Name the states of walks by `drive` from here on."""
+        self._drive = drive
+
+    def run(self, fd: int = -1, limits: Limits = NO_LIMITS, *, more: bool = False) -> int:
+        """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY).
+
+        With `more` the rings are filled behind what the last call brought, which stays where it is.
+        """
+        return self._call(self._nothing, fd, limits, more)
+
+    def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits, more: bool = False) -> int:
+        self._prepare(fd, limits, more)
+        ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
+        before = self.said.messages if more else 0
+        self.said = Counts._make((*self.control[ring.ERRNO :].tolist(), int(self.state[core_kernels.N_ROWS])))
+        if not more:
+            self.begin, self.end = _NOTHING, self.said
+        if self.said.messages > before:
+            self.steps.store()
+        return int(ended)
+
+    def look(self) -> Counts:
+        """Move `end` behind all that came, and return it."""
+        self.end = self.said
+        return self.end
+
+    def done(self) -> None:
+        """Move `begin` to `end`: all up to there is settled."""
+        self.begin = self.end
+
+    @property
+    def holds(self) -> bool:
+        """Whether something lies behind `begin`: the next call must add to it."""
+        return (self.said.kept, self.said.arrivals) > (self.begin.kept, self.begin.arrivals)
+
+    def _prepare(self, fd: int, limits: Limits, more: bool) -> None:
+        control, steps = self.control, self.steps
+        if fd >= 0:
+            control[ring.FD] = fd
+        control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
+        control[ring.FLOOR_NS] = limits.floor_ns
+        control[ring.OPEN] = steps.takes
+        control[ring.ADDS] = more
+        if more:  # what came before is stored
+            self.state[place.MESSAGES] = self.state[place.EXPOSURES] = 0
+        else:
+            steps.load()
+
+    def feed(self, chunks: Sequence[tuple[int, Bytes]]) -> int:
+        """Take what was read elsewhere: one read or more, each with the time at which it came.
+
+        Returns why it ended; `feed_on` goes on behind what ended it, until ALL_TAKEN.
+        """
+        times_ns, datas = zip(*chunks)
+        if max(map(len, datas)) > CHUNK_BYTES:
+            return self.feed([(at_ns, piece) for at_ns, data in chunks for piece in self.decoder.pieces(bytes(data))])
+        reads = np.empty((len(datas), 2), np.int64)
+        reads[:, 0], reads[:, 1] = tuple(map(len, datas)), times_ns
+        self._fed = np.frombuffer(bytearray().join(datas), np.uint8), reads  # put together once, and writable
+        self.control[ring.NEXT_READ : ring.READ_AT + 1] = 0
+        self.control[ring.FD] = -1  # what is sent, the caller sends
+        return self.feed_on()
+
+    def feed_on(self) -> int:
+        """Go on with what `feed` was given."""
+        return self._call(self._fed, -1, NO_LIMITS)
+
+    def hold(self, messages: Messages) -> None:
+        """Take bodies of a recording, by `run`, until all are taken."""
+        buffer = messages.buffer if messages.buffer.flags.writeable else messages.buffer.copy()
+        self._decoder = Decoder(buffer, messages.spans, self._decoder.tally)
+        self.control[ring.PLACE : ring.ARRIVAL_NS + 1] = (0, len(messages.spans), 0)
+
+    def stop(self) -> None:
+        """End a call that is under way in another thread, and those that follow, at once."""
+        self.control[ring.STOP] = 1
+
+    # -- what came -----------------------------------------------------------------------------------------------------
+
+    @property
+    def arrival_ns(self) -> int:
+        """When the bytes were read that were decoded last."""
+        return int(self.control[ring.ARRIVAL_NS])
+
+    @property
+    def odd_type(self) -> int:
+        """The type of the message that ended the call."""
+        return int(self._decoder.buffer[self._decoder.bodies[int(self.control[ring.PLACE]), 0]])
+
+    def take_odd(self) -> Frame:
+        """Return the message that ended the call as a frame; the next call begins behind it."""
+        decoder, place = self._decoder, int(self.control[ring.PLACE])
+        first, stop = decoder.bodies[place].tolist()
+        self.control[ring.PLACE] += 1
+        return unpack_body(decoder.buffer[first:stop].tobytes())
+
+    @property
+    def rows(self) -> npt.NDArray[np.void]:
+        """The decisions of the call, DECISION_DTYPE (n,), in order."""
+        return self.steps.rows(self.begin.rows, self.end.rows)
+
+    @property
+    def rows_by_block(self) -> I64:
+        """How many decisions each of `blocks` gave, int64 (n,)."""
+        return np.diff(self.blocks[:, ring.ROWS], prepend=self.begin.rows)
+
+    @property
+    def blocks(self) -> I64:
+        """When each block came, was decoded, decided and kept, and what had come up to it: state.py's steps (n, N_STEP)."""
+        return self.rings.steps[self.begin.steps : self.end.steps]
+
+    @property
+    def messages(self) -> I64:
+        """Where the stream messages of the call stand in `kept`: state.py's spans (n, 4)."""
+        return self.rings.messages[self.begin.messages : self.end.messages]
+
+    @property
+    def answers(self) -> I64:
+        """Where the acknowledgements stand in `kept`."""
+        return self.rings.answers[self.begin.answers : self.end.answers]
+
+    @property
+    def shows(self) -> I64:
+        """Where the commands stand in `kept` that were sent."""
+        return self.rings.shows[self.begin.shows : self.end.shows]
+
+    @property
+    def notes(self) -> I64:
+        """The waits for bytes: state.py's notes (n, 4)."""
+        return self.rings.notes[self.begin.notes : self.end.notes]
+
+    @property
+    def arrivals(self) -> I64:
+        """When bytes were read, int64 (n,)."""
+        return self.rings.arrivals[self.begin.arrivals : self.end.arrivals]
+
+    @property
+    def kept(self) -> U8:
+        """The bytes that `messages`, `answers` and `shows` speak of."""
+        return self.rings.kept
+
+    def bytes_of(self, span: npt.NDArray[Any]) -> bytes:
+        """Return what stands at one row of `messages`, `answers` or `shows`."""
+        return self.kept[int(span[ring.BEGIN]) : int(span[ring.END])].tobytes()
+
+    def heads(self, kind: MessageType, dtype: npt.DTypeLike) -> tuple[I64, npt.NDArray[np.void]]:
+        """Return the spans of the messages of one kind, in order, and what each begins with: rows of `dtype`, BLOCK_DTYPE or MARK_DTYPE."""
+        spans = self.messages[self.messages[:, ring.WHAT] == int(kind)]
+        kept, size = self.rings.kept.data, np.dtype(dtype).itemsize
+        return spans, np.frombuffer(b"".join([kept[at : at + size] for at in spans[:, ring.BEGIN].tolist()]), dtype)
+
+    def marks(self) -> npt.NDArray[np.void]:
+        """Return the marks among `messages`, MARK_DTYPE (n,), in order."""
+        return self.heads(MessageType.MARK, MARK_DTYPE)[1]
+
+
+_CORE_TYPES = STREAM_TYPES | {MessageType.STATUS, MessageType.EXPOSED}
+_NO_ROWS: npt.NDArray[np.void] = np.zeros(0, DECISION_DTYPE)
+
+
+class Batch(NamedTuple):
+    """Rows (n,) of DECISION_DTYPE, valid until the next batch, events, and the frames that are not the core's alone."""
+
+    rows: npt.NDArray[np.void]
+    events: Sequence[CoreEvent] = ()
+    others: Sequence[Frame] = ()
+
+
+class StreamCore:
+    """A decoder and a core, for the session `session`; all memory is allocated here, before arming."""
+
+    def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, session: int) -> None:
+        self._take_over(Core(plan, decider, shots, n_cycles), session)
+
+    @classmethod
+    def of(cls, core: Core, session: int) -> StreamCore:
+        """Return one for a core that exists."""
+        streamed = cls.__new__(cls)
+        streamed._take_over(core, session)
+        return streamed
+
+    def _take_over(self, core: Core, session: int) -> None:
+        self.core, self.decoder, self.wrong_session, self._session = core, FrameDecoder(), 0, session
+        self.turn = Kernel(core.steps(session), self.decoder)
+
+    @property
+    def tables(self) -> DecisionTables:
+        """What decides without asking the back end."""
+        steps = self.core.steps(self._session)
+        assert isinstance(steps, CoreState)
+        return steps.tables
+
+    def warm_up(self) -> None:
+        """Compile or load every kernel of the path, before arming."""
+        self.core.windows.warm_up()
+        self.turn.warm_up()
+
+    def follow(self, session: int) -> None:
+        """Take messages of `session`, which the core has begun."""
+        self._session = session
+        self.core.steps(session)
+
+    def begin(self, session: int, start_tick: int, n_cycles: int) -> Iterator[Batch]:
+        """Follow the stream that an ARM starts in `session`; what the one before left open is yielded."""
+        output = self.core.begin(start_tick, n_cycles)
+        self.follow(session)
+        yield from _batches(output)
+
+    def end(self) -> Iterator[Batch]:
+        """End the stream, and yield what it leaves open."""
+        yield from _batches(self.core.end())
+
+    def feed(self, data: Bytes) -> Iterator[Batch]:
+        """Take bytes as they arrived, whatever they hold; the iterator must be used up."""
+        for first in range(0, len(data), CHUNK_BYTES):
+            yield from self._continue(self.turn.feed([(0, data[first : first + CHUNK_BYTES])]), self.turn.feed_on)
+
+    def listen(self, fd: int, limits: Limits) -> Iterator[Batch]:
+        """Take what comes from a descriptor until `limits`, or until the other end has closed it; the iterator must be used up."""
+        yield from self._continue(self.turn.run(fd, limits), self.turn.run)
+
+    def replay(self, messages: Messages) -> Iterator[Batch]:
+        """Take recorded messages; the iterator must be used up. `others` has those of another session, for the caller to take."""
+        self.turn.hold(messages)
+        yield from self._continue(self.turn.run(), self.turn.run)
+
+    def _continue(self, ended: int, again: Callable[[], int]) -> Iterator[Batch]:
+        """Yield what a call of the kernel brought, and take what ended it, until nothing is left."""
+        while True:
+            rows = self.turn.rows
+            self.core.remember_rows(self.turn.marks())
+            if len(rows):
+                yield Batch(rows)
+            if ended == ring.ODD:
+                yield from self._take_one(self.turn.take_odd())
+            elif ended != ring.FULL:
+                return
+            self.core.steps(self._session)
+            ended = again()
+
+    def _take_one(self, frame: Frame) -> Iterator[Batch]:
+        """Let the core take a message that is not ordinary: one out of order, with a gap before it, or no block at all."""
+        if frame.session != self._session:
+            self.wrong_session += 1
+            yield Batch(_NO_ROWS, (), [frame])
+        elif frame.type not in _CORE_TYPES:
+            yield Batch(_NO_ROWS, (), [frame])
+        else:
+            yield from _batches(self.core.step(frame))
+            if frame.type == MessageType.STATUS:
+                yield Batch(_NO_ROWS, (), [frame])
+
+
+def _batches(output: Output) -> Iterator[Batch]:
+    if output.decisions or output.events:
+        yield Batch(np.array(output.decisions, DECISION_DTYPE), output.events)

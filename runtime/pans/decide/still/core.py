@@ -1,0 +1,195 @@
+"""The deterministic core: one stream frame in, decisions and events out; no I/O, no clock, no randomness.
+
+A live run, a replay and a simulation all drive this class with the same frames, so that a recording gives the same decisions bit
+for bit. `Core.step` returns an `Output`; a window that overlaps a gap gives a decision that is flagged and abstains, never a guess.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.bundle.backends import NO_LABEL, Decider
+from pans.decide.dark.guard import DarkGuard, cut_out
+from pans.decide.dark.health import Finding, any_click
+from pans.decide.decision import Decision, DecisionFlag, Output
+from pans.decide.follower import ANY_CLASS, Follower, Place
+from pans.decide.plan.plan import Plan
+from pans.protocol.wire import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark
+
+from .kernel_state import CoreState, IdleSteps
+from .windows import DecisionWindows, Window
+
+NO_FLAGS = DecisionFlag(0)
+_NOT_MEASURED = int(DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN)
+
+
+class Core(Follower):
+    """Stream tracker, windows and back end joined up, for objects that stand still."""
+
+    def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, guard: DarkGuard | None = None) -> None:
+        super().__init__(plan, n_cycles, decider.n_classes or ANY_CLASS)  # 0: pictures
+        self.guard = guard  # of the dark counts; None: they are only added up
+        self.windows = DecisionWindows(plan, decider.n_features, shots)
+        self.shots = shots
+        self.decider = decider
+        self._visits_before = 0  # in streams that have ended
+        self._bulk: CoreState | None = None
+        self._session_known = False  # to it
+
+    @property
+    def tallies(self) -> NDArray[np.int64]:
+        """Dark exposures, dark clicks and wrong patterns, int64 (window.N_TALLIES,)."""
+        return self.windows.tallies
+
+    def warm_up(self) -> None:
+        """Run every compiled kernel of the hot path once, before arming."""
+        self.windows.warm_up()
+        if self.guard is not None:
+            self.guard.warm_up()
+
+    @property
+    def takes(self) -> bool:
+        """Whether the kernel may take messages: exposures are clicks, not numbers, and no guard changes decisions."""
+        return self.plan.largest == 1 and (self.guard is None or self.guard.policy == "warn")
+
+    def steps(self, session: int) -> CoreState | IdleSteps:
+        """See Follower."""
+        if not self.takes:
+            return super().steps(session)
+        if self._bulk is None:
+            self._bulk = CoreState(self, self.windows, self.plan, self.decider, self.shots)
+        if not self._session_known:
+            self._bulk.begin(session)
+            self._session_known = True
+        return self._bulk
+
+    def remember(self, mark: Mark) -> None:
+        """See Follower."""
+        super().remember(mark)
+        if self._bulk is not None:
+            self._bulk.remember(mark)
+
+    def begin(self, start_tick: int, n_cycles: int) -> Output:
+        """See Follower."""
+        self._session_known = False
+        return super().begin(start_tick, n_cycles)
+
+    def part(self) -> Place | None:
+        """See Follower."""
+        self._session_known = False  # of the marks that are forgotten here the kernel must not know either
+        return super().part()
+
+    def watch_blocks(
+        self, stamps: NDArray[np.uint16], bits: NDArray[np.uint8], first: int, rows: NDArray[np.void]
+    ) -> list[Finding]:
+        """Let the guard, which only warns, see exposures from `first` on that kernels have taken, and their decisions."""
+        if self.guard is None:
+            return []
+        block = ClickBlock(0, 0, 0, first, 0, self.windows.position[2], stamps, bits)
+        events = self.guard.take(block)
+        measured = rows["flags"] & _NOT_MEASURED == 0
+        self.guard.take_objects(rows["clicks"][measured, None] > 0, rows["object"][measured])
+        return events
+
+    def watch_frames(self, words: NDArray[np.uint8], heads: NDArray[np.void]) -> list[Finding]:
+        """As `watch_blocks` for blocks of frames that follow one another: words uint8 (frames, bytes), heads BLOCK_DTYPE (blocks,).
+
+        Of each object the guard sees which channels have clicked in lit frames.
+        """
+        assert self.guard is not None
+        first = int(heads["exposure_index"][0])
+        events = self.guard.take(FrameBlock(0, 0, 0, first, 0, self.windows.position[2], words))
+        lit = cut_out(self.windows.lit, first, len(words))
+        begins = np.cumsum(heads["count"], dtype=np.int64) - heads["count"]
+        some = np.logical_or.reduceat(lit, begins)
+        seen = any_click(words, begins, lit)[some]
+        clicked = np.unpackbits(seen, axis=1, count=self.plan.n_patterns, bitorder="little").view(np.bool_)
+        self.guard.take_objects(clicked, heads["object_index"][some])
+        return events
+
+    def cycles_left(self, n_cycles: int) -> int:
+        """Return how many of a whole run's `n_cycles` cycles stand out when the visit under way is given up."""
+        return n_cycles - (self._visits_before + self.windows.visits_begun) * self._cycles_per_object
+
+    def _fits(self, block: ClickBlock | FrameBlock) -> bool:
+        return self.windows.fits(block)
+
+    def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
+        decisions = []
+        events = [] if self.guard is None else self.guard.take(block)
+        for window in self.windows.push(block):
+            before_end = (block.exposure_index + n_exposures - 1 - window.last_exposure) * block.period_ticks
+            decisions.append(self._decide(window, end_tick - before_end))
+        return Output(decisions, events, None)
+
+    def _skip_to(self, exposure_index: int, tick: int) -> Output:
+        return Output([self._decide(window, tick) for window in self.windows.skip_to(exposure_index)], [], None)
+
+    def _give_up(self) -> Output:
+        self._visits_before += self.windows.visits_begun
+        if self.guard is not None:
+            self.guard.restart()
+        windows = self.windows.restart()
+        decisions = [self._decide(window, self.last_tick, DecisionFlag.INCOMPLETE) for window in windows]
+        return Output(decisions, [], None)
+
+    def _place(self) -> dict[str, Any] | None:
+        if self.guard is not None and self.guard.policy != "warn":
+            return None  # what it has learnt decides too
+        return None if self.windows.half_seen else {"windows": list(self.windows.position)}
+
+    def _go_on_from(self, place: dict[str, Any]) -> None:
+        visit, next_window, number = place["windows"]
+        self.windows.position = (int(visit), int(next_window), int(number))
+
+    def _nothing_left(self) -> bool:
+        return self.windows.visits_begun * self.windows.visit_exposures >= self.end_exposure
+
+    def _decide(self, window: Window, tick: int, flags: DecisionFlag = NO_FLAGS) -> Decision:
+        label, probability = NO_LABEL, 0.0
+        if window.missing:
+            flags |= DecisionFlag.GAP
+        if window.wrong:
+            flags |= DecisionFlag.WRONG_PATTERN
+        if flags:
+            flags |= DecisionFlag.ABSTAINED
+        elif self.guard is not None:
+            self.guard.take_object(window.counts, window.object_index)
+        decider = self.decider
+        if self.guard is not None:
+            flags |= self.guard.flags
+            decider = self.guard.decider(decider)
+        if flags & DecisionFlag.ABSTAINED:
+            self.n_abstained += 1
+        else:
+            label, probability = decider.decide(window.counts, self.shots)
+            if self.guard is not None:
+                self.guard.count_word(window.counts)
+            if not probability > 0:  # the scores were not finite: their label means nothing
+                flags |= DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
+                label, probability = NO_LABEL, 0.0
+                self.n_abstained += 1
+            elif label == NO_LABEL:
+                flags |= DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED
+                self.n_abstained += 1
+        mark = self.marks.get(window.object_index)
+        decision = Decision(
+            number=self.n_decisions,
+            tick=tick,
+            exposure_index=window.last_exposure,
+            object=window.object_index,
+            shot=window.first_shot,
+            clicks=int(window.counts.sum()),
+            label=label,
+            truth=UNKNOWN_TRUTH if mark is None or window.object_index == NO_OBJECT else mark.truth,
+            flags=int(flags),
+            probability=probability,
+            counts_crc=zlib.crc32(window.counts.tobytes()),
+            exposures=window.exposures,
+        )
+        self.n_decisions += 1
+        return decision

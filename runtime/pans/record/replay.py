@@ -1,0 +1,319 @@
+"""A recording decided again: from its raw messages to decisions, with the same core as in the live run.
+
+`replay` returns the number of decisions, the hash of their log, which is the recorded one when nothing has changed, and how far they
+agree with a recording that was cut off. A `ClickLog` notes the clicks behind each decision on the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.base.console import html_card
+from pans.base.errors import DamagedFileError, UsageError
+from pans.base.files import likeness, npz_bytes, scene_arrays, shipped_scene, write_file
+from pans.bundle.backends import Decider, PictureDecider, Verdict, Verdicts, make_decider, verdicts_of
+from pans.bundle.sensor import Bundle
+from pans.decide import DECISION_DTYPE, Decision, DecisionFlag, Follower, Place, exposure_timing
+from pans.decide.dark import recorded_guard
+from pans.decide.flow import FlowCore, PassageFigures, recorded_flow_core, replayed_figures
+from pans.decide.kernel import StreamCore
+from pans.decide.still import Core
+from pans.instrument.profile import parse_profile
+from pans.protocol.wire import Arm, Frame, MalformedMessage, MessageType, announces_exposed, decode_welcome, unpack_body
+from pans.record.reading.decision_log import LogEncoder
+from pans.record.reading.parts import JoinedRecording, place_of
+from pans.record.reading.recording import Recording
+from pans.record.reading.sent_plan import SHOTS, TICK_HZ, Sent, automaton_of, never_armed, sent_to_device, walk_dose
+
+ASKED = DecisionFlag.NOT_FINITE | DecisionFlag.AMBIGUOUS  # abstained after the back end had been asked
+# what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
+_NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, MalformedMessage)
+
+
+class ClickLog:
+    """Stands between a core and its back end, whichever, and remembers the clicks of every decision that it is asked for."""
+
+    def __init__(self) -> None:
+        self.counts: list[NDArray[np.int64]] = []
+        self.decisions: list[Decision] = []
+        self.shots = 1
+
+    def over(self, decider: Decider) -> Decider:
+        """Return the back end that the core is to ask."""
+        self._back_end = decider
+        for name in ("name", "n_features", "n_classes", "scores_batch", "decide_batch"):
+            setattr(self, name, getattr(decider, name))
+        return cast("Decider", self)  # and no more: a kernel would take the tables of a back end that shows them
+
+    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
+        """As `Decider`."""
+        self.counts.append(counts.copy())
+        self.shots = shots
+        return self._back_end.decide(counts, shots)
+
+    def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
+        """Decide many at once, as the kernel asks for."""
+        self.counts += list(counts.copy())
+        self.shots = shots
+        return verdicts_of(self._back_end, counts, shots)
+
+    def note(self, decisions: Sequence[Decision]) -> None:
+        """Take the decisions in their order: those that were asked for, in the order of asking."""
+        self.decisions += [one for one in decisions if not one.flags & DecisionFlag.ABSTAINED or one.flags & int(ASKED)]
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """What a replay gave: how many decisions, the SHA-256 of their log, what those about passing objects were worth, the agreement.
+
+    `contradictions` are those of the stream with the plan and with itself, by what is wrong, as the core counted them in the run.
+
+    `as_recorded`: every recorded decision was made again, bit for bit, and, where the recording has its end, no other one. A
+    recording that was cut off may hold messages of decisions that it has lost: there may be more than the `recorded` ones.
+    """
+
+    decisions: int
+    sha256: str
+    passages: PassageFigures | None
+    recorded: int
+    as_recorded: bool
+    contradictions: dict[str, int]
+    exposure_timing: dict[str, Any]  # as in the summary; empty where the header has no profile
+
+    @property
+    def more(self) -> int:
+        """Decisions beyond those that are recorded."""
+        return max(0, self.decisions - self.recorded)
+
+    def _repr_html_(self) -> str:
+        facts = {name: getattr(self, name) for name in ("decisions", "recorded", "sha256")}
+        return html_card("Replay", {"as recorded": "yes" if self.as_recorded else "NO"} | facts | self.contradictions)
+
+
+def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = None) -> Replayed:
+    """Decide `recording` again with `bundle`; `pictures`, or another log, collects what the back end is asked.
+
+    The `sha256` of a run in parts is that of one log, as if it had been recorded in one file.
+    """
+    if never_armed(recording):
+        return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True, contradictions={}, exposure_timing={})
+    core, log = _replayed(recording, bundle, pictures)
+    passages = replayed_figures(core, recording.events()) if isinstance(core, FlowCore) else None
+    sha256, recorded = log.encoder.hexdigest(), recording.decisions_sha256
+    if isinstance(recording, JoinedRecording):  # whose hash is a chain: the replay's is over one log
+        whole = LogEncoder()
+        for rows in recording.iter_decisions():
+            whole.update(rows)
+        recorded = whole.hexdigest()
+    agrees = (sha256 if recording.complete else log.sha256_as_far) == recorded
+    told = log.decisions, sha256, passages, recording.n_decisions, agrees, dict(core.contradictions)
+    return Replayed(*told, _exposure_timing(recording, core))
+
+
+def _exposure_timing(recording: Recording, core: Follower) -> dict[str, Any]:
+    toml = recording.profile_toml
+    if not toml:
+        return {}
+    frames = (unpack_body(body) for _, body in recording.answers())
+    welcomes = (decode_welcome(frame.payload) for frame in frames if frame.type == MessageType.WELCOME)
+    announced = any(announces_exposed(welcome.facts) for welcome in welcomes)
+    tolerance_us = parse_profile(toml, f"{recording.path}: its profile").exposure_tolerance_us(core.plan.exposure_us)
+    return exposure_timing(core.exposed, core.plan.tick_us, tolerance_us, announced=announced, untold=core.untold)
+
+
+class _Log:
+    """The log of a replay; `sha256_as_far` is its hash after as many decisions as are recorded, "" while there are fewer."""
+
+    def __init__(self, n_recorded: int, pictures: ClickLog | None) -> None:
+        self.decisions = 0
+        self.sha256_as_far = ""
+        self._n_recorded, self._pictures = n_recorded, pictures
+        self.encoder = LogEncoder()
+        self.take([])
+
+    def take(self, decisions: Sequence[Any] | NDArray[np.void]) -> None:
+        rows = np.asarray(decisions, DECISION_DTYPE)
+        here = self._n_recorded - self.decisions  # rows up to the last recorded one
+        if 0 <= here <= len(rows) and not self.sha256_as_far:
+            self.encoder.update(rows[:here])
+            self.sha256_as_far = self.encoder.hexdigest()
+            self.encoder.update(rows[here:])
+        else:
+            self.encoder.update(rows)
+        self.decisions += len(rows)
+        if self._pictures is not None and not isinstance(decisions, np.ndarray):
+            self._pictures.note(decisions)
+
+
+def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures, NDArray[np.int64]]:
+    """Return what a replay's decisions about passing objects were worth, and truth against decision (classes, classes).
+
+    UsageError where nothing passed.
+    """
+    core, _ = _replayed(recording, bundle, None)
+    if not isinstance(core, FlowCore):
+        raise UsageError(f"{recording.path}: no objects flow past in this run")
+    return replayed_figures(core, recording.events()), core.matcher.confusion
+
+
+def _replayed(recording: Recording, bundle: Bundle, pictures: ClickLog | None) -> tuple[Core | FlowCore, _Log]:
+    """Drive a core through `recording`; return it and the log of its decisions."""
+    core, sent = _rebuilt(recording, bundle, pictures)
+    log = _Log(recording.n_decisions, pictures)
+    for decisions in _decided(core, sent.arms, recording, by_kernel=pictures is None):
+        log.take(decisions)
+    went_on = "part_ended" in recording.summary  # in the next part
+    was_cut = not recording.complete and log.decisions >= recording.n_decisions  # the run did not end there
+    if not (went_on or was_cut):
+        log.take(core.end().decisions)
+    return core, log
+
+
+def _rebuilt(recording: Recording, bundle: Bundle, pictures: ClickLog | None) -> tuple[Core | FlowCore, Sent]:
+    """Return the core of the run, and what the device was sent.
+
+    DamagedFileError if the header or the commands do not tell.
+    """
+    try:
+        config = recording.header["config"]
+        sent = sent_to_device(recording)
+        tick_hz, shots = TICK_HZ.checked(config["tick_hz"], "tick_hz"), SHOTS.checked(config["shots"], "shots")
+        automaton, confidence = automaton_of(config, bundle), float(config.get("confidence", 0.0))
+        backend = str(config.get("backend", "auto"))
+        decider = make_decider(bundle, shots=shots, backend=backend, confidence=confidence, dose=walk_dose(config))
+        plan = sent.plan(tick_hz, getattr(decider, "automaton", automaton), bundle.largest)
+        if pictures is not None:
+            decider = pictures.over(decider)
+        guard = recorded_guard(config.get("dark", {}).get("guard", {}), plan, bundle, shots)
+        n_cycles = next(iter(sent.arms.values())).n_cycles
+        if "flow" not in config:
+            return Core(plan, decider, shots, n_cycles, guard), sent
+        core = recorded_flow_core(config["flow"], plan, decider, bundle, shots, n_cycles)
+        core.guard = guard
+        return core, sent
+    except _NOT_REBUILT as error:
+        # Python's own words of a fact of another type say nothing to a reader.
+        why = (
+            "a fact of another type" if isinstance(error, (AttributeError, TypeError)) else error or "a fact is missing"
+        )
+        raise DamagedFileError(f"{recording.path}: the run cannot be rebuilt: {why}") from error
+
+
+def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
+    """Return why `recording` could not be replayed with `bundle`, [] if it can; nothing is decided.
+
+    A recording of a run that never armed the device holds nothing to decide: its replay has no decisions, as it has.
+    """
+    try:
+        if never_armed(recording):
+            return []
+        _, sent = _rebuilt(recording, bundle, None)
+        place_of(recording)
+        later, session = iter(sent.arms.items()), 0
+        for _, body in recording.messages():
+            frame = unpack_body(body)
+            while frame.session != session:
+                session = next(later)[0]
+    except StopIteration:
+        return ["a message of a session that never armed the device"]
+    except UsageError as error:
+        return [f"the run cannot be rebuilt: {error.message}"]
+    except DamagedFileError as error:
+        return [error.message]
+    except _NOT_REBUILT as error:
+        return [f"a message or the place where the part begins cannot be read: {error}"]
+    return []
+
+
+def _decided(
+    core: Core | FlowCore, arms: Mapping[int, Arm], recording: Recording, *, by_kernel: bool
+) -> Iterator[Sequence[Any] | NDArray[np.void]]:
+    """Drive `core` as the live loop did, and yield its decisions; rows are valid until the next ones.
+
+    `by_kernel` takes many messages in one call, where the core has a kernel. Those of another session than the present one begin the
+    streams of the next ARMs.
+    """
+    streams, session = _begun(core, arms, place_of(recording)), 0
+    streamed = StreamCore.of(core, 0) if by_kernel and isinstance(core, Core) and core.takes else None
+
+    def batches() -> Iterator[tuple[Sequence[Any] | NDArray[np.void], list[Frame]]]:
+        if streamed is None:
+            yield from (([], [unpack_body(body)]) for _, body in recording.messages())
+            return
+        for messages in recording.iter_messages():
+            for batch in streamed.replay(messages):
+                yield batch.rows, [frame for frame in batch.others if frame.session != session]
+
+    for rows, frames in batches():
+        yield rows
+        for frame in frames:
+            while frame.session != session:
+                if (begun := next(streams, None)) is None:
+                    raise DamagedFileError(f"{recording.path}: a message of a session that never armed the device")
+                session, decisions = begun
+                yield decisions
+            if streamed is not None:
+                streamed.follow(session)
+            yield core.step(frame).decisions
+    yield from (decisions for _, decisions in streams)  # those that gave no message at all
+
+
+def _begun(core: Follower, arms: Mapping[int, Arm], place: Place | None) -> Iterator[tuple[int, Sequence[Any]]]:
+    """Begin the stream of each ARM, the first one at the `place` of a later part; yield its session, and the decisions."""
+    for session, arm in arms.items():
+        output = core.begin(arm.start_tick, arm.n_cycles)
+        if place is not None:
+            core.resume(place)
+            place = None
+        yield session, output.decisions
+
+
+TRUTH_MAX_BYTES = 1 << 26  # as a scene file
+
+
+class PictureLog(ClickLog):
+    """The log of a back end that returns pictures."""
+
+    def over(self, decider: Decider) -> Decider:
+        """Return the back end that the core is to ask; UsageError for one that returns no pictures."""
+        if not isinstance(decider, PictureDecider):
+            raise UsageError("the bundle decides among classes, it returns no pictures", remedy="leave --pictures out")
+        self._pictures = decider
+        return super().over(decider)
+
+    def pictures(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return the objects, int64 (n,), and their pictures cut to [0, 1], float32 (n, height, width)."""
+        if len(self.decisions) != len(self.counts):
+            raise ValueError(f"{len(self.counts)} decisions were asked for, {len(self.decisions)} came")
+        if not self.counts:
+            return np.zeros(0, np.int64), np.zeros((0, *self._pictures.picture_shape), np.float32)
+        objects = np.array([decision.object for decision in self.decisions], np.int64)
+        return objects, self._pictures.pictures(np.stack(self.counts), self.shots)
+
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write `object` and `pictures` to a .npz, whole or not at all; UsageError if it exists, unless `force`."""
+        objects, pictures = self.pictures()
+        write_file(path, npz_bytes(object=objects, pictures=pictures), force=force)
+
+    def compare(self, truth: Path) -> dict[str, Any]:
+        """Return SSIM and mean squared error against the scene in `truth` (.npz with `images`), whose objects pass in turn."""
+        objects, pictures = self.pictures()
+        images = _images(truth)
+        alike = likeness(pictures, images[objects % len(images)])
+        known = bool(len(objects))
+        return {
+            "ssim_mean": float(alike.ssim.mean()) if known else None,
+            "mse_mean": float(alike.mse.mean()) if known else None,
+            "pictures": len(objects),
+        }
+
+
+def _images(name: Path) -> NDArray[np.uint8]:
+    path = name if name.exists() else shipped_scene(str(name)) or name
+    return scene_arrays(path, TRUTH_MAX_BYTES)["images"]
