@@ -28,4 +28,6 @@ def test_a_package_exports_what_it_names(path: Path) -> None:
     package = importlib.import_module(name_of(ROOT / path))
     for name in getattr(package, "__all__", ()):
         value = getattr(package, name)
-        assert not callable(value) or get_origin(value) is Literal or value.__doc__, f"{package.__name__}.{name} has no docstring"
+        assert not callable(value) or get_origin(value) is Literal or value.__doc__, (
+            f"{package.__name__}.{name} has no docstring"
+        )

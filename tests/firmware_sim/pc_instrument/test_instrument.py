@@ -285,7 +285,7 @@ class OwnProjector:
 def test_an_adapter_with_all_its_members_is_taken() -> None:
     check_adapter("projectors", "mylab:Projector", OwnProjector(None))
     with pytest.raises(
-        UsageError, match=r"has no clock, needed: a pans\.firmware_sim\.lab\.SteeredClock, of the profile's ticks"
+        UsageError, match=r"has no clock, needed: a pans_sim\.pc_instrument\.SteeredClock, of the profile's ticks"
     ):
         check_adapter("counters", "mylab:Counter", OwnProjector(None))
 

@@ -29,7 +29,7 @@ from pans.decide.plan import build_plan
 from pans.decide.still import Core
 from pans.instrument.optics import Imaging, seen
 from pans.instrument.profile import Profile
-from pans.live.loop import Observers, run_live
+from pans.live.loop import Connection, Observers, run_live
 from pans.live.options import RunOptions
 from pans.live.stop import Stop
 from pans.protocol.links import open_link
@@ -311,8 +311,6 @@ class Trial(NamedTuple):
 
 def scene_size(device: str) -> int:
     """Return how many objects the scene of a simulated instrument has, 0 where the device does not say."""
-    from pans.live.loop import Connection
-
     with closing(open_link(device)) as link:
         connection = Connection(link)
         try:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.base.errors import UsageError
+from pans.base.files import read_grey, scene_arrays
 
 CELLS = ("#.#..#", "##.#..", "..#..#", "..#...", "..#..#", "##.###")
 SIDE = 28
@@ -43,8 +44,6 @@ def read_target(path: Path) -> U8:
 
     UsageError for a file that is neither, for too few or too many pixels, and for a picture without contrast.
     """
-    from pans.base.files import read_grey, scene_arrays
-
     is_scene = path.suffix == ".npz"
     picture = scene_arrays(path, TARGET_BYTES)["images"][0] if is_scene else read_grey(path, MOST_PIXELS)
     return _checked(picture, str(path))

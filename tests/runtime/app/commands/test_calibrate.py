@@ -14,7 +14,7 @@ from pans.base.errors import EXIT_ALERT, EXIT_TIMING, DamagedFileError
 from pans.instrument.calibration_file import find_warnings, load_calibration, now_utc, save_calibration
 from pans.instrument.profile import load_profile
 from pans.live import gates, reconnect
-from pans.protocol.links import base
+from pans.protocol import links
 
 URL = "sim:ideal?scene=uniform&pace=fast&seed=1"
 
@@ -22,11 +22,11 @@ URL = "sim:ideal?scene=uniform&pace=fast&seed=1"
 def test_contradictions_are_a_fault_and_stand_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans
 ) -> None:
-    opened = base.open_link
+    opened = links.open_link
     for module in (one_run, reconnect, gates):  # imported before: else they would keep the false one for good
         assert module.open_link is opened
     lie = Mutation("CLICKS", "object_index", by=17, most=3)
-    monkeypatch.setattr(base, "open_link", lambda url: MutatedLink(opened(url), (lie,), Evidence(1 << 40, 2, 10**6)))
+    monkeypatch.setattr(links, "open_link", lambda url: MutatedLink(opened(url), (lie,), Evidence(1 << 40, 2, 10**6)))
     out = tmp_path / "c.json"
     found = pans("calibrate", "--device", URL, "--seconds", "0.5", "-o", out, code=EXIT_TIMING)
     assert found["contradictions"] == {"object": 6}  # in each of the two stages

@@ -14,7 +14,6 @@ from bundles import made_bundle
 from commands import Pans, fixed_run, json_of
 from heads import onnx_chain, random_layers
 
-import pans
 from pans.app.main import main
 from pans.base import SHIPPED
 from pans.base.errors import DamagedFileError, UsageError
@@ -26,6 +25,7 @@ from pans.instrument.profile import load_profile
 from pans.record.reading import read_recording
 from pans.record.reading.exposures import click_list
 from pans.record.reading.sent_plan import recorded_plan
+from pans.record.tables import to_frame, to_xarray
 from pans.record.tables.parquet import write_rows
 
 FASHION = SHIPPED / "fashion10.pans"
@@ -217,18 +217,18 @@ def test_other_readers_find_the_same_tables(run_of: Path, tmp_path: Path, pans: 
         assert found.columns.tolist() == columns.column.tolist()
         for column, unit in zip(columns.column, columns.unit):
             assert unit in ("", "1") or column.endswith(unit), column  # the unit stands in the name
-        wanted = pans.to_frame(recording, "clicks" if file == "clicks.csv" else "decisions").reset_index()
+        wanted = to_frame(recording, "clicks" if file == "clicks.csv" else "decisions").reset_index()
         texts = dict.fromkeys(columns.column[columns.dtype == "str"], "")
         pandas.testing.assert_frame_equal(found.fillna(texts), wanted[found.columns].fillna(texts), check_dtype=False)
     table = parquet.read_table(tmp_path / "d.parquet").to_pandas()
-    wanted = pans.to_frame(recording).reset_index()[table.columns]
+    wanted = to_frame(recording).reset_index()[table.columns]
     for column in table:
         assert table[column].fillna(-1).tolist() == wanted[column].fillna(-1).tolist()
 
 
 def test_without_the_frames_extra_the_remedy_is_named(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = read_recording(recording)
-    for name, call in (("pandas", pans.to_frame), ("xarray", pans.to_xarray)):
+    for name, call in (("pandas", to_frame), ("xarray", to_xarray)):
         monkeypatch.setitem(sys.modules, name, None)
         with pytest.raises(UsageError, match=name) as error:
             call(source)
