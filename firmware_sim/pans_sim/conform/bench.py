@@ -28,7 +28,7 @@ from pans.protocol.wire import (
 from pans.protocol.wire import messages as wire
 
 from .plans import Layout, layout_for
-from .rules import Broken, Silent, need
+from .registry import Broken, Silent, need
 
 PATIENCE_S = 2.0  # for an answer: a loaded machine is no broken rule
 QUIET_S = 0.3  # in which an answer that must not come would have come

@@ -13,9 +13,9 @@ from pans.instrument.profile import Profile
 from pans.protocol.links import Link
 from pans.protocol.wire import SCHEMA, Opcode
 
-from . import automata, counts, exposed, frames, orders, runs, sessions  # noqa: F401  (they register the rules)
+from . import rules  # noqa: F401  (they register themselves)
 from .bench import Bench, Piece
-from .rules import RULES, Broken, NotTried, Rule, Silent, in_order
+from .registry import RULES, Broken, NotTried, Rule, Silent, in_order
 
 KEPT, BROKEN, NOT_TRIED, GONE = "kept", "broken", "not tried", "gone"
 MOST_SILENT = 3  # rules in a row whose session does not open: after that the device is taken as gone

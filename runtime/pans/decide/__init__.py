@@ -1,4 +1,4 @@
-"""The deterministic core: stream messages in, rows of decisions out; no clock, no input or output, no random number.
+"""The deterministic core: stream messages in, rows of decisions out; no random number, and in `kernel` alone a clock and a descriptor.
 
 In: a profile and a bundle (`build_plan`), then messages. Out: decisions, events and the alarms of dark counts.
 A live run, a replay and a simulation give the same decisions bit for bit.

@@ -1,7 +1,7 @@
-"""Has the detector changed? Dark counts and light against what is expected.
+"""Has the detector or the light changed? Dark counts and lit exposures against what is expected.
 
 In: counts of clicks with their exposures. Out: findings with their intervals, alarms, other tables. Start at guard.py; cusum.py has the
-test, light_level.py watches the light.
+test. light_level.py watches the light of fixed patterns, state_watch.py that of automata.
 """
 
 from .cusum import ChannelWatch, WatchSettings

@@ -1,6 +1,6 @@
 """HTML pages of runs, bundles, measurements and folders of runs: one file each, for any width, in light and dark, and on paper.
 
-In: files of this project. Out: HTML. templates/ has structure and words (Jinja2), charts.py draws (matplotlib), both of the extra `plot`.
+In: files of this project. Out: HTML. templates/ has structure and words (Jinja2), charts.py draws (matplotlib); extra `ui` or `plot`.
 No page runs a script or loads anything. Start at run.py and templates/run.html.
 """
 

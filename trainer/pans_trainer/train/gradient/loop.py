@@ -299,7 +299,7 @@ class Run:
         return exposure_us_of(self.profile, min(max(self.encoder.brightest(), low), high))
 
     def _penalty(self, clicks: Tensor, photons: Tensor, illumination: Tensor) -> Tensor:
-        """Illumination by `alpha`; a budget by a weight that grows while it is exceeded and shrinks while it is not."""
+        """Return the price of the light: `alpha` per unit of illumination; that of a budget grows while it is exceeded, else it shrinks."""
         penalty = (self.options.alpha or 0.0) * illumination
         if self.options.spread and isinstance(self.encoder, ActiveIllumination):
             penalty = penalty + self.options.spread * concentration(self.encoder.patterns())

@@ -19,9 +19,8 @@ from pans.protocol.wire import (
     wrong_facts,
 )
 from pans.protocol.wire import messages as wire
-
-from .bench import LEASE_MS, PATIENCE_S, QUIET_S, Bench
-from .rules import NotTried, Silent, beyond_the_link, need, rule
+from pans_sim.conform.bench import LEASE_MS, PATIENCE_S, QUIET_S, Bench
+from pans_sim.conform.registry import NotTried, Silent, beyond_the_link, need, rule
 
 CLOCK_PPM = 1000.0  # section 9
 CLOCK_S = 2.0

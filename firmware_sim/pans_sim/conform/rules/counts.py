@@ -22,10 +22,10 @@ from pans.protocol.wire import (
     pack_command,
     state_dtype,
 )
+from pans_sim.conform.bench import Bench
+from pans_sim.conform.registry import NotTried, need, rule
 
 from .automata import CYCLES, SLOTS, follow, following, four_states
-from .bench import Bench
-from .rules import NotTried, need, rule
 
 LEAVES = 5
 MALFORMED, RANGE, STATE = AckStatus.MALFORMED, AckStatus.OUT_OF_RANGE, AckStatus.WRONG_STATE

@@ -18,11 +18,11 @@ from pans.protocol.wire import (
     encode_command,
     pack_command,
 )
+from pans_sim.conform.bench import LEASE_MS, PATIENCE_S, STEP_S, Bench
+from pans_sim.conform.plans import Layout
+from pans_sim.conform.registry import NotTried, Silent, need, rule
 
 from .automata import SLOTS, four_states
-from .bench import LEASE_MS, PATIENCE_S, STEP_S, Bench
-from .plans import Layout
-from .rules import NotTried, Silent, need, rule
 from .runs import blocks_of, lateness
 
 LONG_S, SHORT_S = 1.2, 0.1  # of a run in which a STATUS comes between its beginning and its end, and of another

@@ -16,10 +16,9 @@ from pans.protocol.wire import (
     StateReason,
     encode_hello,
 )
-
-from .bench import LEASE_MS, PATIENCE_S, STEP_S, Bench
-from .plans import Layout
-from .rules import NotTried, beyond_the_link, need, rule
+from pans_sim.conform.bench import LEASE_MS, PATIENCE_S, STEP_S, Bench
+from pans_sim.conform.plans import Layout
+from pans_sim.conform.registry import NotTried, beyond_the_link, need, rule
 
 CYCLES = 12
 WIDTHS = 17, 33, 65  # channels whose word is of the next size

@@ -1,4 +1,4 @@
-"""The table of rules, which the check modules fill when they are imported: number, words and check; and what a check raises.
+"""The table of rules, which the modules of rules/ fill when they are imported: number, words and check; and what a check raises.
 
 The words are those of section 12 of docs/reference/protocol.md.
 """

@@ -27,10 +27,9 @@ from pans.protocol.wire import (
     pack_command,
     state_dtype,
 )
-
-from .bench import LEASE_MS, PATIENCE_S, Bench
-from .plans import Layout
-from .rules import NotTried, need, rule
+from pans_sim.conform.bench import LEASE_MS, PATIENCE_S, Bench
+from pans_sim.conform.plans import Layout
+from pans_sim.conform.registry import NotTried, need, rule
 
 CYCLES = 15
 SLOTS = 3

@@ -20,10 +20,9 @@ from pans.protocol.wire import (
     encode_command,
     pack_command,
 )
-
-from .bench import Bench
-from .plans import Layout
-from .rules import NotTried, need, rule
+from pans_sim.conform.bench import Bench
+from pans_sim.conform.plans import Layout
+from pans_sim.conform.registry import NotTried, need, rule
 
 UNKNOWN_OPCODE = 0xEE
 MOST_GATES = 300  # that a check asks for until the list is full

@@ -8,9 +8,8 @@ import zlib
 
 from pans.protocol.wire import HEADER, MESSAGES, AckStatus, DeviceState, MessageType, Opcode, cobs_encode, encode_frame
 from pans.protocol.wire import messages as wire
-
-from .bench import QUIET_S, Bench
-from .rules import need, rule
+from pans_sim.conform.bench import QUIET_S, Bench
+from pans_sim.conform.registry import need, rule
 
 GOLDEN = bytes.fromhex("020101010A44332211C4AF642E010101058FAF0A2A00")
 GOLDEN_SESSION = 0x11223344
