@@ -37,7 +37,7 @@ I64 = npt.NDArray[np.int64]
 GATHERED_BYTES = 1 << 18
 EAGER_NS = 200_000  # as protocol/links/reader.py: an answer that was asked for is waited for awake
 LEAST_NS = 100_000
-CALL_NS = 20_000_000  # a call returns at least so often: signals, the watchdog's heartbeat, other threads' wishes
+CALL_NS = 30_000_000  # a call returns at least so often: signals, the watchdog's heartbeat, other threads' wishes
 
 
 def why_fed(link: Link) -> str:
@@ -323,6 +323,7 @@ class Receiver:
                 self._stamp(kernel)
                 if end.messages - begin.messages > end.steps - begin.steps:
                     self._settle_marks(kernel)
+                    yield
                 self._record(kernel)
                 yield
                 if end.steps > begin.steps:
@@ -408,16 +409,21 @@ class StillReceiver(Receiver):
         rows = kernel.rows  # a back end that is not the kernel's decides here
         if not steps.decides and not run.connection.link.virtual:
             blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
-        events = self._watch(kernel, rows)
+        yield
+        events = self._watch(kernel)
         for event in events:
             run.journal.take(event)
         yield
+        if self._still.guard is not None and not self._still.windows.parallel:
+            self._still.watch_objects(rows)
+            yield
         ends_ns, unsure_ns = self._ends_of(kernel)
         if len(rows):
             run.tally.add_rows(rows, steps.photons_of)
             yield
             if run.recorder is not None:
                 run.recorder.add_decisions(rows)
+                yield
             counts = kernel.rows_by_block
             some = counts > 0
             stamps = blocks[some, : ring.RECORDED + 1]
@@ -426,7 +432,7 @@ class StillReceiver(Receiver):
         outputs.append(Output(RowDecisions(rows), events, int(blocks[-1, ring.END_TICK])))
         yield
 
-    def _watch(self, kernel: Kernel, rows: npt.NDArray[np.void]) -> list[Any]:
+    def _watch(self, kernel: Kernel) -> list[Any]:
         """Let the guard of the dark counts see the exposures of a call."""
         core = self._still
         if core.guard is None:
@@ -435,7 +441,7 @@ class StillReceiver(Receiver):
             spans, heads = kernel.heads(MessageType.FRAMES, BLOCK_DTYPE)
             return core.watch_frames(_words_of(kernel.kept, spans, heads), heads)
         n = int(unpack_blocks(kernel.kept, kernel.messages, self._stamps, self._bits))
-        return core.watch_blocks(self._stamps[:n], self._bits[:n], self._following - n, rows)
+        return core.watch_blocks(self._stamps[:n], self._bits[:n], self._following - n)
 
 
 def _words_of(kept: npt.NDArray[np.uint8], spans: I64, heads: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:

@@ -158,6 +158,8 @@ class Kernel:
             control[ring.FD] = fd
         control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
         control[ring.FLOOR_NS] = limits.floor_ns
+        if more:  # the rings count from their beginning, and what lies there has been granted before
+            control[ring.BUDGET] += self.said.messages
         control[ring.OPEN] = steps.takes
         control[ring.ADDS] = more
         if more:  # what came before is stored

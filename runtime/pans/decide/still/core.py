@@ -83,17 +83,16 @@ class Core(Follower):
         self._session_known = False  # of the marks that are forgotten here the kernel must not know either
         return super().part()
 
-    def watch_blocks(
-        self, stamps: NDArray[np.uint16], bits: NDArray[np.uint8], first: int, rows: NDArray[np.void]
-    ) -> list[Finding]:
-        """Let the guard, which only warns, see exposures from `first` on that kernels have taken, and their decisions."""
-        if self.guard is None:
-            return []
-        block = ClickBlock(0, 0, 0, first, 0, self.windows.position[2], stamps, bits)
-        events = self.guard.take(block)
+    def watch_blocks(self, stamps: NDArray[np.uint16], bits: NDArray[np.uint8], first: int) -> list[Finding]:
+        """Let the guard, which only warns, see exposures from `first` on that kernels have taken; `watch_objects` follows."""
+        assert self.guard is not None
+        return self.guard.take(ClickBlock(0, 0, 0, first, 0, self.windows.position[2], stamps, bits))
+
+    def watch_objects(self, rows: NDArray[np.void]) -> None:
+        """Let the guard see the decisions that the exposures of `watch_blocks` gave, DECISION_DTYPE (n,)."""
+        assert self.guard is not None
         measured = rows["flags"] & _NOT_MEASURED == 0
         self.guard.take_objects(rows["clicks"][measured, None] > 0, rows["object"][measured])
-        return events
 
     def watch_frames(self, words: NDArray[np.uint8], heads: NDArray[np.void]) -> list[Finding]:
         """As `watch_blocks` for blocks of frames that follow one another: words uint8 (frames, bytes), heads BLOCK_DTYPE (blocks,).

@@ -8,9 +8,10 @@ import pytest
 from automata import automaton_bundle, random_automaton
 from heads import head_bundle, random_layers
 
-from pans.app.bench import decide, ingest, streams, turn
+from pans.app.bench import against, decide, ingest, streams, turn
 from pans.app.bench.rows import BenchOptions, Spent, machine_facts, percentiles_us, table_text
 from pans.app.main import main
+from pans.base.errors import EXIT_USAGE, UsageError
 from pans.bundle.backends.choose import make_decider
 from pans.bundle.heads.layers import quantise_head
 from pans.bundle.sensor.bundle import load_bundle
@@ -115,3 +116,42 @@ def test_the_command_prints_one_object(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert main(["bench", "turn", "--load"]) == 2
     with pytest.raises(SystemExit, match="2"):
         main(["bench", "loop", "--seconds", "0"])
+
+
+def test_a_loss_of_pace_is_named_and_noise_is_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def row(name: str, p50: float, p99: float | None, late: int) -> dict[str, object]:
+        return {
+            "bench": "loop",
+            "name": name,
+            "p50_us": p50,
+            "p99_us": p99,
+            "p999_us": None,
+            "late": late,
+            "decisions": 1000,
+        }
+
+    file = tmp_path / "before.json"
+    before = [row("a", 100.0, 500.0, 1), row("b", 100.0, None, 0), {"bench": "ingest", "name": "c", "ns": 1.0}]
+    file.write_text(json.dumps({"machine": {}, "rows": before}))
+    earlier = against.read_rows(file)
+    assert sorted(earlier) == ["a", "b"]
+    found, losses = against.compared([row("a", 114.0, 570.0, 3), row("new", 1.0, 1.0, 0)], earlier)
+    assert (losses, len(found)) == ([], 1)
+    assert (found[0]["p50_us_ratio"], found[0]["p99_us_ratio"], found[0]["p999_us_ratio"]) == (1.14, 1.14, None)
+    _, losses = against.compared([row("a", 116.0, 600.0, 4), row("b", 90.0, 9e9, 1)], earlier)
+    assert [loss.split(":")[1].split(" times")[0].split(" of 1000")[0] for loss in losses] == [
+        *(" p50_us 1.16", " p99_us 1.2", " 4"),
+    ]
+    with pytest.raises(UsageError, match="there: a, b"):
+        against.compared([row("new", 1.0, 1.0, 0)], earlier)
+    for text in (
+        "[]",
+        "{}",
+        '{"rows": 3}',
+        '{"rows": [{"bench": "ingest", "name": "c"}]}',
+        '{"rows": [1, {"name": 2}]}',
+    ):
+        file.write_text(text)
+        assert main(["bench", "loop", "--against", str(file)]) == EXIT_USAGE
+        assert str(file) in capsys.readouterr().err
+    assert main(["bench", "decide", "--against", str(file)]) == EXIT_USAGE

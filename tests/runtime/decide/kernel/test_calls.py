@@ -3,12 +3,15 @@
 Streams with faults go through it in tests/runtime/core (tests/oracles/streams.py), whole runs with faults in the fault grid.
 """
 
+import array
 import contextlib
+import fcntl
 import os
 import signal
 import socket
 import subprocess
 import sys
+import termios
 import threading
 import time
 import tty
@@ -88,6 +91,37 @@ def test_another_thread_can_stop_a_call_between_messages() -> None:
         theirs.send(b"".join(clean))
         assert ring.WHY[streamed.turn.run(ours.fileno(), Limits(due_ns=0))] == "due"
         assert streamed.turn.end.messages == 0  # nothing was read
+
+
+def test_a_call_that_adds_to_the_rings_is_granted_as_many_messages_as_any_other() -> None:
+    """What lies in the rings has been granted before: else each call would end behind its first read, and take one message."""
+    streamed, clean = streaming()
+    turn, (ours, theirs) = streamed.turn, socket.socketpair()
+    streamed.warm_up()
+
+    def send_in_two_reads() -> None:
+        for data in clean[3:5]:
+            while unread(ours):
+                pass
+            theirs.send(data)
+
+    with ours, theirs:
+        theirs.send(b"".join(clean[:3]))
+        assert turn.run(ours.fileno(), Limits(due_ns=0)) == ring.DUE
+        assert turn.said.messages == 3
+        sender = threading.Thread(target=send_in_two_reads)
+        sender.start()
+        limits = Limits(due_ns=time.perf_counter_ns() + LONG_NS, budget=2)
+        assert turn.run(ours.fileno(), limits, more=True) == ring.DUE
+        sender.join()
+    assert turn.said.messages == 5
+
+
+def unread(receiving: socket.socket) -> int:
+    """How many bytes wait to be read."""
+    held = array.array("i", [0])
+    fcntl.ioctl(receiving, termios.FIONREAD, held)
+    return held[0]
 
 
 def test_what_comes_while_something_is_settled_lies_behind_it() -> None:

@@ -203,7 +203,8 @@ def test_the_watch_for_dead_channels_sees_only_what_was_measured() -> None:
     rows = np.zeros(5, DECISION_DTYPE)
     rows["object"], rows["clicks"] = range(5), (2, 0, 3, 1, 1)
     rows["flags"][1:4] = [DecisionFlag.GAP | DecisionFlag.ABSTAINED, DecisionFlag.WRONG_PATTERN, DecisionFlag.AMBIGUOUS]
-    core.watch_blocks(np.zeros(20, np.uint16), np.ones(20, np.uint8), 0, rows)
+    core.watch_blocks(np.zeros(20, np.uint16), np.ones(20, np.uint8), 0)
+    core.watch_objects(rows)
     lit.end_object()
     assert (lit.objects, lit.clicked.tolist()) == (3, [3])
 
