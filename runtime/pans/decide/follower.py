@@ -225,7 +225,7 @@ class Follower:
 
     @property
     def tallies(self) -> npt.NDArray[np.int64]:
-        """Dark exposures, dark clicks and wrong patterns, int64 (window.N_TALLIES,)."""
+        """Dark exposures, dark clicks and wrong patterns, int64 (still/windows.N_TALLIES,)."""
         raise NotImplementedError
 
     def warm_up(self) -> None:

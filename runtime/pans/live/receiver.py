@@ -37,7 +37,9 @@ I64 = npt.NDArray[np.int64]
 GATHERED_BYTES = 1 << 18
 EAGER_NS = 200_000  # as protocol/links/reader.py: an answer that was asked for is waited for awake
 LEAST_NS = 100_000
-CALL_NS = 30_000_000  # a call returns at least so often: signals, the watchdog's heartbeat, other threads' wishes
+# A call returns at least so often: signals, the watchdog's heartbeat, other threads' wishes. Accounting costs the same for one block as
+# for twenty, so that it comes seldom; but what it takes at once delays the blocks that come meanwhile.
+CALL_NS = 30_000_000
 
 
 def why_fed(link: Link) -> str:
@@ -409,7 +411,7 @@ class StillReceiver(Receiver):
         rows = kernel.rows  # a back end that is not the kernel's decides here
         if not steps.decides and not run.connection.link.virtual:
             blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
-        yield
+        yield  # from here on the kernel decides what comes between two parts
         events = self._watch(kernel)
         for event in events:
             run.journal.take(event)

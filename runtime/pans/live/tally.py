@@ -234,4 +234,4 @@ class RunResult:
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
     page_faults: dict[str, int] = field(default_factory=dict)  # of the loop's thread while armed; its switches too
-    exposure_timing: dict[str, Any] = field(default_factory=dict)  # core.follower.exposure_timing
+    exposure_timing: dict[str, Any] = field(default_factory=dict)  # decide.exposure_timing

@@ -1,4 +1,4 @@
-"""Rows of an earlier `pans bench loop --json` in, what has become of them out: a loss of pace is seen before it is shipped."""
+"""Rows of an earlier `pans bench loop --json` in, their ratios to the rows of now out: who made the loop slower sees it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pans.base.files import MIB, parse_json_object, read_file
 
 from .rows import Row
 
-ALLOWED = 1.15  # times p50 and p99 of before: runs of the same code differ by so much
-ALLOWED_LATE = 2.0  # more of 1000 decisions
+ALLOWED = 1.15  # times p50 and p99 of before: five runs of the same loop in turn differed by up to 1.11
+ALLOWED_LATE = 2.0  # more of 1000 decisions; chosen, so that a single stall is no loss
 FIGURES = ("p50_us", "p99_us", "p999_us")
 JUDGED = ("p50_us", "p99_us")
 
@@ -58,17 +58,16 @@ def compared(rows: list[Row], before: dict[str, Row]) -> tuple[list[Row], list[s
 
 def _ratio(now: Any, before: Any) -> float | None:
     """The ratio of two figures, None where one of them is none."""
-    if not (_is_figure(now) and _is_figure(before)) or before <= 0:
-        return None
-    return round(now / before, 3)
+    this, that = _figure(now), _figure(before)
+    return None if this is None or not that else round(this / that, 3)
 
 
 def _late_per_1000(row: Row) -> float | None:
-    late, decisions = row.get("late"), row.get("decisions")
-    if not (_is_figure(late) and _is_figure(decisions)) or not decisions:
-        return None
-    return round(1000 * float(late or 0) / float(decisions or 1), 2)
+    """Late decisions of 1000, None where the row does not count them."""
+    late, decisions = _figure(row.get("late")), _figure(row.get("decisions"))
+    return None if late is None or not decisions else round(1000 * late / decisions, 2)
 
 
-def _is_figure(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
+def _figure(value: Any) -> float | None:
+    """A number as a file or a row has it; None for anything else, below 0 too."""
+    return float(value) if type(value) in (int, float) and 0 <= value < math.inf else None

@@ -1,6 +1,6 @@
 """`pans bench`: decision speed and accuracy of this machine; each benchmark is found by entry point (`pans.benches`).
 
-The exit code is 0 whatever the figures are: a benchmark measures, tests judge. With --against it is 1 where the pace was lost.
+The exit code is 0 whatever the figures are: a benchmark measures, tests judge. With --against it is 1 where the loop has become slower.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     seconds = "loop: length of each of its six runs (default 5)"
     add("--seconds", type=Range(0.01, 86_400).option, default=5.0, help=seconds)
     add("--load", action="store_true", help="loop: keep both cores busy with other processes")
-    against = "loop: compare with what an earlier `pans bench loop --json` printed; exit 1 where p50 or p99 is 1.15 times that, or more"
+    against = "loop: compare with what an earlier `pans bench loop --json` printed; exit 1 where the loop is slower now"
     add("--against", type=Path, metavar="FILE", help=against)
     add("--plot", type=Path, help="write a plot of speed against error (plot extra)")
     add_force(parser)

@@ -144,7 +144,7 @@ class FlowCore(Follower):
 
     @property
     def tallies(self) -> I64:
-        """Dark exposures, dark clicks and wrong patterns (never seen: static patterns carry no stamp), int64 (window.N_TALLIES,)."""
+        """Dark exposures, dark clicks and wrong patterns (never seen: static patterns carry no stamp), int64 (still/windows.N_TALLIES,)."""
         tallies: I64 = np.zeros(N_TALLIES, np.int64)
         n_dark = int(self._ring.state[kernels.DARK_FRAMES])
         tallies[DARK_EXPOSURES], tallies[DARK_CLICKS] = n_dark * len(self.dark_channels), self.dark_channels.sum()

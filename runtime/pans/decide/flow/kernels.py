@@ -48,7 +48,7 @@ MAX_BLOCK, DARK_EVERY, WATCH_AT, FRAMES, OBJECTS, TOLD, MARKED, ASKS = range(cor
 MIDDLE, MIDDLE_PART, PITCH, NOMINAL_PITCH, TRACK, BEFORE, BEFORE_MIDDLE, BEFORE_PART, POSITION, N_FACTS = range(
     ASKS + 1, ASKS + 11
 )
-W_FIRST, W_LAST, W_CENTRE, W_LEAVE, W_CLICKS, N_PASSAGE = range(6)  # of core.decision.Passage
+W_FIRST, W_LAST, W_CENTRE, W_LEAVE, W_CLICKS, N_PASSAGE = range(6)  # of decision.Passage
 _GAP, _ABSTAINED, _NOT_FINITE, _AMBIGUOUS, _COINCIDENCE, _INCOMPLETE = (
     int(DecisionFlag[name]) for name in ("GAP", "ABSTAINED", "NOT_FINITE", "AMBIGUOUS", "COINCIDENCE", "INCOMPLETE")
 )
@@ -74,7 +74,7 @@ class FlowWalk(NamedTuple):
 
     `offsets` int64 (slots of a cycle,) in ticks; `mask` uint64 (1,) of the channels; `sure` float64 (1,): below it a posterior is
     ambiguous; `gated` uint8 (classes,): of which a pulse is asked. Decisions stand in `rows`, DECISION_DTYPE (m,), in the same place
-    their passages int64 (m, 5), in the order of `core.decision.Passage`, and the clicks of their windows int64 (m, pool, d_f). What the
+    their passages int64 (m, 5), in the order of `decision.Passage`, and the clicks of their windows int64 (m, pool, d_f). What the
     empty field gave stands in `empty` int64 (k, 2 + d_f), by its number modulo k: the exposure behind the block, empty frames, clicks of
     each channel, since the run began. `heard` is StreamTracker's.
     """

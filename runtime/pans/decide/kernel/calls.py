@@ -31,7 +31,7 @@ Bytes = bytes | bytearray | memoryview | U8
 
 
 class Limits(NamedTuple):
-    """When a call ends though all is ordinary: see state.py's control for the columns."""
+    """When a call ends though all is ordinary: see arrays.py's control for the columns."""
 
     due_ns: int = NO_END
     patience_ns: int = 0
@@ -41,7 +41,7 @@ class Limits(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What a call reports, in the order of state.py's control; `rows` of decisions beside it."""
+    """What a call reports, in the order of arrays.py's control; `rows` of decisions beside it."""
 
     errno: int
     unsent: int
@@ -227,12 +227,12 @@ class Kernel:
 
     @property
     def blocks(self) -> I64:
-        """When each block came, was decoded, decided and kept, and what had come up to it: state.py's steps (n, N_STEP)."""
+        """When each block came, was decoded, decided and kept, and what had come up to it: arrays.py's steps (n, N_STEP)."""
         return self.rings.steps[self.begin.steps : self.end.steps]
 
     @property
     def messages(self) -> I64:
-        """Where the stream messages of the call stand in `kept`: state.py's spans (n, 4)."""
+        """Where the stream messages of the call stand in `kept`: arrays.py's spans (n, 4)."""
         return self.rings.messages[self.begin.messages : self.end.messages]
 
     @property
@@ -247,7 +247,7 @@ class Kernel:
 
     @property
     def notes(self) -> I64:
-        """The waits for bytes: state.py's notes (n, 4)."""
+        """The waits for bytes: arrays.py's notes (n, 4)."""
         return self.rings.notes[self.begin.notes : self.end.notes]
 
     @property

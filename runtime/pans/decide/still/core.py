@@ -42,7 +42,7 @@ class Core(Follower):
 
     @property
     def tallies(self) -> NDArray[np.int64]:
-        """Dark exposures, dark clicks and wrong patterns, int64 (window.N_TALLIES,)."""
+        """Dark exposures, dark clicks and wrong patterns, int64 (still/windows.N_TALLIES,)."""
         return self.windows.tallies
 
     def warm_up(self) -> None:

@@ -62,7 +62,7 @@ class Summary(TallyFigures):
     deadline_us: float
     clock: dict[str, Any]
     slot_jitter_us: float
-    exposure_timing: dict[str, Any]  # of what the device told (core.follower.exposure_timing)
+    exposure_timing: dict[str, Any]  # of what the device told (decide.exposure_timing)
     wrong_patterns: int
     dark: DarkReport
     stream: dict[str, int]

@@ -1,6 +1,6 @@
 """The kernel by itself: how a call ends, and what it leaves to Python.
 
-Streams with faults go through it in tests/runtime/core (tests/oracles/streams.py), whole runs with faults in the fault grid.
+Streams with faults go through it in tests/runtime/decide (tests/oracles/streams.py), whole runs with faults in the fault grid.
 """
 
 import array
