@@ -1,6 +1,8 @@
 """The kernel and the core alone over the same bytes, and the faults that a link may add to them."""
 
 import socket
+import threading
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -8,8 +10,11 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pans.decide.decision import DECISION_DTYPE
+from pans.decide.kernel import arrays as ring
 from pans.decide.kernel.calls import Limits, StreamCore
 from pans.decide.still.core import Core
+from pans.decide.still.kernel_state import IdleSteps
+from pans.live.deciding import DecidingThread
 from pans.protocol.wire import DeviceState, MessageType, StateReason
 from pans.protocol.wire import messages as wire
 from pans.protocol.wire.framing import FrameDecoder
@@ -59,10 +64,64 @@ def by_descriptor(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> t
     return np.concatenate(rows), events, streamed
 
 
+def by_thread(
+    plan: Any,
+    decider: Any,
+    shots: int,
+    pieces: list[bytes],
+    pause: Callable[[str], None] = lambda step: None,
+    gather_ns: int = 0,
+) -> tuple[np.ndarray, list[Any], StreamCore]:
+    """As `by_descriptor`, but the kernel serves in a thread of its own; Python calls `pause` at each step of its side."""
+    streamed = StreamCore(plan, decider, shots, 0, SESSION)
+    core, turn = streamed.core, streamed.turn
+    rows, events = [np.zeros(0, DECISION_DTYPE)], list[Any]()
+    ours, theirs = socket.socketpair()
+    ours.setblocking(False)
+
+    def send() -> None:
+        for piece in pieces:
+            theirs.sendall(piece)
+        theirs.shutdown(socket.SHUT_WR)
+
+    thread, sender, ended = DecidingThread(), threading.Thread(target=send), ring.ALL_TAKEN
+    with ours, theirs:
+        turn.allow(0, 0, gather_ns)
+        thread.start(turn, ours.fileno())
+        sender.start()
+        while ended != ring.GONE:
+            thread.wait(1.0)
+            pause("woken")
+            if not turn.receive_batch():
+                continue
+            ended, parked = turn.end.ended, bool(turn.reported[ring.PARKED])
+            pause("received")
+            rows.append(turn.rows.copy())
+            core.remember_rows(turn.marks())
+            if parked and ended == ring.ODD:
+                for batch in streamed._take_one(turn.take_odd()):
+                    rows.append(batch.rows.copy())
+                    events += batch.events
+                core.steps(SESSION)
+                turn.allow(0, 0, gather_ns)
+                pause("taken")
+                thread.go_on()
+            pause("accounted for")
+            if turn.release():
+                thread.wake()
+            pause("released")
+        thread.close()
+        sender.join()
+    return np.concatenate(rows), events, streamed
+
+
 def compare(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> np.ndarray:
     expected, expected_events, core, decoder = by_core(plan, decider, shots, pieces)
     fed = by_stream(plan, decider, shots, pieces)
-    for rows, events, streamed in (fed, by_descriptor(plan, decider, shots, pieces)):
+    ways = [fed, by_descriptor(plan, decider, shots, pieces)]
+    if not isinstance(core.steps(SESSION), IdleSteps) and core.steps(SESSION).decides:
+        ways.append(by_thread(plan, decider, shots, pieces))
+    for rows, events, streamed in ways:
         same(rows, events, streamed, expected, expected_events, core, decoder)
     return fed[0]
 

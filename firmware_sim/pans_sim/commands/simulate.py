@@ -26,6 +26,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
     parser.add_argument("--core", type=int, metavar="N", help="pin to core N and busy-wait; uses 100 %% of that core")
     parser.add_argument(
+        "--any-core", action="store_true", help="do not leave the last core to the thread of a run that decides"
+    )
+    parser.add_argument(
         "--echo",
         type=Range(0, 1 << 20, whole=True).option,
         metavar="BYTES",
@@ -48,7 +51,7 @@ def _run(args: argparse.Namespace) -> int:
         _announce(args, port.url)
         gc.freeze()  # what was made so far is never collected: hardware has no pauses
         gc.enable()
-        serve(instrument, clock, port, orphaned.is_set, args.core, args.realtime)
+        serve(instrument, clock, port, orphaned.is_set, args.core, args.realtime, not args.any_core)
     finally:
         port.close()
     return 0

@@ -15,7 +15,7 @@ from contextlib import nullcontext
 from typing import Protocol
 
 from pans.base.errors import LinkError, UsageError
-from pans.base.machine import busy_core, scheduled
+from pans.base.machine import busy_core, off_the_deciding_core, scheduled
 from pans_sim.device.clock import SteppedDevice
 
 READ_BYTES = 1 << 16
@@ -169,12 +169,15 @@ def serve(
     stopped: Callable[[], bool],
     core: int | None = None,
     realtime: bool = False,
+    simulates: bool = False,
 ) -> None:
     """Step `device` in real time and carry its bytes over `port` until `stopped()`; on `core`, kept awake, if one is given.
 
-    With `realtime` the thread asks for SCHED_FIFO. A simulator computes its clicks: so it may take most of a core from all others.
+    With `realtime` the thread asks for SCHED_FIFO. A simulator computes its clicks: so it may take most of a core from all others, and
+    stays off the one where a run decides (`simulates`), unless it is given a core.
     """
-    with scheduled("SCHED_FIFO", FIFO_PRIORITY) if realtime else nullcontext(), busy_core(core):
+    apart = off_the_deciding_core() if simulates and core is None else nullcontext()
+    with scheduled("SCHED_FIFO", FIFO_PRIORITY) if realtime else nullcontext(), apart, busy_core(core):
         _serve(device, clock, port, stopped)
 
 

@@ -125,12 +125,17 @@ class Connection:
         """
         if self.on_answer is not None and frame.type in ANSWER_TYPES:
             self.on_answer(arrival_ns, pack_body(frame))
+        is_cores = self.digest(frame, arrival_ns)
+        self.delivered += is_cores
+        self.answers += not is_cores
+        return is_cores
+
+    def digest(self, frame: Frame, arrival_ns: int) -> bool:
+        """Give a frame to the session, which is on record and counted, and return whether it is the core's too."""
         try:
             is_cores = self.session.on_frame(frame, arrival_ns)
         except PansError as error:
             self._failure, is_cores = self._failure or error, False
-        self.delivered += is_cores
-        self.answers += not is_cores
         return is_cores
 
     def flush(self) -> bool:

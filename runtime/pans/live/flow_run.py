@@ -112,25 +112,27 @@ class FlowReceiver(Receiver):
             kernel.blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
         if run.recorder is not None:
             run.recorder.add_decisions(kernel.rows)
-        if pulses := steps.pulses(len(kernel.rows)):  # of the last block, which ended the call
-            arrival_ns, decided_ns = kernel.blocks[-1, [ring.ARRIVAL, ring.DECIDED]].tolist()
-            run.take_pulses(pulses, arrival_ns, decided_ns)
+        if pulses := steps.pulses(kernel.begin.rows, kernel.end.rows):  # mostly of the last block, which was urgent
+            places = [pulse.number - int(kernel.rows["index"][0]) + kernel.begin.rows for pulse in pulses]
+            block_of = np.searchsorted(kernel.blocks[:, ring.ROWS], places, "right")
+            for pulse, stamps in zip(pulses, kernel.blocks[block_of]):
+                run.take_pulses([pulse], int(stamps[ring.ARRIVAL]), int(stamps[ring.DECIDED]))
             run.pulse()
 
-    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
         run, blocks, rows, steps = self._run, kernel.blocks, kernel.rows, kernel.steps
         assert isinstance(steps, FlowCore)
         for output in settled_blocks(kernel) if steps.decides else self._outputs:
             for event in output.events:
                 run.journal.take(event)
             outputs.append(output)
-        yield
         self._ends_of(kernel)
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
         if len(rows):
             run.tally.add_rows(rows, unknown_photons)  # a passage's number is no mark's
             block_of = np.repeat(np.arange(len(blocks)), kernel.rows_by_block)
-            ends_ns, unsure_ns = run.connection.known_clock().to_host_ns_many(steps.leave_ticks(len(rows)))
+            leave_ticks = steps.leave_ticks(kernel.begin.rows, kernel.end.rows)
+            ends_ns, unsure_ns = run.connection.known_clock().to_host_ns_many(leave_ticks)
             stamps = blocks[block_of, : ring.RECORDED + 1]
             run.account_times(int(rows["index"][0]), np.ones(len(rows), np.int64), ends_ns, unsure_ns, stamps)
 
@@ -144,13 +146,14 @@ def settled_blocks(kernel: Kernel) -> Iterator[Output]:
     behind = (heads["exposure_index"] + heads["count"]).astype(np.int64)  # the exposure that follows each block
     empty = {told[0]: told for told in core.told_empty()}
     places = np.flatnonzero(kernel.messages[:, ring.WHAT] == int(MessageType.MARK)).tolist()
-    marks, row = deque(zip(places, map(mark_of, kernel.marks()))), 0
+    marks, row = deque(zip(places, map(mark_of, kernel.marks()))), kernel.begin.rows
+    first = kernel.begin.messages
     decided = kernel.rows_by_block > 0
     some = decided | np.isin(behind, list(empty)) | by_block
     decided[-1] = some[-1] = True
     columns = blocks[:, ring.END_TICK : ring.MESSAGES + 1].tolist()
     for block, (end_tick, stop, place) in enumerate(columns):
-        while marks and marks[0][0] < place:
+        while marks and marks[0][0] < place - first:
             core.remember(marks.popleft()[1])
         following = int(behind[block])
         if decided[block] or by_block:

@@ -13,16 +13,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
 from pans.base.errors import DeviceError, LinkError, RecordingError
-from pans.base.machine import ThreadCounts, arm_realtime, busy_core
+from pans.base.machine import GRANTED, ThreadCounts, apart, arm_realtime, busy_core
 from pans.bundle.sensor import Bundle
 from pans.decide import Follower, exposure_timing
 from pans.decide.dark import DarkGuard, dark_report
+from pans.decide.kernel import BATCH_NS
 from pans.decide.plan import Plan
 from pans.decide.still import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS, Core
 from pans.instrument.click_law import click_law, click_probability
@@ -62,7 +63,8 @@ class Observers:
 
     `uploaded` is called when the device has the plan, before the first kernel is needed: what compiles them elsewhere can be waited for.
 
-    A watcher that only looks (`acts` is False) gets what a call of the kernel brought all at once.
+    A watcher that only looks (`acts` is False) gets what a call of the kernel brought all at once. Where the kernel decides in a thread of
+    its own, what came in `gather_ns` is accounted for and shown at once.
     """
 
     watch: Watcher | None = None
@@ -70,6 +72,7 @@ class Observers:
     stop: Stop | None = None
     acts: bool = True
     uploaded: Callable[[], None] | None = None
+    gather_ns: int = BATCH_NS
 
 
 NO_OBSERVERS = Observers()
@@ -121,43 +124,48 @@ def running(
     run = LiveRun(connection, plan, core, len(bundle.classes), config, recorder, started_ns)
     run.failed = failed
     try:
-        _warm_up(run, prompt=observers.acts and observers.watch is not None)
+        _warm_up(run, observers)
         with _granted(run):
             _light_on(run, recovery, prepare, observers)
         yield _result(run, profile)
     finally:
-        run.connection.close()
+        run.close()
 
 
-def _warm_up(run: LiveRun, *, prompt: bool) -> None:
-    """Load what receives; with `prompt` a watcher acts."""
+def _warm_up(run: LiveRun, observers: Observers) -> None:
+    """Load what receives."""
     run.core.warm_up()
-    run.receiver = receiver_of(run, run.core, prompt=prompt)
+    prompt = observers.acts and observers.watch is not None
+    run.receiver = receiver_of(run, run.core, prompt=prompt, gather_ns=observers.gather_ns)
     run.receiver.prepare()  # before the heap is touched: loading kernels takes memory
 
 
-def receiver_of(run: LiveRun, core: Follower, *, prompt: bool) -> Receiver:
+def receiver_of(run: LiveRun, core: Follower, *, prompt: bool, gather_ns: int) -> Receiver:
     """Return the receiver for `core`."""
     if isinstance(core, Core):
-        return StillReceiver(run, core, prompt=prompt)
+        return StillReceiver(run, core, prompt=prompt, gather_ns=gather_ns)
     if not core.moving:  # it takes every message itself
         return Receiver(run, core, prompt=prompt)
     from .flow_run import FlowReceiver
 
-    return FlowReceiver(run, core, prompt=prompt)
+    return FlowReceiver(run, core, prompt=prompt, gather_ns=gather_ns)
 
 
 @contextmanager
 def _granted(run: LiveRun) -> Iterator[None]:
     """What the machine grants to a run at real pace, as long as it lasts; `run.realtime` says what that is."""
     link, reader, config = run.connection.link, run.connection.reader.thread_id, run.config
+    own = run.receiver.thread_id  # None: this thread decides, and the reader's may stand in for it
+    deciding = [0, *([] if reader is None else [reader])] if own is None else [own]
     welcome = run.connection.session.welcome
     simulated = link.simulated or bool(welcome and welcome.facts.get("simulated"))
     wanted = config.realtime and not link.virtual and (config.realtime_simulated or not simulated)
-    with (
-        busy_core(None if link.virtual else config.core) as awake,
-        arm_realtime(wanted, [] if reader is None else [reader]) as granted,
-    ):
+    with ExitStack() as held:
+        awake = held.enter_context(busy_core(None if link.virtual else config.core, own or 0))
+        granted = held.enter_context(arm_realtime(wanted, deciding))
+        # a thread of real-time priority gets a free core by itself, and the user may have chosen one
+        if own is not None and not awake and not config.any_core and granted.get("sched_fifo") != GRANTED:
+            granted |= held.enter_context(apart(own))
         run.realtime = granted | awake | {"turn": "; ".join(filter(None, ("compiled", why_fed(link))))}
         yield
 
@@ -166,7 +174,7 @@ def _light_on(
     run: LiveRun, recovery: Recovery | None, prepare: Callable[[Link], Connection], observers: Observers
 ) -> None:
     """From arming to dark: however it ends, the device is told to stop."""
-    counts = ThreadCounts()
+    counts = ThreadCounts(run.receiver.thread_id)
     try:
         if observers.prepared is not None:
             observers.prepared(run)

@@ -58,6 +58,7 @@ class RunOptions:
         False, "ask for SCHED_FIFO and locked memory with a simulated device too", flag="--realtime"
     )
     core: int | None = option(None, "pin to core N and busy-wait; uses 100 %% of that core", type=int, metavar="N")
+    any_core: bool = option(False, "do not keep a core for the thread that decides")
     out: Path | None = option(
         None, f"folder for the recording and the summary (default: a new one in {RUNS})", type=Path, metavar="DIR"
     )

@@ -1,7 +1,10 @@
-"""Receives the bytes of a run: calls the kernel (package kernel), then settles what came in the call, once its commands have left.
+"""Receives the bytes of a run: the kernel reads and decides, then what it brought is accounted for.
 
 `Receiver.receive` returns the outputs of what came: decisions in rows, events, the tick at which the last exposure ended. The kernel takes
 what is ordinary; any other message is given to `LiveRun.take_frame`, which continues the same state.
+
+Where the link has a descriptor and the kernel gives each label, the kernel serves in a thread of its own (deciding.py) and hands over
+batches; deciding then never waits for the accounting. Else it is called in turn with the accounting.
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.base.errors import LinkError
+from pans.base.machine import give_way
 from pans.decide import Follower, Output, RowDecisions
 from pans.decide.kernel import QUIET_NS, Kernel, Limits, offered, unpack_blocks
 from pans.decide.kernel import arrays as ring
@@ -24,22 +29,24 @@ from pans.live.timing.causes import INFERENCE, NS_PER_S
 from pans.protocol.clock import STEP_MARGIN_NS
 from pans.protocol.links import Link, count_delimiters, descriptor_of
 from pans.protocol.session import STREAM_TYPES, Refusal
-from pans.protocol.wire import BLOCK_DTYPE, HEADER, MessageType, Opcode, decode_ack
+from pans.protocol.wire import BLOCK_DTYPE, HEADER, MessageType, Opcode, decode_ack, unpack_body
 from pans.record.reading import Kind
 
 from .connection import Connection
+from .deciding import PARK_GIVE_UP_S, DecidingThread
 
 if TYPE_CHECKING:
-    from .run import LiveRun
+    from .run import LiveRun, Taken
 
 I64 = npt.NDArray[np.int64]
 
 GATHERED_BYTES = 1 << 18
 EAGER_NS = 200_000  # as protocol/links/reader.py: an answer that was asked for is waited for awake
 LEAST_NS = 100_000
-# A call returns at least so often: signals, the watchdog's heartbeat, other threads' wishes. Accounting costs the same for one block as
-# for twenty, so that it comes seldom; but what it takes at once delays the blocks that come meanwhile.
-CALL_NS = 30_000_000
+CALL_NS = (
+    30_000_000  # a call in turn returns at least so often: signals, the watchdog's heartbeat, other threads' wishes
+)
+WAIT_NS = 100_000_000  # so does a wait for a batch
 
 
 def why_fed(link: Link) -> str:
@@ -60,27 +67,41 @@ def has_host_clock(link: Link) -> bool:
 class Receiver:
     """The kernel's calls of `run`, across reconnections: `prepare` before each ARM, then `receive` again and again.
 
-    With `prompt`, a call ends behind the first bytes that gave a decision, for a watcher that acts.
+    With `prompt`, a call ends behind the first bytes that gave a decision, for a watcher that acts. `gather_ns` is for how long a kernel in
+    a thread of its own gathers blocks before it hands them over.
     """
 
-    def __init__(self, run: LiveRun, core: Follower, *, prompt: bool) -> None:
-        self._run, self._core, self._prompt = run, core, prompt
+    def __init__(self, run: LiveRun, core: Follower, *, prompt: bool, gather_ns: int = 0) -> None:
+        self._run, self._core, self._prompt, self._gather_ns = run, core, prompt, gather_ns
+        self._thread: DecidingThread | None = None
+        self._parked, self._parked_ns = False, 0  # whether the kernel waits for Python, and since when
+        # whether the core takes a message without touching the rows of the batch before
+        self._rows_stay = not core.moving
         self._kernel: Kernel | None = None
         self._attached: Connection | None = None
         self._fd: int | None = None
         self._stamps_itself = True  # whether the kernel's times are the link's
         self._asked = False  # what Python sent of a call is about to be answered
-        self._goes_between = False  # whether the kernel is called between the parts of the settling, too
-        self._following = 0  # the exposure behind what is settled
-        self._told = (0, 0)  # of the answers and commands of a call, those that the session knows of
         self._gives_up = False  # nothing is sent any more
+
+    @property
+    def thread_id(self) -> int | None:
+        """Native id of the thread that decides; None where that is the one that calls."""
+        return None if self._thread is None else self._thread.thread_id
 
     def next_id(self) -> int:
         """Let a call that is under way end, from any thread; return the id that follows those of the commands that it has sent."""
         if self._kernel is None:
             return 0
         self._kernel.stop()
+        if self._thread is not None:
+            self._thread.wake()
         return int(self._kernel.control[ring.NEXT_ID])
+
+    def close(self) -> None:
+        """End the thread that decides."""
+        if self._thread is not None:
+            self._thread.close()
 
     def prepare(self) -> None:
         """Attach the kernel to the run's present connection, once; kernels are compiled or loaded."""
@@ -97,6 +118,12 @@ class Receiver:
         link = run.connection.link
         self._fd = None if why_fed(link) else descriptor_of(link)
         self._stamps_itself = has_host_clock(link)
+        if self._may_serve(self._kernel) and self._thread is None:
+            self._thread = DecidingThread()
+
+    def _may_serve(self, kernel: Kernel) -> bool:
+        """Whether `kernel` may decide in a thread of its own: it needs nobody's help for an ordinary message, and nobody acts on each."""
+        return self._fd is not None and kernel.steps.decides and not self._prompt
 
     def _warm_up(self, kernel: Kernel) -> None:
         """Compile or load what settles a call."""
@@ -106,13 +133,14 @@ class Receiver:
         run, outputs = self._run, list[Output]()
         connection, kernel = run.connection, self._kernel
         assert kernel is not None
-        if self._fd is not None and connection.reader.lend():
+        if self.serves or self._begins_to_serve(kernel):
+            self._receive_batch(kernel, outputs)
+        elif self._fd is not None and connection.reader.lend():
             try:
                 asked = connection.send_due()
                 self._load(kernel)
-                limits = self._limits(eager=asked)
-                ended = self._run_on(kernel, limits, outputs, more=kernel.holds)
-                ended = self._settle(kernel, outputs, ended)
+                ended = self._sent(kernel, kernel.run(self._fd, self._limits(eager=asked)))
+                self._settle(kernel, outputs)
             finally:
                 connection.reader.take_back()
             self._continue(kernel, ended, outputs, kernel.run)
@@ -125,19 +153,6 @@ class Receiver:
         if not outputs:
             connection.raise_failure()
         return outputs
-
-    def _goes_on(self, kernel: Kernel, ended: int, outputs: list[Output]) -> bool:
-        """Do what has nothing to do with the blocks of the call that ended; return whether that was all there is to do."""
-        if ended == ring.ODD:
-            kind = kernel.odd_type
-            if kind == MessageType.PONG or (kind == MessageType.ACK and not kernel.control[ring.DRIVES]):
-                self._take_odd(kernel, outputs)
-                return True
-        run, connection, block_ns = self._run, self._run.connection, int(kernel.control[ring.BLOCK_NS])
-        if ended != ring.DUE or not run.lateness.ask_if_overdue(connection, block_ns, run.now_ns()):
-            return False
-        connection.flush()
-        return True
 
     def last(self, poll_s: float) -> None:
         """Receive while the device stops: no state is named any more."""
@@ -152,16 +167,125 @@ class Receiver:
         if kernel is None or self._attached is not run.connection or run.connection is not run.armed:
             run.connection.rest()
             return
-        self.finish([])
+        self._gives_up = True
+        self.stop_serving([])
         if chunks := run.connection.reader.rest():
-            self._gives_up = True
             self._feed(kernel, chunks, [])
-            self._gives_up = False
+        self._gives_up = False
 
-    def finish(self, outputs: list[Output]) -> None:
-        """Settle what came while something else was settled."""
-        if self._kernel is not None:
-            self._settle(self._kernel, outputs, ring.ALL_TAKEN)
+    # -- a kernel in a thread of its own -------------------------------------------------------------------------------
+
+    @property
+    def serves(self) -> bool:
+        """Whether the kernel decides in a thread of its own now."""
+        return self._thread is not None and self._thread.serves
+
+    def _begins_to_serve(self, kernel: Kernel) -> bool:
+        """Let the kernel serve, where it may and nothing waits that was read before."""
+        run, thread = self._run, self._thread
+        if thread is None or run.stops or self._gives_up or not self._may_serve(kernel):
+            return False
+        assert self._fd is not None
+        if not kernel.steps.takes or not run.connection.reader.lend(long=True):
+            return False
+        self._allow(kernel)
+        thread.start(kernel, self._fd)
+        return True
+
+    def _allow(self, kernel: Kernel) -> None:
+        """Before the kernel begins to serve, or goes on: tell it how things stand."""
+        self._load(kernel)
+        lateness = self._run.lateness
+        kernel.allow(lateness.longest_ns, lateness.evidence.floor_ns, self._gather_ns)
+
+    def _receive_batch(self, kernel: Kernel, outputs: list[Output]) -> None:
+        """Wait until a batch is handed over, and account for it; answer what only Python can answer."""
+        run, thread = self._run, self._thread
+        assert thread is not None
+        run.connection.send_due()
+        now_ns = run.now_ns()
+        thread.wait(min(max(run.due_ns - now_ns, LEAST_NS), WAIT_NS) / NS_PER_S)
+        if kernel.control[ring.OVERDUE]:
+            kernel.control[ring.OVERDUE] = 0
+            run.connection.session.probe(run.now_ns())
+            run.connection.flush()
+        self._take_batch(kernel, outputs)
+        if not self._parked:
+            return
+        ended = kernel.end.ended
+        if ended == ring.GONE:
+            self.stop_serving(outputs)
+            self._ask_why(kernel)
+            return
+        if ended == ring.ODD:  # of a flow
+            self._take_odd(kernel, outputs)
+        elif ended == ring.BROKEN:
+            self._sent(kernel, ended)
+        self._go_on(kernel)
+
+    def _take_batch(self, kernel: Kernel, outputs: list[Output]) -> None:
+        """Account for the batch that has been handed over, if there is one."""
+        thread = self._thread
+        assert thread is not None
+        if not kernel.receive_batch():
+            return
+        self._parked, self._parked_ns = bool(kernel.reported[ring.PARKED]), self._run.now_ns()
+        try:
+            taken = self._settle(kernel, outputs)
+            give_way()
+            self._run.report(outputs)  # before the kernel writes over the rows
+            if taken is not None:
+                self._run.book_frame(taken, outputs)
+        finally:  # a file that cannot be written must not make messages count twice
+            if kernel.release():
+                thread.wake()
+
+    def _go_on(self, kernel: Kernel) -> None:
+        thread, run = self._thread, self._run
+        assert thread is not None
+        self._allow(kernel)
+        self._parked = False
+        thread.go_on()
+        run.lateness.evidence.parked(self._parked_ns, run.now_ns())
+
+    def _park(self, kernel: Kernel, outputs: list[Output]) -> None:
+        """Let the kernel wait for Python, with all accounted for that it has brought."""
+        thread = self._thread
+        assert thread is not None
+        thread.ask_to_park()
+        give_up_s = time.monotonic() + PARK_GIVE_UP_S
+        while not self._parked:
+            thread.wait(PARK_GIVE_UP_S / 10)
+            self._take_batch(kernel, outputs)
+            if time.monotonic() > give_up_s:
+                raise LinkError("the thread that decides does not answer")
+
+    @contextmanager
+    def held(self, outputs: list[Output]) -> Iterator[None]:
+        """While the block runs, the core may be changed: nothing is decided, and all is accounted for that came before."""
+        kernel = self._kernel
+        if kernel is None or not self.serves:
+            yield
+            return
+        self._park(kernel, outputs)
+        yield
+        if kernel.end.ended == ring.ODD:  # of a flow: it was about to park for this one
+            self._take_odd(kernel, outputs)
+        kernel.control[ring.PARK] = 0
+        self._go_on(kernel)
+
+    def stop_serving(self, outputs: list[Output]) -> None:
+        """From here on the kernel is called in turn; all is accounted for that came before."""
+        kernel, run = self._kernel, self._run
+        if kernel is None or self._thread is None or not self._thread.serves:
+            return
+        try:
+            self._park(kernel, outputs)
+        finally:
+            self._thread.stop()
+            self._parked = False
+            run.connection.reader.take_back()
+        self._continue(kernel, kernel.end.ended, outputs, kernel.run)
 
     # -- before a call -------------------------------------------------------------------------------------------------
 
@@ -179,9 +303,8 @@ class Receiver:
         next_id, oldest_id, oldest_ns, waiting = run.connection.session.window
         drives = driver is not None and not run.stops and not run.is_broken and not self._gives_up
         control[ring.DRIVES : ring.WAITING + 1] = (drives, waiting)
-        control[ring.NEXT_ID : ring.OLDEST_NS + 1], control[ring.FIRST_ID] = (next_id, oldest_id, oldest_ns), next_id
-        if not kernel.holds:
-            control[ring.BLOCK_NS], self._told = run.lateness.block_ns, (0, 0)
+        control[ring.NEXT_ID : ring.OLDEST_NS + 1] = (next_id, oldest_id, oldest_ns)
+        control[ring.BLOCK_NS] = run.lateness.block_ns
         if driver is not None:
             control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1] = driver.sent
         self._core.steps(run.connection.session.nonce)
@@ -216,9 +339,9 @@ class Receiver:
 
     def _feed(self, kernel: Kernel, chunks: Sequence[tuple[int, bytes]], outputs: list[Output]) -> None:
         """Take what Python has read."""
-        self.finish(outputs)
         self._load(kernel)
-        ended = self._settle(kernel, outputs, self._sent(kernel, kernel.feed(chunks)))
+        ended = self._sent(kernel, kernel.feed(chunks))
+        self._settle(kernel, outputs)
         self._continue(kernel, ended, outputs, kernel.feed_on)
 
     def _continue(self, kernel: Kernel, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
@@ -228,32 +351,29 @@ class Receiver:
                 self._take_odd(kernel, outputs)
             self._load(kernel)
             self._run.report(outputs)  # before the rings are filled anew
-            ended = self._settle(kernel, outputs, self._sent(kernel, again()))
+            ended = self._sent(kernel, again())
+            self._settle(kernel, outputs)
 
     def _take_odd(self, kernel: Kernel, outputs: list[Output]) -> None:
         """Let Python take one message that is not ordinary."""
+        if (taken := self._taken(kernel)) is not None:
+            self._run.book_frame(taken, outputs)
+
+    def _taken(self, kernel: Kernel) -> Taken | None:
+        """Let the core take one message that is not ordinary; None where it is the session's alone."""
         run, arrival_ns = self._run, kernel.arrival_ns
         connection, frame = run.connection, kernel.take_odd()
         if frame.type in STREAM_TYPES and frame.session == connection.session.nonce:
             connection.session.heard_ns = arrival_ns
             connection.delivered += 1
-            run.take_frame(arrival_ns, frame, outputs)
-        elif connection.sort(frame, arrival_ns):
-            run.take_frame(arrival_ns, frame, outputs)
-
-    def _run_on(self, kernel: Kernel, limits: Limits, outputs: list[Output], *, more: bool) -> int:
-        """Let the kernel read until `limits`; return why it ended."""
-        assert self._fd is not None
-        ended = self._sent(kernel, kernel.run(self._fd, limits, more=more))
-        while self._goes_on(kernel, ended, outputs):
-            limits = limits._replace(patience_ns=self._run.lateness.patience_ns, eager_ns=0)
-            ended = self._sent(kernel, kernel.run(self._fd, limits, more=True))
-        return ended
+        elif not connection.sort(frame, arrival_ns):
+            return None
+        return run.take_frame(arrival_ns, frame)
 
     def _sent(self, kernel: Kernel, ended: int) -> int:
         """Send what is left of a command that the kernel could not send whole, all of it without a descriptor; return `ended`."""
         if ended == ring.BROKEN:
-            last, unsent = kernel.rings.shows[kernel.said.shows - 1], kernel.said.unsent
+            last, unsent = kernel.rings.shows[kernel.end.shows - 1], kernel.end.unsent
             try:
                 self._run.connection.link.write(kernel.bytes_of(last)[-unsent:])
                 last[ring.TIME], self._asked = self._run.now_ns(), True
@@ -265,7 +385,7 @@ class Receiver:
 
     def _ask_why(self, kernel: Kernel) -> None:
         """The descriptor says that the other end is gone: the link says it in its words."""
-        link, errno = self._run.connection.link, kernel.said.errno
+        link, errno = self._run.connection.link, kernel.end.errno
         try:
             self._run.connection.reader.wait(0.0)
             raise LinkError(f"{link.name} went away: {os.strerror(errno) if errno else 'closed by the other end'}")
@@ -285,55 +405,36 @@ class Receiver:
                 evidence.waited(began, asked, ended)
         evidence.arrived(*kernel.arrivals.tolist())
 
-    def _settle(self, kernel: Kernel, outputs: list[Output], ended: int) -> int:
-        """Account for what a call took and sent; `ended` says why it ended. Return why the latest call ended.
+    def _settle(self, kernel: Kernel, outputs: list[Output]) -> Taken | None:
+        """Account for what a call, or a batch, brought: session, driver, marks, recording, decisions.
 
-        Settling takes longer than a block. Between its parts the kernel takes what has come meanwhile, where it is the kernel that reads
-        and decides: that is settled with the next call, and with this one if it is not ordinary.
+        A kernel that is parked for an irregular message gets it taken and goes on before the decisions are accounted for; return what
+        came of that message.
         """
-        while True:
-            for _ in self._parts(kernel, outputs):
-                if self._goes_between and self._fd is not None and ended == ring.DUE:
-                    try:
-                        ended = self._run_on(kernel, self._glance(), outputs, more=True)
-                    except LinkError as error:  # told once all that has come is settled
-                        self._run.note_broken(error)
-                        ended = ring.ALL_TAKEN
-            if ended == ring.DUE or not kernel.holds:
-                break
-        if self._told != (kernel.said.answers, kernel.said.shows):
+        run, begin, end = self._run, kernel.begin, kernel.end
+        taken: Taken | None = None
+        if end.kept > begin.kept:
+            connection = run.connection
+            connection.session.heard_ns = end.heard_ns or connection.session.heard_ns
+            connection.delivered += end.messages - begin.messages
+            connection.answers += end.answers - begin.answers
+            run.taken_here += end.messages - begin.messages
             self._settle_commands(kernel)
-        return ended
-
-    def _glance(self) -> Limits:
-        """Return the limits of a call that takes what is there and waits for nothing."""
-        run = self._run
-        return Limits(run.now_ns() - QUIET_NS, 0, 0, max(run.messages_granted, 1), run.lateness.evidence.floor_ns)
-
-    def _parts(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:
-        """Settle what has come up to now, in parts: session, driver, marks, recording, decisions."""
-        run, begin, end = self._run, kernel.begin, kernel.look()
-        self._following = self._core.tracker.next_exposure
-        try:
-            if end.kept > begin.kept:
-                connection = run.connection
-                connection.session.heard_ns = end.heard_ns or connection.session.heard_ns
-                connection.delivered += end.messages - begin.messages
-                connection.answers += end.answers - begin.answers
-                run.taken_here += end.messages - begin.messages
-                self._settle_commands(kernel)
-                self._stamp(kernel)
-                if end.messages - begin.messages > end.steps - begin.steps:
-                    self._settle_marks(kernel)
-                    yield
-                self._record(kernel)
-                yield
-                if end.steps > begin.steps:
-                    yield from self._settle_blocks(kernel, outputs)
-            if not run.connection.link.virtual and (end.notes > begin.notes or end.arrivals > begin.arrivals):
-                self._note(kernel)
-        finally:  # a file that cannot be written must not make messages count twice
-            kernel.done()
+            self._stamp(kernel)
+            give_way()  # between the parts, each of some 0.2 ms: nobody who is in a hurry waits for the whole
+            if end.messages - begin.messages > end.steps - begin.steps:
+                self._settle_marks(kernel)
+            self._record(kernel)
+        if self.serves and end.ended == ring.ODD and self._rows_stay:
+            taken = self._taken(kernel)
+            self._go_on(kernel)
+        if end.kept > begin.kept:
+            give_way()
+            if end.steps > begin.steps:
+                self._settle_blocks(kernel, outputs)
+        if not run.connection.link.virtual and (end.notes > begin.notes or end.arrivals > begin.arrivals):
+            self._note(kernel)
+        return taken
 
     def _stamp(self, kernel: Kernel) -> None:
         """Set the times of the blocks where the kernel has another clock than the link; in virtual time none passes in between."""
@@ -356,27 +457,28 @@ class Receiver:
         self._core.remember_rows(kernel.marks())
 
     def _settle_commands(self, kernel: Kernel) -> None:
-        """Bring the session and the driver to where the kernel has them."""
-        run, control, (n_answers, n_shows) = self._run, kernel.control, self._told
-        self._told = kernel.said.answers, kernel.said.shows
-        if self._told == (n_answers, n_shows):
-            return
-        answers, shows = kernel.rings.answers[n_answers : self._told[0]], kernel.rings.shows[n_shows : self._told[1]]
-        first = int(control[ring.NEXT_ID]) - len(shows)
-        open_since = max(int(control[ring.OLDEST_ID]), first)
-        sent = [(number, kernel.bytes_of(shows[number - first])) for number in range(open_since, first + len(shows))]
+        """Bring the session and the driver to where the kernel has them, and give the session the answers that are left to it."""
+        run, control, shows, answers = self._run, kernel.reported, kernel.shows, kernel.answers
         session = run.connection.session
-        session.continue_from(int(control[ring.OLDEST_ID]), int(control[ring.OLDEST_NS]), sent, Opcode.SHOW)
-        session.next_id = first + len(shows)
-        for span in answers[answers[:, ring.WHAT] == ring.REFUSAL]:
-            ack = decode_ack(kernel.bytes_of(span)[HEADER.size :])
+        if control[ring.DRIVES]:
+            first = int(control[ring.NEXT_ID]) - len(shows)
+            open_since = max(int(control[ring.OLDEST_ID]), first)
+            sent = [(n, kernel.bytes_of(shows[n - first])) for n in range(open_since, first + len(shows))]
+            session.continue_from(int(control[ring.OLDEST_ID]), int(control[ring.OLDEST_NS]), sent, Opcode.SHOW)
+            session.next_id = first + len(shows)
+        for span in answers[answers[:, ring.WHAT] != ring.DONE] if len(answers) else ():
+            body = kernel.bytes_of(span)
+            if span[ring.WHAT] != ring.REFUSAL:
+                run.connection.digest(unpack_body(body), int(span[ring.TIME]))
+                continue
+            ack = decode_ack(body[HEADER.size :])
             session.refusals.append(Refusal(ack.refused_id, ack.status, ack.text, Opcode.SHOW))
-        if run.driver is not None:
+        if run.driver is not None and control[ring.DRIVES]:
             exposure, state = control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1].tolist()
             run.driver.account((exposure, state), shows[:, ring.TIME] - shows[:, ring.WHAT])
 
-    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:
-        """Account for the blocks of a call and their decisions, in parts."""
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
+        """Account for the blocks of a call and their decisions."""
         raise NotImplementedError
 
     def _ends_of(self, kernel: Kernel) -> tuple[I64, I64]:
@@ -391,8 +493,8 @@ class Receiver:
 class StillReceiver(Receiver):
     """The receiver of a run with objects that stand still."""
 
-    def __init__(self, run: LiveRun, core: Core, *, prompt: bool) -> None:
-        super().__init__(run, core, prompt=prompt)
+    def __init__(self, run: LiveRun, core: Core, *, prompt: bool, gather_ns: int = 0) -> None:
+        super().__init__(run, core, prompt=prompt, gather_ns=gather_ns)
         self._still = core
         self._stamps, self._bits = np.ones(0, np.uint16), np.ones(0, np.uint8)
         if core.guard is not None and not core.windows.parallel:
@@ -400,39 +502,36 @@ class StillReceiver(Receiver):
             self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
 
     def _warm_up(self, kernel: Kernel) -> None:
-        self._goes_between = kernel.steps.decides and not self._prompt
         unpack_blocks(kernel.kept, kernel.messages, self._stamps, self._bits)
         if self._run.recorder is not None:
             self._run.recorder.add_stamped(Kind.MESSAGES, kernel.kept, kernel.messages)
 
-    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> Iterator[None]:
+    def _settle_blocks(self, kernel: Kernel, outputs: list[Output]) -> None:
         run, blocks, steps = self._run, kernel.blocks, kernel.steps
         assert isinstance(steps, CoreState)
         rows = kernel.rows  # a back end that is not the kernel's decides here
         if not steps.decides and not run.connection.link.virtual:
             blocks[:, ring.DECIDED : ring.RECORDED + 1] = run.now_ns()
-        yield  # from here on the kernel decides what comes between two parts
         events = self._watch(kernel)
         for event in events:
             run.journal.take(event)
-        yield
+        give_way()
         if self._still.guard is not None and not self._still.windows.parallel:
             self._still.watch_objects(rows)
-            yield
+            give_way()
         ends_ns, unsure_ns = self._ends_of(kernel)
+        give_way()
         if len(rows):
             run.tally.add_rows(rows, steps.photons_of)
-            yield
+            give_way()
             if run.recorder is not None:
                 run.recorder.add_decisions(rows)
-                yield
             counts = kernel.rows_by_block
             some = counts > 0
             stamps = blocks[some, : ring.RECORDED + 1]
             run.account_times(int(rows["index"][0]), counts[some], ends_ns[some], unsure_ns[some], stamps)
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
         outputs.append(Output(RowDecisions(rows), events, int(blocks[-1, ring.END_TICK])))
-        yield
 
     def _watch(self, kernel: Kernel) -> list[Any]:
         """Let the guard of the dark counts see the exposures of a call."""
@@ -443,7 +542,7 @@ class StillReceiver(Receiver):
             spans, heads = kernel.heads(MessageType.FRAMES, BLOCK_DTYPE)
             return core.watch_frames(_words_of(kernel.kept, spans, heads), heads)
         n = int(unpack_blocks(kernel.kept, kernel.messages, self._stamps, self._bits))
-        return core.watch_blocks(self._stamps[:n], self._bits[:n], self._following - n)
+        return core.watch_blocks(self._stamps[:n], self._bits[:n], kernel.end.following - n)
 
 
 def _words_of(kept: npt.NDArray[np.uint8], spans: I64, heads: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:

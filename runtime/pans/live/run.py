@@ -9,13 +9,13 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from contextlib import suppress
-from typing import Any, Protocol
+from contextlib import AbstractContextManager, suppress
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from pans.base.errors import DeviceError, LinkError
+from pans.base.errors import DeviceError, LinkError, RecordingError
 from pans.decide import DECISION_DTYPE, Action, Follower, Output
 from pans.decide.plan import Plan
 from pans.decide.still import Core
@@ -51,7 +51,9 @@ from .tally import RunTally, unknown_photons
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
 RECEIVE_WINDOW = 4096  # stream messages
-FLUSH_EVERY_NS = 500 * NS_PER_MS
+FLUSH_EVERY_NS = (
+    467 * NS_PER_MS
+)  # no divisor of a second: a device says how it stands each second, and Python has to answer then
 POLL_S = 0.02
 LONGEST_LEAD_NS = 32 * ARM_LEAD_NS  # five refusals, each twice as far ahead
 STOP_GIVE_UP_NS = 1 * NS_PER_S
@@ -61,6 +63,14 @@ SILENCE_NS = 5 * NS_PER_S  # without clicks
 Watcher = Callable[["LiveRun", Output], None]
 I64 = npt.NDArray[np.int64]
 Rows = npt.NDArray[np.void]
+
+
+class Taken(NamedTuple):
+    """A message that the core has taken, what came of it, and when it arrived, was decoded and decided, in ns."""
+
+    frame: Frame
+    output: Output
+    times_ns: tuple[int, int, int]
 
 
 class Receives(Protocol):
@@ -74,7 +84,17 @@ class Receives(Protocol):
 
     def rest(self) -> None: ...
 
-    def finish(self, outputs: list[Output]) -> None: ...
+    def held(self, outputs: list[Output]) -> AbstractContextManager[None]: ...
+
+    def stop_serving(self, outputs: list[Output]) -> None: ...
+
+    def close(self) -> None: ...
+
+    @property
+    def serves(self) -> bool: ...
+
+    @property
+    def thread_id(self) -> int | None: ...
 
     def next_id(self) -> int: ...
 
@@ -171,9 +191,12 @@ class LiveRun:
         self._lead_ns *= 2
         self.journal.note("armed_too_late", lead_ms=self._lead_ns // NS_PER_MS)
         n_cycles = self.core.cycles_left(self.config.n_cycles) if self.config.n_cycles else 0
-        now_ns, start_tick = self._start()
-        self.core.begin_later(start_tick)
-        self._send_arm(now_ns, Arm(start_tick, n_cycles, self.config.lease_ms))
+        outputs: list[Output] = []
+        with self.receiver.held(outputs):
+            now_ns, start_tick = self._start()
+            self.core.begin_later(start_tick)
+            self._send_arm(now_ns, Arm(start_tick, n_cycles, self.config.lease_ms))
+        self.report(outputs)
         return True
 
     def _start(self) -> tuple[int, int]:
@@ -189,7 +212,7 @@ class LiveRun:
 
     def _send_arm(self, now_ns: int, arm: Arm) -> None:
         start_ns = now_ns + self._lead_ns
-        self.lateness.attach(self.connection, start_ns)
+        self.lateness.attach(self.connection, start_ns, self.receiver.thread_id)
         self.connection.session.submit(Opcode.ARM, pack_command(arm))
         if self.driver is not None:
             self.driver.begin(self.connection)
@@ -207,6 +230,9 @@ class LiveRun:
     def stop(self) -> None:
         """Tell the device to go dark. One that does not answer any more does so by itself when its lease runs out."""
         session, self._watch = self.connection.session, None
+        unwritten: RecordingError | None = None
+        if self.driver is not None:  # what the kernel sends has its numbers from the same session
+            unwritten = self._stop_serving()
         give_up_ns = self.now_ns() + (0 if self.link_lost else STOP_GIVE_UP_NS)
         try:
             session.submit(Opcode.STOP)
@@ -217,6 +243,7 @@ class LiveRun:
             self.lose_link(error)
         except KeyboardInterrupt:  # a second Ctrl-C: STOP is sent, and the lease does the rest
             self.ended = self.ended or "interrupted"
+        unwritten = self._stop_serving() or unwritten
         self.take_rest()
         self.settle(self.core.end())
         self.gates.finish(session)
@@ -225,6 +252,19 @@ class LiveRun:
         self.lateness.evidence.close()
         self.journal.clock(self.connection)
         self.stopped = True
+        if unwritten is not None:
+            raise unwritten
+
+    def _stop_serving(self) -> RecordingError | None:
+        """Call the kernel in turn from here on; return why the recording had to be given up: the light goes off first."""
+        try:
+            self.receiver.stop_serving([])
+        except RecordingError as error:
+            self.drop_recorder()
+            return error
+        except LinkError as error:
+            self.lose_link(error)
+        return None
 
     def take_rest(self) -> None:
         """Decide on and record what has arrived on a connection that is given up: lost is only what never came."""
@@ -265,7 +305,9 @@ class LiveRun:
         idle = self._idle and not outputs
         now_ns = self.now_ns()
         self._act(now_ns)
-        if (verdict := self.lateness.settled(self.connection, now_ns, idle=idle)) is not None:
+        if (
+            verdict := self.lateness.settled(self.connection, now_ns, idle=idle and not self.receiver.serves)
+        ) is not None:
             self.journal.take(verdict)
         self.journal.refusals(self.connection)
         self.report(outputs)
@@ -321,10 +363,10 @@ class LiveRun:
             self.connection.session.poll(now_ns)
             self.connection.flush()
 
-    def take_frame(self, arrival_ns: int, frame: Frame, outputs: list[Output]) -> None:
-        """Let the core take one message, and account for what comes of it; it takes nothing of a connection that was not armed."""
+    def take_frame(self, arrival_ns: int, frame: Frame) -> Taken | None:
+        """Let the core take one message, record it, and return what `book_frame` accounts for; None of a connection that was not armed."""
         if self.connection is not self.armed:
-            return
+            return None
         decoded_ns = self.now_ns()
         output = self.core.step(frame)
         self._drive(arrival_ns)
@@ -332,7 +374,12 @@ class LiveRun:
         self.lateness.evidence.worked(INFERENCE, decoded_ns, self.now_ns())
         if self.recorder is not None:
             self.recorder.add_message(arrival_ns, pack_body(frame))
-        self.book(output, (arrival_ns, decoded_ns, self.now_ns()), outputs)
+        return Taken(frame, output, (arrival_ns, decoded_ns, self.now_ns()))
+
+    def book_frame(self, taken: Taken, outputs: list[Output]) -> None:
+        """Account for what came of a message that the core has taken."""
+        frame, arrival_ns = taken.frame, taken.times_ns[0]
+        self.book(taken.output, taken.times_ns, outputs)
         if frame.type == MessageType.STATUS:
             with suppress(MalformedMessage):  # counted where it was taken
                 status = decode_status(frame.payload)  # the session may know a later one, where the host was held up
@@ -459,13 +506,14 @@ class LiveRun:
             return
         for event in recorder.news():
             self.journal.note(**event)
-        if recorder.wants_part:
-            self.receiver.finish(outputs)  # belongs to this part
+        if not recorder.wants_part:
+            return
+        with self.receiver.held(outputs):  # what came before belongs to this part
             self.report(outputs)
-        if recorder.wants_part and (place := self.core.part()) is not None:
-            recorder.next_part(place.facts(), self._setup, now_ns)
-            recorder.add_clock(self.connection.known_clock().history())
-            self.journal.session(self.connection)
+            if (place := self.core.part()) is not None:
+                recorder.next_part(place.facts(), self._setup, now_ns)
+                recorder.add_clock(self.connection.known_clock().history())
+                self.journal.session(self.connection)
 
     def _renew(self, now_ns: int) -> None:
         self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW
@@ -478,6 +526,14 @@ class LiveRun:
         """End the run because the link is gone; what was decided so far stands."""
         self.ended = self.ended or f"the link was lost: {error.message}"
         self.link_lost = True
+
+    def close(self) -> None:
+        """Close the link, and end the thread that decides."""
+        try:
+            if hasattr(self, "receiver"):
+                self.receiver.close()
+        finally:
+            self.connection.close()
 
     def drop_recorder(self) -> None:
         """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""

@@ -41,7 +41,9 @@ def test_a_link_that_breaks_under_a_pulse_loses_nothing_that_has_arrived(monkeyp
     monkeypatch.setattr(LiveRun, "_act", act)
     outputs: list[Output] = []
     for at_ns in range(3):
-        run.take_frame(at_ns, Frame(0x90, 0, 1, b""), outputs)
+        taken = run.take_frame(at_ns, Frame(0x90, 0, 1, b""))
+        assert taken is not None
+        run.book_frame(taken, outputs)
     assert len(seen) == len(outputs) == 3
     with pytest.raises(LinkError, match="the port is gone"):
         run.raise_broken()
@@ -56,7 +58,9 @@ def test_a_status_that_waited_is_held_against_its_own_arrival(monkeypatch: pytes
     run, came = bare_run(lambda frame: Output([], [], None), monkeypatch)
     monkeypatch.setattr(LiveRun, "check_tick", lambda self, tick, at_ns: checked.append((tick, at_ns)))
     for at_ns, frame in zip((1, 2, 3), frames):
-        run.take_frame(at_ns, frame, [])
+        taken = run.take_frame(at_ns, frame)
+        assert taken is not None
+        run.book_frame(taken, [])
     assert checked == came == [(100, 1), (200, 2), (300, 3)]
 
 
@@ -64,7 +68,7 @@ def test_a_connection_that_was_never_armed_is_only_pumped() -> None:
     """A run that is ended while it reconnects: the receiver still holds the link before, whose descriptor may be another file's by now."""
     asked: list[float] = []
     connection = SimpleNamespace(pump=lambda poll_s: asked.append(poll_s) or [])
-    receiver = Receiver(SimpleNamespace(connection=connection), SimpleNamespace(), prompt=False)  # type: ignore[arg-type]
+    receiver = Receiver(SimpleNamespace(connection=connection), SimpleNamespace(moving=False), prompt=False)  # type: ignore[arg-type]
     receiver.last(0.5)
     assert asked == [0.5]
 

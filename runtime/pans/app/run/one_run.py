@@ -337,6 +337,7 @@ class _Run:
         self, options: RunOptions, link: Link, recorder: Recorder | None
     ) -> tuple[RunOptions, RunResult, Summary]:
         """Run, with all observers: the dark counts' guard, the live view, metrics and the state file, which get the verdict."""
+        from pans.decide.kernel import BATCH_NS
         from pans.live.loop import Observers, Recovery, running, scene_words
         from pans.live.watch import Watchers
 
@@ -384,7 +385,9 @@ class _Run:
                 if besides is not None and besides.watch is not None:
                     besides.watch(run, output)
 
-            observers = Observers(look, prepared, around.stop, acts=False)
+            # a neighbour that hears of each decision hears of it at once
+            at_once = around.osc is not None or (besides is not None and besides.watch is not None)
+            observers = Observers(look, prepared, around.stop, acts=False, gather_ns=0 if at_once else BATCH_NS)
             what = self.dark.profile, self.bundle, self.plan, self.core, self.options
             result = around.ending.enter_context(running(link, *what, recorder, recovery, observers))
             monitor.close_notes()

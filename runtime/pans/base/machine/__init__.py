@@ -11,18 +11,22 @@ from .realtime import (
     FIFO_PRIORITY,
     GRANTED,
     ThreadCounts,
+    apart,
     arm_realtime,
     bound,
     busy_core,
     check_core,
     cores_of,
+    deciding_core,
     fault_words,
     first_line,
+    give_way,
     held_heap,
     isolated_cores,
     lacking,
     load_average,
     locked_memory,
+    off_the_deciding_core,
     scheduled,
     shallow_idle,
     steal_ms,
@@ -31,13 +35,14 @@ from .realtime import (
 
 if TYPE_CHECKING:
     from .jit import FOLDER, inner, kernel_folder, njit, outer
-    from .jit_bytes import as_float32, bare, copy_span, load4, load8, spin
+    from .jit_bytes import as_float32, bare, copy_span, fence, load4, load8, spin
 
 __all__ = [
     "FIFO_PRIORITY",
     "FOLDER",
     "GRANTED",
     "ThreadCounts",
+    "apart",
     "arm_realtime",
     "as_float32",
     "bare",
@@ -46,8 +51,11 @@ __all__ = [
     "check_core",
     "copy_span",
     "cores_of",
+    "deciding_core",
     "fault_words",
+    "fence",
     "first_line",
+    "give_way",
     "held_heap",
     "inner",
     "isolated_cores",
@@ -58,6 +66,7 @@ __all__ = [
     "load_average",
     "locked_memory",
     "njit",
+    "off_the_deciding_core",
     "outer",
     "scheduled",
     "shallow_idle",

@@ -49,6 +49,9 @@ if numba.config.DISABLE_JIT:
     def pause() -> None:
         """Do nothing."""
 
+    def fence() -> None:
+        """Do nothing: the interpreter's threads see each other's writes in order."""
+
 else:
 
     @intrinsic
@@ -104,6 +107,16 @@ else:
                 builder.call(builder.module.declare_intrinsic("llvm.x86.sse2.pause", (), kind), [])
             else:
                 builder.fence("seq_cst")
+            return context.get_dummy_value()
+
+        return types.void(), code
+
+    @intrinsic
+    def fence(typing_context):  # type: ignore[no-untyped-def]
+        """Other threads see what was written before this before what is written after it, and reads keep to their side too."""
+
+        def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+            builder.fence("seq_cst")
             return context.get_dummy_value()
 
         return types.void(), code

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import socket
 import sys
 import threading
 import time
@@ -33,7 +34,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
 USUAL_THRESHOLD = 128 << 10  # of both
 PAGE_BYTES = 4096
 SMALL_BYTES, PIN_EVERY_BYTES = 400, 128 << 10  # pymalloc: objects to 512 bytes, in arenas of 256 KiB or 1 MiB
-COUNTED = {"minor": "ru_minflt", "major": "ru_majflt", "involuntary_switches": "ru_nivcsw"}
+COUNTED = {"minor": 7, "major": 9}  # fields of /proc/PID/stat behind the name: minflt, majflt
 
 OF_SYSTEM: Mapping[str, Callable[[], bool]] = {
     "real-time priority (SCHED_FIFO)": lambda: hasattr(os, "sched_setscheduler"),
@@ -51,12 +52,12 @@ def lacking() -> list[str]:
 
 
 @contextmanager
-def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
+def arm_realtime(wanted: bool, deciding: Sequence[int] = (0,)) -> Iterator[dict[str, Any]]:
     """Ask for a steady process while the loop runs; yield {what: "granted" or the reason why not}, undo it afterwards.
 
     The garbage collector is frozen and switched off in any case: a collection costs milliseconds with numba loaded. With `wanted`,
-    SCHED_FIFO (for this thread and `other_threads`, by native id) and locked memory are asked for; both need privileges, and
-    neither is needed to be correct. The interpreter's other threads go one step below: whoever holds the interpreter must not wait
+    SCHED_FIFO (for the threads that are `deciding`, by native id, 0: this one) and locked memory are asked for; both need privileges,
+    and neither is needed to be correct. The interpreter's other threads go one step below: whoever holds the interpreter must not wait
     for the rest of the machine, since the loop may be waiting for it.
     """
     granted: dict[str, Any] = {"gc_off": GRANTED, "switch_interval_s": SWITCH_INTERVAL_S}
@@ -70,9 +71,8 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
         gc.disable()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         if wanted:
-            threads = [0, *other_threads]
-            granted["sched_fifo"] = held.enter_context(scheduled("SCHED_FIFO", FIFO_PRIORITY, threads))
-            for number in _ordinary_threads(threads) if granted["sched_fifo"] == GRANTED else ():
+            granted["sched_fifo"] = held.enter_context(scheduled("SCHED_FIFO", FIFO_PRIORITY, deciding))
+            for number in _ordinary_threads(deciding) if granted["sched_fifo"] == GRANTED else ():
                 with suppress(OSError):  # it has ended
                     held.enter_context(scheduled("SCHED_FIFO", FIFO_PRIORITY - 1, [number]))
             granted["mlockall"] = held.enter_context(locked_memory())
@@ -113,8 +113,9 @@ def scheduled(policy: str, priority: int = 0, threads: Sequence[int] = (0,)) -> 
 
 
 def _ordinary_threads(but: Sequence[int]) -> list[int]:
-    """The interpreter's threads of ordinary priority, by native id, but for the calling one and those of `but`."""
-    numbers = {thread.native_id or 0 for thread in threading.enumerate()} - {*but, 0, threading.get_native_id()}
+    """The interpreter's threads of ordinary priority, by native id, but for those of `but` (0: the calling one)."""
+    numbers = {thread.native_id or 0 for thread in threading.enumerate()} - {*but, 0}
+    numbers -= {threading.get_native_id()} if 0 in but else set()
     found = []
     for number in numbers:
         with suppress(OSError):  # it has ended
@@ -123,12 +124,11 @@ def _ordinary_threads(but: Sequence[int]) -> list[int]:
     return found
 
 
-def bound(core: int) -> AbstractContextManager[str]:
-    """Return the context in which the calling thread runs on `core` alone."""
+def bound(core: int, thread: int = 0) -> AbstractContextManager[str]:
+    """Return the context in which a thread, by native id (0: the calling one), runs on `core` alone."""
     if not hasattr(os, "sched_setaffinity"):
         return nullcontext("this system does not bind threads to cores")
-    before = os.sched_getaffinity(0)
-    return _asked(lambda: os.sched_setaffinity(0, {core}), lambda: os.sched_setaffinity(0, before))
+    return _kept_on({core}, thread)
 
 
 @contextmanager
@@ -185,6 +185,66 @@ def held_heap(n_bytes: int = HELD_BYTES) -> Iterator[str]:
 
 
 # ---- cores ----
+
+
+def deciding_core() -> int | None:
+    """Return the core that a thread that decides gets for itself: the last one; None where there is one core, or the user has chosen.
+
+    A process that may not use every core of the machine was confined by somebody (taskset, a cpuset): nothing is bound then.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return None
+    cores = os.sched_getaffinity(0)
+    return max(cores) if 1 < len(cores) == os.cpu_count() else None
+
+
+@contextmanager
+def apart(thread: int) -> Iterator[dict[str, Any]]:
+    """Keep the thread that decides, by native id, on a core where no simulated instrument computes, while the block runs.
+
+    A wake-up puts a thread on the core of whoever woke it, at ordinary priority: there it waits for 1 to 3 ms until that has computed
+    (docs/explanation/timing.md). Yields {"deciding_core": core, or why the thread is not bound}.
+    """
+    core = deciding_core()
+    if core is None:
+        yield {"deciding_core": "not bound: one core, or the user has chosen the cores"}
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as mark:
+        try:
+            mark.bind(
+                f"\0pans-deciding-on-core-{core}"
+            )  # of this machine; nobody's any more once the process has ended
+        except OSError:
+            yield {"deciding_core": f"not bound: another run decides on core {core}"}
+            return
+        with bound(core, thread) as answer:
+            yield {"deciding_core": core if answer == GRANTED else answer}
+
+
+def give_way() -> None:
+    """Let a thread run that waits for this core: at ordinary priority it would wait until this one's slice, some 3 ms, has passed."""
+    if hasattr(os, "sched_yield"):
+        os.sched_yield()
+
+
+@contextmanager
+def off_the_deciding_core() -> Iterator[bool]:
+    """Keep the calling thread, and those that it starts, off the core where a run on this machine decides; yield whether that was done."""
+    core = deciding_core()
+    if core is None:
+        yield False
+        return
+    with _kept_on(os.sched_getaffinity(0) - {core}, 0) as answer:
+        yield answer == GRANTED
+
+
+def _kept_on(cores: set[int], thread: int) -> AbstractContextManager[str]:
+    """Return the context in which a thread, by native id, runs on these cores alone."""
+    try:
+        before = os.sched_getaffinity(thread)
+    except OSError:  # it has ended
+        return nullcontext("ended")
+    return _asked(lambda: os.sched_setaffinity(thread, cores), lambda: os.sched_setaffinity(thread, before))
 
 
 def check_core(core: int | None) -> None:
@@ -248,8 +308,10 @@ def steal_ms(root: Path = Path("/")) -> float | None:
 
 
 @contextmanager
-def busy_core(core: int | None) -> Iterator[dict[str, Any]]:
-    """Pin the calling thread to `core` and keep that core busy while the block runs; yield {what: "granted" or why not}, {} for None.
+def busy_core(core: int | None, thread: int = 0) -> Iterator[dict[str, Any]]:
+    """Pin a thread, by native id (0: the calling one), to `core` and keep that core busy while the block runs.
+
+    Yields {what: "granted" or why not}, {} for None.
 
     A core that halts between two blocks wakes with cold caches and, in a virtual machine, after somebody else's turn
     (docs/explanation/timing.md). A spinning thread of idle priority keeps it awake: whatever has something to do goes before it.
@@ -257,17 +319,17 @@ def busy_core(core: int | None) -> Iterator[dict[str, Any]]:
     if core is None or not hasattr(os, "sched_setaffinity"):
         yield {}
         return
-    with bound(core) as answer:
+    with bound(core, thread) as answer:
         if answer != GRANTED:
             yield {"core": answer}
             return
-        with _spinning() as awake:
+        with _spinning(core) as awake:
             yield {"core": core, "kept_awake": awake}
 
 
 @contextmanager
-def _spinning() -> Iterator[str]:
-    """A thread of idle priority, on the core of the calling one, spins in compiled code without the interpreter's lock.
+def _spinning(core: int) -> Iterator[str]:
+    """A thread of idle priority, on `core`, spins in compiled code without the interpreter's lock.
 
     It gets its priority only while it spins and loses it before it ends: a thread of idle priority that holds the interpreter's lock on a
     core that others want would stop this process for seconds.
@@ -281,7 +343,8 @@ def _spinning() -> Iterator[str]:
     with ExitStack() as held:
         held.callback(thread.join)
         held.callback(state.__setitem__, ENDED, 1)
-        with scheduled("SCHED_OTHER"):  # a thread inherits its priority: with a real-time one it would spin for good
+        # a thread inherits its core and its priority: with a real-time one it would spin for good
+        with scheduled("SCHED_OTHER"), bound(core):
             thread.start()
             while not state[SPINS]:
                 time.sleep(LOOK_EVERY_S)
@@ -294,34 +357,35 @@ def _spinning() -> Iterator[str]:
 
 
 class ThreadCounts:
-    """Page faults of the calling thread, how often it lost its core, and for how long it waited for one, since the last `restart`.
+    """Page faults of a thread, how often it lost its core, and for how long it waited for one, since the last `restart`.
 
-    A minor fault is the first touch of a page, one to a few microseconds; a major one waits for the disk.
+    A minor fault is the first touch of a page, one to a few microseconds; a major one waits for the disk. The thread is the calling one,
+    or one of this process by its native id.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, thread: int | None = None) -> None:
+        self._task = Path(f"/proc/self/task/{threading.get_native_id() if thread is None else thread}")
         self.restart()
 
     def restart(self) -> None:
         """Count from here on."""
-        self._before = _counts()
+        self._before = self._counts()
 
     def since(self) -> dict[str, int]:
         """Return {minor, major, involuntary_switches, waited_ms} so far; {} where the system has no such counts."""
-        return {name: count - self._before[name] for name, count in _counts().items() if name in self._before}
+        return {name: count - self._before[name] for name, count in self._counts().items() if name in self._before}
 
-
-def _counts() -> dict[str, int]:
-    try:
-        import resource
-
-        usage = resource.getrusage(resource.RUSAGE_THREAD)
-    except (ImportError, AttributeError, ValueError):  # Windows; macOS knows whole processes only
-        return {}
-    counts = {name: int(getattr(usage, field)) for name, field in COUNTED.items()}
-    if times := first_line(Path("/proc/thread-self/schedstat")).split():  # computing, waiting, time slices; ns
-        counts["waited_ms"] = int(times[1]) // 1_000_000
-    return counts
+    def _counts(self) -> dict[str, int]:
+        """Read what Linux says of a thread (proc(5)); other systems count for whole processes only."""
+        fields = first_line(self._task / "stat").rpartition(")")[2].split()  # the name before may hold spaces
+        counts = {name: int(fields[place]) for name, place in COUNTED.items()} if len(fields) > 9 else {}
+        with suppress(OSError):
+            for line in (self._task / "status").read_text().splitlines():
+                if line.startswith("nonvoluntary_ctxt_switches"):
+                    counts["involuntary_switches"] = int(line.split()[1])
+        if times := first_line(self._task / "schedstat").split():  # computing, waiting, time slices; ns
+            counts["waited_ms"] = int(times[1]) // 1_000_000
+        return counts
 
 
 def fault_words(counts: Mapping[str, int]) -> str:

@@ -38,7 +38,7 @@ MAX_CHANNELS = 64  # bits of a ring word
 MAX_PASSAGES = 64  # of one call of `scan`; it is called again
 ROWS_MORE = 2048  # decisions of one call, beside those of a block
 MOST_BLOCKS = (
-    4096  # whose empty frames have not been told yet: as many as a call keeps times of (decide/kernel/arrays.py)
+    4096  # whose empty frames have not been told yet: as many as the rings keep times of (decide/kernel/arrays.py)
 )
 _LARGEST = (1 << 62) - 1
 _PART = (1 << Q) - 1
@@ -81,7 +81,7 @@ class FlowCore(Follower):
         self.dark_probability = 0.0  # of a click, that the limits were worked out with
         self.gated = gated  # classes for which a pulse is asked
         self._cycles_before = 0  # in streams that have ended
-        self._told = 0  # of walk.empty
+        self._told = self._now_told = 0  # of walk.empty: accounted for, and there in the present batch
         self._dark_cycle = plan.slots_per_cycle if plan.slot_pattern[-1] == DARK_PATTERN else 0
         self._period_ticks, self._max_block = plan.slot_period_ticks, plan.block_exposures
         self.block_rows = plan.block_exposures + 1 + MAX_PASSAGES
@@ -92,7 +92,8 @@ class FlowCore(Follower):
             self._prepare_tape(plan)
 
     def _new_walk(self, plan: Plan, n: int) -> FlowWalk:
-        limits, pool, n_rows = self.limits, self.settings.pool, self.block_rows + ROWS_MORE
+        # two halves: one is filled while the other is accounted for
+        limits, pool, n_rows = self.limits, self.settings.pool, 2 * self.block_rows + ROWS_MORE
         state = np.zeros(kernels.N_FACTS, np.int64)
         state[columns.EXPOSURE_TICKS], state[columns.PERIOD_TICKS] = plan.exposure_ticks, plan.slot_period_ticks
         state[columns.CYCLE_TICKS], state[kernels.MAX_BLOCK] = plan.cycle_ticks, plan.block_exposures
@@ -203,24 +204,25 @@ class FlowCore(Follower):
         state[kernels.ASKS], state[kernels.MARKED] = 0, self.marks.following
         state[kernels.WATCH_AT] = self.watched_frames + WATCHED_FRAMES if self.watches_empty else 1 << 62
 
-    def store(self) -> None:
-        """Copy what the kernel did back."""
-        store_core(self, self.walk.state.tolist())
+    def store(self, state: I64) -> None:
+        """Copy what the kernel did back: its state, or what that was when a batch was handed over."""
+        store_core(self, state.tolist())
+        self._now_told = int(state[kernels.TOLD])
 
     def told_empty(self) -> list[list[int]]:
         """Return what the empty field gave and has not been accounted for: rows of `FlowWalk.empty`."""
-        first, self._told = self._told, int(self.walk.state[kernels.TOLD])
+        first, self._told = self._told, self._now_told
         return self.walk.empty[np.arange(first, self._told) % MOST_BLOCKS].tolist()
 
-    def leave_ticks(self, n: int) -> I64:
-        """Return when the objects of the first `n` rows left, int64 (n,) device ticks."""
-        return self.walk.passages[:n, kernels.W_LEAVE]
+    def leave_ticks(self, first: int, stop: int) -> I64:
+        """Return when the objects of rows `first` to `stop` - 1 left, int64 (n,) device ticks."""
+        return self.walk.passages[first:stop, kernels.W_LEAVE]
 
-    def pulses(self, n: int) -> list[Action]:
-        """Return the pulses that the first `n` rows ask for, in order."""
-        places = np.flatnonzero(np.isin(self.walk.rows["label"][:n], sorted(self.gated))) if self.gated else ()
-        numbers, leaves = self.walk.rows["index"], self.leave_ticks(n)
-        return [self._pulse(int(numbers[place]), int(leaves[place])) for place in places]
+    def pulses(self, first: int, stop: int) -> list[Action]:
+        """Return the pulses that rows `first` to `stop` - 1 ask for, in order."""
+        rows, leaves = self.walk.rows[first:stop], self.leave_ticks(first, stop)
+        places = np.flatnonzero(np.isin(rows["label"], sorted(self.gated))) if self.gated else ()
+        return [self._pulse(int(rows["index"][place]), int(leaves[place])) for place in places]
 
     def watch(self, empty: list[int] | None) -> list[Finding]:
         """Let the guard see what the empty field gave with a block, a row of `told_empty`; return what it found with that, and before."""
@@ -352,7 +354,7 @@ class FlowCore(Follower):
             self.load()
             self.walk.state[kernels.WATCH_AT] = 1 << 62
             done = bool(kernels.settle(self.walk, stop, origin_tick, flags))
-            self.store()
+            self.store(self.walk.state)
             output = joined(output, self._decided(slice(0, int(self.walk.state[columns.N_ROWS]))))
         return output
 
@@ -371,7 +373,7 @@ class FlowCore(Follower):
         """Give up what the end of the stream leaves open."""
         self.load()
         kernels.close_passage(self.walk, min(self.last_tick, _LARGEST))
-        self.store()
+        self.store(self.walk.state)
         return self._decided(slice(0, int(self.walk.state[columns.N_ROWS])))
 
     def _give_up(self) -> Output:

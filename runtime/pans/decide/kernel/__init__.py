@@ -6,11 +6,12 @@ messages are left to Python. Start at calls.py (`Kernel`), then receive.py; arra
 
 from . import arrays as arrays
 from .arrays import OVERSLEPT_NS, Drive
-from .calls import Kernel, Limits, StreamCore
+from .calls import BATCH_NS, Kernel, Limits, StreamCore
 from .receive import QUIET_NS, turn, unpack_blocks
 from .system_calls import now_ns, offered, read_now, wait_for, write_now
 
 __all__ = [
+    "BATCH_NS",
     "OVERSLEPT_NS",
     "QUIET_NS",
     "Drive",

@@ -12,32 +12,38 @@ OVERSLEPT_NS = 500_000  # a timer that fires later than this was not the timer's
 U8 = npt.NDArray[np.uint8]
 I64 = npt.NDArray[np.int64]
 
-# control, int64 (N_CONTROL,). What the caller sets: the descriptor, and whether it is read (0: what is decoded already, and no more);
-# until when, how long after a block the next one is overdue (0: nobody asks), how long bytes are waited for awake at first, how many
-# messages may come; whether a stream is open, whether SHOW is sent, whether commands wait in the session; most rows of one block;
-# waits that lie closer together are one
+# control, int64 (N_CONTROL,). Set by the caller before a call: the descriptor, and whether it is read (0: only what is decoded already);
+# until when; how long after a block the next one is overdue (0: do not watch); how long to poll awake at first; how many messages may
+# come; whether a stream is open, whether SHOW is sent, whether commands wait in the session; most rows of one block; waits that lie
+# closer together are one
 FD, READS, DUE_NS, PATIENCE_NS, EAGER_NS, BUDGET, OPEN, DRIVES, WAITING, BLOCK_ROWS, FLOOR_NS = range(11)
-STOP = 11  # a flag that anybody may set: the call ends
-# what both ends keep: the next decoded body and how many there are, when they were read, when a block came last; the session's
+STOP = 11  # set by anybody, at any time: the call ends
+# kept by both sides: the next decoded body and how many there are, when they were read, when a block came last; the session's
 # window of commands (next id, the oldest without an answer, since when that counts); what SHOW named last
 PLACE, N_BODIES, ARRIVAL_NS, BLOCK_NS, NEXT_ID, OLDEST_ID, OLDEST_NS, SENT_EXPOSURE, SENT_STATE = range(12, 21)
 # of bytes that were read elsewhere: the next read, and where it begins
 NEXT_READ, READ_AT = range(21, 23)
-# the id of the first command that this call may send; whether a pulse is asked for, so that the call ends with the bytes read so far
+# the id of the first command that this call may send; whether the caller must know of a block at once
 FIRST_ID, URGENT = range(23, 25)
-ADDS = 25  # set by the caller: the rings are filled behind what the last call brought
-# where the rings of waits and of arrivals stood when the call began: those before may have been looked at
-FIRST_NOTE, FIRST_ARRIVAL = range(26, 28)
-# what a call reports: errno, bytes of the last command that were not sent, when anything of the session came last, and up to where each
-# ring is used
-ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(28, 39)
+# the part of the rings that is being filled: one of HALVES (1: all of it), and where it begins and ends, in entries, bytes and rows
+HALVES, HALF, FIRST, LIMIT, KEPT_LIMIT, FIRST_ROW, ROW_LIMIT = range(25, 32)
+# of a kernel that serves in a thread of its own. Set by the caller: whether it does; the pipes by which it is woken and wakes; how long
+# blocks are gathered, and how many messages at most, before they are handed over. The caller asks it to park by PARK and lets it go on
+# by clearing PARKED. READY: a batch has been handed over and is not accounted for yet; HUNGRY: the next one waits for that.
+SERVES, WAKE_FD, TELL_FD, BATCH_NS, BATCH_MESSAGES, PARK, PARKED, READY, HUNGRY = range(32, 41)
+# when it handed over last; the block after which it has reported the next one overdue, when, and whether Python is to see to it
+HANDED_NS, OVERDUE_BLOCK_NS, OVERDUE_NS, OVERDUE = range(41, 45)
+# what a call, or a batch, reports: errno, bytes of the last command that were not sent, when anything of the session came last, up to
+# where each ring and the rows are used, the exposure that comes next, and why it ended
+ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT = range(45, 55)
+STOP_ROW, FOLLOWING, ENDED, N_CONTROL = range(55, 59)
 
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)
 # messages, answers and shows, int64 (n, 4): where a body (of `shows`: a frame) stands in `kept`, the time at which it came or left, and
-# its type (of `shows`: the arrival that it answers; of `answers` REFUSAL where a SHOW was refused)
+# its type (of `shows`: the arrival that it answers; of `answers` DONE or REFUSAL where the kernel has accounted for it)
 BEGIN, END, TIME, WHAT = range(4)
-REFUSAL = -1
+DONE, REFUSAL = -2, -1
 
 ALL_TAKEN, DUE, FULL, ODD, GONE, SIGNALLED, BROKEN = range(7)  # why a call ended
 WHY = ("all taken", "due", "full", "odd", "gone", "signalled", "broken")
@@ -57,6 +63,9 @@ class Rings(NamedTuple):
     shows: I64
     notes: I64  # (n, 4): waits for bytes: began, asked until, ended
     arrivals: I64
+    handed: I64  # (N_CONTROL,): `control` as it was when a batch was handed over
+    handed_state: I64  # the state of the walk at that time
+    spare: U8  # what is read from and written to the pipes
 
 
 class Decoder(NamedTuple):
@@ -81,12 +90,13 @@ class Drive(NamedTuple):
     sizes: I64
 
 
-def make_rings() -> Rings:
-    """Return rings in memory that has been touched."""
+def make_rings(state_size: int) -> Rings:
+    """Return rings in memory that has been touched, for a walk whose state has `state_size` numbers."""
     kept: U8 = np.full(KEPT_BYTES, 1, np.uint8)
     messages, answers, shows, notes = (np.full((MANY, 4), 1, np.int64) for _ in range(4))
     steps, arrivals = np.full((MANY, N_STEP), 1, np.int64), np.full(MANY, 1, np.int64)
-    return Rings(kept, steps, messages, answers, shows, notes, arrivals)
+    handed, handed_state = np.full(N_CONTROL, 0, np.int64), np.full(state_size, 0, np.int64)
+    return Rings(kept, steps, messages, answers, shows, notes, arrivals, handed, handed_state, np.full(64, 1, np.uint8))
 
 
 def no_drive() -> Drive:

@@ -15,13 +15,11 @@ import numpy.typing as npt
 from pans.bundle.backends import Decider
 from pans.decide.decision import DECISION_DTYPE, CoreEvent, Output
 from pans.decide.plan.plan import Plan
-from pans.decide.still import kernels as core_kernels
 from pans.decide.still.core import Core
 from pans.decide.still.kernel_state import CoreState
 from pans.decide.still.kernels import DecisionTables
 from pans.protocol.session import STREAM_TYPES
 from pans.protocol.wire import CHUNK_BYTES, MARK_DTYPE, Frame, FrameDecoder, Messages, MessageType, unpack_body
-from pans.protocol.wire import kernels as place
 
 from . import arrays as ring
 from .arrays import I64, U8, Decoder, Drive, Rings, make_rings, no_drive
@@ -41,7 +39,7 @@ class Limits(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What a call reports, in the order of arrays.py's control; `rows` of decisions beside it."""
+    """What a call reports, in the order of arrays.py's control: where each ring and the rows end, `rows`, the exposure that comes next."""
 
     errno: int
     unsent: int
@@ -54,6 +52,8 @@ class Counts(NamedTuple):
     arrivals: int
     kept: int
     rows: int
+    following: int
+    ended: int
 
 
 class Steps(Protocol):
@@ -78,36 +78,39 @@ class Steps(Protocol):
 
     def load(self) -> None: ...
 
-    def store(self) -> None: ...
+    def store(self, state: I64) -> None: ...
 
     def rows(self, first: int, stop: int) -> npt.NDArray[np.void]: ...
 
 
 NO_LIMITS = Limits()
 _NOTHING = Counts._make([0] * len(Counts._fields))
+BATCH_NS = 50_000_000  # for so long blocks are gathered: accounting costs the same for one block as for twenty
+BATCH_MESSAGES = 512  # at once from so many on: an eighth of the receive window
 
 
 class Kernel:
-    """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming.
+    """The calls of `steps` on what `decoder` decodes; all memory is allocated here, before arming.
 
-    `rows`, `blocks`, `messages` and the like give what lies from `begin` to `end`: after `run` all that came. After `run` with `more` the
-    new part lies behind `end` until `look` moves `end`; `done` moves `begin` to `end`.
+    `rows`, `blocks`, `messages` and the like give what a call brought, or a batch that `receive_batch` returned; they are valid until
+    the next call, or until `release`.
     """
 
     def __init__(self, steps: Steps, decoder: FrameDecoder, drive: Drive | None = None) -> None:
         from .receive import turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
-        self.rings: Rings = make_rings()
-        self.said = self.begin = self.end = _NOTHING
+        self.state: I64 = steps.walk.state
+        self.rings: Rings = make_rings(self.state.size)
+        self.begin = self.end = _NOTHING
         self._kernel = turn
         self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
         self._drive = no_drive() if drive is None else drive
         self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
-        self.state: I64 = steps.walk.state
-        self.control[ring.FD] = -1
+        self.control[ring.FD], self.control[ring.HALVES] = -1, 1
         self.control[ring.BLOCK_ROWS] = steps.block_rows
         self.control[ring.SENT_EXPOSURE] = self.control[ring.SENT_STATE] = -1
+        self.reported = self.control  # or what that was when a batch was handed over
         self._scratch: I64 = np.zeros(4, np.int64)
         self._decoder = Decoder(*decoder.arrays)
         self._walk = steps.walk
@@ -120,52 +123,65 @@ class Kernel:
         """Name the states of walks by `drive` from here on."""
         self._drive = drive
 
-    def run(self, fd: int = -1, limits: Limits = NO_LIMITS, *, more: bool = False) -> int:
-        """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY).
+    def run(self, fd: int = -1, limits: Limits = NO_LIMITS) -> int:
+        """Process what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (arrays.WHY)."""
+        return self._call(self._nothing, fd, limits)
 
-        With `more` the rings are filled behind what the last call brought, which stays where it is.
-        """
-        return self._call(self._nothing, fd, limits, more)
-
-    def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits, more: bool = False) -> int:
-        self._prepare(fd, limits, more)
-        ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
-        before = self.said.messages if more else 0
-        self.said = Counts._make((*self.control[ring.ERRNO :].tolist(), int(self.state[core_kernels.N_ROWS])))
-        if not more:
-            self.begin, self.end = _NOTHING, self.said
-        if self.said.messages > before:
-            self.steps.store()
-        return int(ended)
-
-    def look(self) -> Counts:
-        """Move `end` behind all that came, and return it."""
-        self.end = self.said
-        return self.end
-
-    def done(self) -> None:
-        """Move `begin` to `end`: all up to there is settled."""
-        self.begin = self.end
-
-    @property
-    def holds(self) -> bool:
-        """Whether something lies behind `begin`: the next call must add to it."""
-        return (self.said.kept, self.said.arrivals) > (self.begin.kept, self.begin.arrivals)
-
-    def _prepare(self, fd: int, limits: Limits, more: bool) -> None:
-        control, steps = self.control, self.steps
+    def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits) -> int:
+        control = self.control
         if fd >= 0:
             control[ring.FD] = fd
         control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
-        control[ring.FLOOR_NS] = limits.floor_ns
-        if more:  # the rings count from their beginning, and what lies there has been granted before
-            control[ring.BUDGET] += self.said.messages
-        control[ring.OPEN] = steps.takes
-        control[ring.ADDS] = more
-        if more:  # what came before is stored
-            self.state[place.MESSAGES] = self.state[place.EXPOSURES] = 0
-        else:
-            steps.load()
+        control[ring.FLOOR_NS], control[ring.OPEN] = limits.floor_ns, self.steps.takes
+        self.steps.load()
+        ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, control, self._scratch)
+        self._report(control, self.state)
+        return int(ended)
+
+    def _report(self, control: I64, state: I64) -> None:
+        """Take over what a call, or a batch, says of itself."""
+        self.reported, self.end = control, Counts._make(control[ring.ERRNO :].tolist())
+        first, row = control[[ring.FIRST, ring.FIRST_ROW]].tolist()
+        kept = int(control[ring.HALF]) * (ring.KEPT_BYTES // int(control[ring.HALVES]))
+        self.begin = Counts._make((0, 0, 0, *[first] * 6, kept, row, 0, 0))
+        if self.end.messages > first:
+            self.steps.store(state)
+
+    # -- in a thread of its own ----------------------------------------------------------------------------------------
+
+    def serve(self, fd: int, wake_fd: int, tell_fd: int) -> None:
+        """Read `fd`, decide and answer until `stop`, in the thread of the caller, without the interpreter.
+
+        `wake_fd` is the end of a pipe that is read, `tell_fd` one that is written whenever a batch is handed over. Before it begins, and
+        whenever it is parked, `allow` says what it may do.
+        """
+        control = self.control
+        control[[ring.FD, ring.WAKE_FD, ring.TELL_FD]] = fd, wake_fd, tell_fd
+        control[ring.HALVES], control[ring.SERVES], control[ring.READS] = 2, 1, 1
+        try:
+            self._kernel(*self._nothing, self._decoder, self._walk, self._drive, self.rings, control, self._scratch)
+        finally:
+            control[ring.HALVES], control[ring.HALF], control[ring.SERVES] = 1, 0, 0
+
+    def allow(self, patience_ns: int, floor_ns: int, batch_ns: int) -> None:
+        """Say what a serving kernel may do from here on; it is parked, or has not begun."""
+        control = self.control
+        control[ring.PATIENCE_NS], control[ring.FLOOR_NS], control[ring.OPEN] = patience_ns, floor_ns, self.steps.takes
+        control[ring.BATCH_NS], control[ring.BATCH_MESSAGES] = batch_ns, BATCH_MESSAGES
+        self.steps.load()
+
+    def receive_batch(self) -> bool:
+        """Look at the batch that a serving kernel has handed over; False where there is none. `release` gives its half back."""
+        if not self.control[ring.READY]:
+            return False
+        self._report(self.rings.handed, self.rings.handed_state)
+        return True
+
+    def release(self) -> bool:
+        """Give the half of the last batch back; return whether the kernel waits for it, and has to be woken."""
+        self.begin = self.end
+        self.control[ring.READY] = 0
+        return bool(self.control[ring.HUNGRY])
 
     def feed(self, chunks: Sequence[tuple[int, Bytes]]) -> int:
         """Take what was read elsewhere: one read or more, each with the time at which it came.
@@ -213,6 +229,7 @@ class Kernel:
         decoder, place = self._decoder, int(self.control[ring.PLACE])
         first, stop = decoder.bodies[place].tolist()
         self.control[ring.PLACE] += 1
+        self.end = self.end._replace(ended=ring.ALL_TAKEN)
         return unpack_body(decoder.buffer[first:stop].tobytes())
 
     @property

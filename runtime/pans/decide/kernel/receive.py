@@ -1,8 +1,16 @@
-"""One call of the kernel: wait, read, resynchronise, check, decide, name the next state, keep what came.
+"""The kernel's loop: wait, read, resynchronise, check, decide, name the next state, keep what came.
 
 It continues by itself with all that is ordinary and leaves the rest, untouched and in its place, to the caller. Bytes are decoded by
 protocol/wire/kernels.py, messages taken by the kernel of the core's kind (`Walk.kernel`: still/kernels.py, flow/kernels.py), commands
 written by show.py. It never allocates.
+
+In turn with its caller, a call ends when something is due or irregular. In a thread of its own (control[SERVES]) it never returns:
+it hands over what has come in one half of the rings and fills the other half meanwhile, and parks for a message that Python must take.
+
+    filling one half --(time, many, urgent; READY is 0)--> copy `control` to `handed`, READY = 1, wake Python --> filling the other half
+    irregular message, PARK --> hand over, PARKED = 1 ------(Python clears PARKED, wakes the kernel)-----------> filling the other half
+
+Python reads a batch only after it was woken, and clears READY when it has done with it; no half is written while Python reads it.
 """
 
 from __future__ import annotations
@@ -14,7 +22,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from pans.base.machine import bare, copy_span, inner, load4, outer
+from pans.base.machine import bare, copy_span, fence, inner, load4, outer
 from pans.decide.still import kernels as core
 from pans.decide.still.kernels import WalkArrays
 from pans.protocol.wire import MAX_FRAME_BYTES, SCHEMA, MessageType
@@ -24,7 +32,7 @@ from pans.protocol.wire import kernels as wire
 from . import arrays as ring
 from .arrays import OVERSLEPT_NS
 from .show import IS_ODD, IS_REFUSED, send_show, take_ack
-from .system_calls import AGAIN, INTERRUPTED, now_ns, read_now, wait_for
+from .system_calls import AGAIN, INTERRUPTED, now_ns, read_now, wait_both, wait_for, write_now
 
 
 @inner
@@ -86,31 +94,56 @@ else:
 READ_BYTES = 1 << 16  # at once, as protocol/links/serial.py
 LEAST_WAIT_NS = 200_000
 QUIET_NS = 5_000_000
-_ACK = int(MessageType.ACK)
+NAP_NS = 200_000_000  # longest wait of a serving kernel: a wake-up that was lost costs no more
+# a device that is late all the time is asked so often: each probe costs both sides a wake-up
+SILENCE_EVERY_NS = 100_000_000
+HUNGRY_NS = 1_000_000  # how often it looks whether Python has done with the batch before
+_ACK, _PONG = int(MessageType.ACK), int(MessageType.PONG)
 _U = np.uint64
 _LIMIT, _SCHEMA = np.int64(MAX_FRAME_BYTES), np.int64(SCHEMA)  # plain numbers are types of their own to the compiler
 
 
 @outer
 def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
-    """Take what is decoded, then read and take until something is due or not ordinary; return why it ended (rings.WHY).
+    """Process decoded messages, then read more until something is due or irregular; return the reason (arrays.WHY).
 
     decoder Decoder, walk of a class with a `kernel()`, drive Drive, rings Rings, control int64 (N_CONTROL,), scratch int64 (4,). Rings
-    are filled from their beginning. Where there are `reads`, nothing is read but `fed` uint8, read by read: `reads` int64 (n, 2) are their
-    bytes and the times of their arrival, control[NEXT_READ] and control[READ_AT] say which one comes next, and where it begins; ALL_TAKEN
-    behind the last one.
+    are filled from the beginning of their half. Where there are `reads`, nothing is read but `fed` uint8, read by read: `reads` int64
+    (n, 2) are their bytes and the times of their arrival, control[NEXT_READ] and control[READ_AT] say which one comes next, and where
+    it begins; ALL_TAKEN behind the last one. With control[SERVES] it returns when STOP is set, or where Python is to close the link.
     """
     decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
     fed, reads, control, scratch = bare(fed), bare(reads), bare(control), bare(scratch)
-    _begin(walk, control)
+    while True:
+        _begin(walk, control)
+        control[ring.FIRST_ID] = control[ring.NEXT_ID]
+        ended = _until_ended(fed, reads, decoder, walk, drive, rings, control, scratch)
+        if not control[ring.SERVES]:
+            _report(walk, control, ended)
+            return ended
+        if not _park(walk, rings, control, ended, scratch):
+            return ended
+
+
+@inner
+def _until_ended(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
     # before the first read neither the clock nor the blocks are looked at
     began_ns, blocks = np.int64(-1), np.int64(-1)
     while True:
         ended = take_bodies(decoder, walk, drive, rings, control, scratch)
-        if ended == ring.ALL_TAKEN and reads.shape[0]:
+        if control[ring.SERVES]:
+            if ended == ring.ALL_TAKEN:
+                ended = _await_served(decoder, walk, rings, control, scratch)
+            if ended == ring.FULL:  # Python is behind by a whole half: wait for it
+                if not _make_free(walk, rings, control, scratch):
+                    return ring.DUE
+                continue
+            if ended != ring.ALL_TAKEN:
+                return ended
+        elif ended == ring.ALL_TAKEN and reads.shape[0]:
             if control[ring.NEXT_READ] == reads.shape[0]:
                 return ended
-            if control[ring.N_ARRIVALS] == rings.arrivals.size:
+            if control[ring.N_ARRIVALS] == control[ring.LIMIT]:
                 return ring.FULL
             _next_read(fed, reads, decoder, control)
         elif ended != ring.ALL_TAKEN or not control[ring.READS] or control[ring.URGENT]:
@@ -128,6 +161,107 @@ def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ig
         control[ring.N_ARRIVALS] += 1
 
 
+# -- serving in a thread -----------------------------------------------------------------------------------------------
+
+
+@inner
+def _await_served(decoder, walk, rings, control, scratch):  # type: ignore[no-untyped-def]
+    """Read as soon as something is there, and hand over when it is time; ALL_TAKEN when new bytes are decoded, or why the kernel parks."""
+    while True:
+        if control[ring.STOP] or control[ring.PARK]:
+            return ring.DUE
+        if control[ring.N_ARRIVALS] == control[ring.LIMIT] or control[ring.N_NOTES] == control[ring.LIMIT]:
+            return ring.FULL
+        now = now_ns(scratch)
+        due, gathered = now + NAP_NS, control[ring.N_MESSAGES] - control[ring.FIRST]
+        patience = control[ring.PATIENCE_NS]
+        if patience and control[ring.OVERDUE_BLOCK_NS] != control[ring.BLOCK_NS]:
+            at = max(control[ring.BLOCK_NS] + patience, control[ring.OVERDUE_NS] + SILENCE_EVERY_NS)
+            if now >= at:  # Python asks the device, once in each silence
+                control[ring.OVERDUE_BLOCK_NS], control[ring.OVERDUE_NS] = control[ring.BLOCK_NS], now
+                control[ring.OVERDUE] = 1
+                write_now(control[ring.TELL_FD], rings.spare, 0, 1)
+            else:
+                due = min(due, at)
+        if control[ring.URGENT] or control[ring.N_ARRIVALS] > control[ring.FIRST]:
+            at = control[ring.HANDED_NS] + control[ring.BATCH_NS]
+            if control[ring.URGENT] or gathered >= control[ring.BATCH_MESSAGES] or now >= at:
+                if not control[ring.READY]:
+                    _hand_over(walk, rings, control, ring.DUE, scratch)
+                    continue
+                control[ring.HUNGRY], due = 1, min(due, now + HUNGRY_NS)
+            else:
+                due = min(due, at)
+        ready = wait_both(control[ring.FD], control[ring.WAKE_FD], due - now, scratch)
+        _note_wait(rings.notes, control, now, due, now_ns(scratch))
+        if ready < 0 and ready != -INTERRUPTED:
+            return _failed(control, ready)
+        if ready >= 2:
+            read_now(control[ring.WAKE_FD], rings.spare, 0, rings.spare.size)
+        if ready == 1 or ready == 3:
+            found = _read(decoder, control, scratch)
+            if found > 0:
+                return ring.ALL_TAKEN
+            if found != -AGAIN and found != -INTERRUPTED:
+                return _failed(control, found)
+
+
+@inner
+def _make_free(walk, rings, control, scratch):  # type: ignore[no-untyped-def]
+    """Wait until Python has done with the batch before, then hand over; False when the kernel is to stop."""
+    while control[ring.READY]:
+        control[ring.HUNGRY] = 1
+        _nap(rings, control, HUNGRY_NS, scratch)
+        if control[ring.STOP]:
+            return False
+    _hand_over(walk, rings, control, ring.FULL, scratch)
+    return True
+
+
+@inner
+def _hand_over(walk, rings, control, ended, scratch):  # type: ignore[no-untyped-def]
+    """Hand what has come to Python, which has done with the batch before, and go on in the other half."""
+    control[ring.HANDED_NS], control[ring.HUNGRY] = now_ns(scratch), 0
+    _report(walk, control, ended)
+    for column in range(ring.N_CONTROL):
+        rings.handed[column] = control[column]
+    for column in range(walk.state.size):
+        rings.handed_state[column] = walk.state[column]
+    walk.state[stream.MESSAGES] = walk.state[stream.EXPOSURES] = 0
+    control[ring.HALF] = 1 - control[ring.HALF]
+    _begin(walk, control)
+    fence()  # the batch is whole before READY says so
+    control[ring.READY] = 1
+    fence()
+    write_now(control[ring.TELL_FD], rings.spare, 0, 1)
+
+
+@inner
+def _park(walk, rings, control, ended, scratch):  # type: ignore[no-untyped-def]
+    """Hand over and wait until Python lets the kernel go on; False when it is to stop."""
+    while control[ring.READY]:
+        control[ring.HUNGRY] = 1
+        _nap(rings, control, HUNGRY_NS, scratch)
+        if control[ring.STOP]:
+            return False
+    control[ring.PARKED] = 1
+    _hand_over(walk, rings, control, ended, scratch)
+    while control[ring.PARKED] and not control[ring.STOP]:
+        _nap(rings, control, NAP_NS, scratch)
+    fence()  # what Python has changed is read from here on
+    return not control[ring.STOP]
+
+
+@inner
+def _nap(rings, control, wait_ns, scratch):  # type: ignore[no-untyped-def]
+    """Wait for Python, at most `wait_ns`."""
+    if wait_for(control[ring.WAKE_FD], np.int64(wait_ns), np.bool_(False), scratch) > 0:
+        read_now(control[ring.WAKE_FD], rings.spare, 0, rings.spare.size)
+
+
+# -- in turn with the caller -------------------------------------------------------------------------------------------
+
+
 @inner
 def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no-untyped-def]
     """Read as soon as something is there; ALL_TAKEN when it is decoded, or why the call ends."""
@@ -138,9 +272,9 @@ def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no
             due = min(due, max(control[ring.BLOCK_NS] + control[ring.PATIENCE_NS], began_ns + LEAST_WAIT_NS))
         overdue = now >= due  # what is there is read once even then
         over = overdue or control[ring.N_MESSAGES] >= control[ring.BUDGET]
-        if control[ring.STOP] or (over and control[ring.N_ARRIVALS] > control[ring.FIRST_ARRIVAL]):
+        if control[ring.STOP] or (over and control[ring.N_ARRIVALS] > control[ring.FIRST]):
             return ring.DUE
-        if control[ring.N_ARRIVALS] == rings.arrivals.size or control[ring.N_NOTES] == rings.notes.shape[0]:
+        if control[ring.N_ARRIVALS] == control[ring.LIMIT] or control[ring.N_NOTES] == control[ring.LIMIT]:
             return ring.FULL
         awake = now < began_ns + control[ring.EAGER_NS]
         if not awake:
@@ -177,13 +311,26 @@ def _next_read(fed, reads, decoder, control):  # type: ignore[no-untyped-def]
 
 @inner
 def _begin(walk, control):  # type: ignore[no-untyped-def]
-    """Nothing has come in this call yet, unless it adds to the last one."""
-    if not control[ring.ADDS]:
-        for column in range(ring.ERRNO, ring.N_CONTROL):
-            control[column] = 0
-        control[ring.FIRST_ID], control[ring.URGENT] = control[ring.NEXT_ID], 0
-        walk.state[core.N_ROWS] = 0
-    control[ring.FIRST_NOTE], control[ring.FIRST_ARRIVAL] = control[ring.N_NOTES], control[ring.N_ARRIVALS]
+    """Fill the present half of the rings from its beginning."""
+    halves, half = control[ring.HALVES], control[ring.HALF]
+    control[ring.FIRST], control[ring.LIMIT] = half * (ring.MANY // halves), (half + 1) * (ring.MANY // halves)
+    control[ring.KEPT_LIMIT] = (half + 1) * (ring.KEPT_BYTES // halves)
+    rows = walk.rows.size // halves
+    control[ring.FIRST_ROW], control[ring.ROW_LIMIT] = half * rows, (half + 1) * rows
+    for column in range(ring.ERRNO, ring.N_STEPS):
+        control[column] = 0
+    for column in range(ring.N_STEPS, ring.KEPT):
+        control[column] = control[ring.FIRST]
+    control[ring.KEPT] = half * (ring.KEPT_BYTES // halves)
+    control[ring.URGENT] = 0
+    walk.state[core.N_ROWS] = control[ring.FIRST_ROW]
+
+
+@inner
+def _report(walk, control, ended):  # type: ignore[no-untyped-def]
+    """Complete what `control` says of the call, or batch, that ends."""
+    control[ring.STOP_ROW], control[ring.FOLLOWING] = walk.state[core.N_ROWS], walk.state[stream.NEXT_EXPOSURE]
+    control[ring.ENDED] = ended
 
 
 @inner
@@ -219,7 +366,7 @@ def _failed(control, found):  # type: ignore[no-untyped-def]
 def _note_wait(notes, control, began, asked, ended):  # type: ignore[no-untyped-def]
     """Keep a wait for bytes; one that follows at once on a wait that ended in time is the same one (live/timing/causes.py)."""
     n = control[ring.N_NOTES]
-    if n > control[ring.FIRST_NOTE]:
+    if n > control[ring.FIRST]:
         before = notes[n - 1]
         if before[2] - before[1] < OVERSLEPT_NS and began - min(before[1], before[2]) < control[ring.FLOOR_NS]:
             before[1], before[2] = asked, ended
@@ -245,7 +392,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
     buffer, bodies = decoder.buffer, decoder.bodies
     while control[ring.PLACE] < control[ring.N_BODIES]:
         start, stop = bodies[control[ring.PLACE], 0], bodies[control[ring.PLACE], 1]
-        if not _has_room(walk, rings, control, stop - start):
+        if not _has_room(walk, control, stop - start):
             return ring.FULL
         if buffer[start] == _ACK and control[ring.DRIVES]:
             if load_session(buffer, start) != walk.state[core.SESSION]:
@@ -254,8 +401,14 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
             if said == IS_ODD:
                 return ring.ODD
             _keep(buffer, start, stop, rings.kept, rings.answers, ring.N_ANSWERS, control)
-            if said == IS_REFUSED:
-                rings.answers[control[ring.N_ANSWERS] - 1, ring.WHAT] = ring.REFUSAL
+            rings.answers[control[ring.N_ANSWERS] - 1, ring.WHAT] = ring.REFUSAL if said == IS_REFUSED else ring.DONE
+            control[ring.PLACE] += 1
+            continue
+        if control[ring.SERVES] and (buffer[start] == _ACK or buffer[start] == _PONG):
+            # an answer changes nothing that the core knows: the session gets it with the batch, from `answers`
+            if load_session(buffer, start) != walk.state[core.SESSION]:
+                return ring.ODD
+            _keep(buffer, start, stop, rings.kept, rings.answers, ring.N_ANSWERS, control)
             control[ring.PLACE] += 1
             continue
         if not control[ring.OPEN]:
@@ -288,15 +441,15 @@ def load_session(buffer, start):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _has_room(walk, rings, control, size):  # type: ignore[no-untyped-def]
-    """Whether another body of `size` bytes, what it answers and all its decisions fit into the rings."""
+def _has_room(walk, control, size):  # type: ignore[no-untyped-def]
+    """Whether another body of `size` bytes, what it answers and all its decisions fit into this half of the rings."""
     return (
-        control[ring.KEPT] + size + ring.SHOW_BYTES <= rings.kept.size
-        and control[ring.N_STEPS] < rings.steps.shape[0]
-        and control[ring.N_MESSAGES] < rings.messages.shape[0]
-        and control[ring.N_ANSWERS] < rings.answers.shape[0]
-        and control[ring.N_SHOWS] < rings.shows.shape[0]
-        and walk.state[core.N_ROWS] + control[ring.BLOCK_ROWS] <= walk.rows.size
+        control[ring.KEPT] + size + ring.SHOW_BYTES <= control[ring.KEPT_LIMIT]
+        and control[ring.N_STEPS] < control[ring.LIMIT]
+        and control[ring.N_MESSAGES] < control[ring.LIMIT]
+        and control[ring.N_ANSWERS] < control[ring.LIMIT]
+        and control[ring.N_SHOWS] < control[ring.LIMIT]
+        and walk.state[core.N_ROWS] + control[ring.BLOCK_ROWS] <= control[ring.ROW_LIMIT]
     )
 
 

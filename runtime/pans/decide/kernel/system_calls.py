@@ -51,6 +51,14 @@ if numba.config.DISABLE_JIT:
             return -(error.errno or 1)
         return len(found[0]) + len(found[1])
 
+    def wait_both(fd: Any, wake_fd: Any, wait_ns: Any, scratch: I64) -> int:
+        """Wait at most `wait_ns` until `fd` or `wake_fd` can be read: 1 and 2 added up say which, 0 neither, below 0 minus errno."""
+        try:
+            found = select.select([int(fd), int(wake_fd)], [], [], max(wait_ns, 0) / 1e9)[0]
+        except OSError as error:
+            return -(error.errno or 1)
+        return (int(fd) in found) + 2 * (int(wake_fd) in found)
+
     def read_now(fd: int, buffer: U8, at: int, size: int) -> int:
         """Read at most `size` bytes to buffer[at:]: how many, 0 at the end (or of a terminal without data), else minus errno."""
         try:
@@ -77,6 +85,11 @@ elif sys.platform not in ("linux", "darwin"):
 
     @inner
     def wait_for(fd, wait_ns, to_write, scratch):  # type: ignore[no-untyped-def]
+        """Not offered here."""
+        return np.int64(-_NOT_OFFERED)
+
+    @inner
+    def wait_both(fd, wake_fd, wait_ns, scratch):  # type: ignore[no-untyped-def]
         """Not offered here."""
         return np.int64(-_NOT_OFFERED)
 
@@ -112,11 +125,25 @@ else:
     def wait_for(fd, wait_ns, to_write, scratch):  # type: ignore[no-untyped-def]
         """Wait at most `wait_ns` until `fd` can be read (or written): above 0 when it can or is gone, 0 when not, else minus errno."""
         scratch[0] = np.int64(fd) | (_OUT if to_write else _IN) << np.int64(32)
+        return _polled(1, wait_ns, scratch)
+
+    @inner
+    def wait_both(fd, wake_fd, wait_ns, scratch):  # type: ignore[no-untyped-def]
+        """Wait at most `wait_ns` until `fd` or `wake_fd` can be read: 1 and 2 added up say which, 0 neither, below 0 minus errno."""
+        scratch[0], scratch[1] = np.int64(fd) | _IN << np.int64(32), np.int64(wake_fd) | _IN << np.int64(32)
+        found = _polled(2, wait_ns, scratch)
+        if found <= 0:
+            return found
+        return np.int64(scratch[0] >> 48 != 0) + 2 * np.int64(scratch[1] >> 48 != 0)  # revents are the highest 16 bits
+
+    @inner
+    def _polled(count, wait_ns, scratch):  # type: ignore[no-untyped-def]
+        """Poll the first `count` of two descriptors in `scratch`."""
         if _DARWIN:
-            found = _poll(scratch.ctypes.data, np.uint32(1), np.int32(max((wait_ns + 999_999) // 1_000_000, 0)))
+            found = _poll(scratch.ctypes.data, np.uint32(count), np.int32(max((wait_ns + 999_999) // 1_000_000, 0)))
         else:
             scratch[2], scratch[3] = max(wait_ns, 0) // NS_PER_S, max(wait_ns, 0) % NS_PER_S
-            found = _ppoll(scratch.ctypes.data, np.uint64(1), scratch.ctypes.data + 16, 0)
+            found = _ppoll(scratch.ctypes.data, np.uint64(count), scratch.ctypes.data + 16, 0)
         return np.int64(found) if found >= 0 else -np.int64(_errno_at()[0])
 
     @inner

@@ -39,7 +39,7 @@ class CoreState:
         self._decider, self._shots = decider, shots
         self.tables = decision_tables(decider, shots, plan)
         asked = 0 if self.decides else decider.n_features
-        rows_max = self.block_rows + min(ROWS_PER_CALL, COUNTS_PER_CALL // max(asked, 1))
+        rows_max = 2 * self.block_rows + min(ROWS_PER_CALL, COUNTS_PER_CALL // max(asked, 1))
         # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
         self._rows: Rows = np.full(rows_max, 0, DECISION_DTYPE)
         self._counts = np.full((rows_max if asked else 0, decider.n_features), 0, np.int64)
@@ -114,11 +114,11 @@ class CoreState:
         load_core(self.core, state)
         state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT] = self.windows.position
 
-    def store(self) -> None:
-        """Copy what the kernel did back."""
-        state = self._state.tolist()
-        if store_core(self.core, state):
-            self.windows.advance((state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT]))
+    def store(self, state: npt.NDArray[np.int64]) -> None:
+        """Copy what the kernel did back: its state, or what that was when a batch was handed over."""
+        found = state.tolist()
+        if store_core(self.core, found):
+            self.windows.advance((found[kernels.VISIT], found[kernels.NEXT_WINDOW], found[kernels.OBJECT]))
 
 
 def load_core(core: Any, state: npt.NDArray[np.int64]) -> None:
@@ -148,7 +148,7 @@ def store_core(core: Any, state: list[int]) -> bool:
 class IdleSteps:
     """What the kernel has of a core (a Follower) that takes every message itself: it only receives and checks."""
 
-    takes, decides, block_rows = False, True, 1
+    takes, decides, block_rows = False, False, 1
 
     def __init__(self, core: Any) -> None:
         self.walk = IdleArrays(np.zeros(kernels.N_STATE, np.int64), np.zeros(1, DECISION_DTYPE), core.tracker.heard)
@@ -165,7 +165,7 @@ class IdleSteps:
     def load(self) -> None:
         """Nothing is continued."""
 
-    def store(self) -> None:
+    def store(self, state: npt.NDArray[np.int64]) -> None:
         """Nothing was."""
 
 

@@ -252,16 +252,25 @@ class Evidence:
         self._spans: deque[Span] = deque(maxlen=MAX_SPANS)
         self._stamped: deque[Stamped] = deque(maxlen=MAX_STAMPED)
         self._collecting_ns = self._cpu_mark_ns = 0
+        self._apart = False  # whether decisions are made in another thread than the accounting
+        self._accounting: deque[Span] = deque(
+            maxlen=MAX_STAMPED
+        )  # then: what the accounting did, which delays no decision
         self._counters = Counters(now_ns, [])
 
-    def watch(self, reader: int | None = None) -> None:
-        """From here on watch collections, the calling thread, and the link's reader by native id; a new link has a new one."""
+    def watch(self, reader: int | None = None, deciding: int | None = None) -> None:
+        """From here on watch collections and the thread that decides, by native ids: the calling one, with the link's reader, or another.
+
+        A new link has a new reader.
+        """
         if self._virtual:
             return
         if self._on_gc not in gc.callbacks:
             gc.callbacks.append(self._on_gc)
         self._counters.close()
-        self._counters = Counters(self._now, [threading.get_native_id(), *([reader] if reader else [])])
+        self._apart = deciding is not None
+        own = [threading.get_native_id(), *([reader] if reader else [])] if deciding is None else [deciding]
+        self._counters = Counters(self._now, own)
 
     def close(self) -> None:
         """End: leave the collector as it was found; idempotent."""
@@ -269,9 +278,18 @@ class Evidence:
             gc.callbacks.remove(self._on_gc)
         self._counters.close()
 
+    def parked(self, begin_ns: int, end_ns: int) -> None:
+        """Note that the thread that decides waited for the accounting: what that did counts."""
+        for one in self._accounting:
+            if one.end_ns > begin_ns and one.begin_ns < end_ns:
+                self._spans.append(Span(one.kind, max(one.begin_ns, begin_ns), min(one.end_ns, end_ns)))
+
     def worked(self, kind: str, begin_ns: int, end_ns: int) -> None:
         """Note that the loop was busy with `kind`."""
-        if end_ns - begin_ns >= self.floor_ns:
+        if end_ns - begin_ns >= self.floor_ns and self._apart:
+            kept = self._spans if kind == INFERENCE else self._accounting
+            kept.append(Span(kind, begin_ns, end_ns))
+        elif end_ns - begin_ns >= self.floor_ns:
             cpu_ns = -1 if self._virtual else time.thread_time_ns() - self._cpu_mark_ns
             self._spans.append(Span(kind, begin_ns, end_ns, cpu_ns))
 

@@ -31,10 +31,10 @@ class Lateness:
         if recorder is not None and not link.virtual:
             recorder.watch_write = partial(self.evidence.worked, DISK)
 
-    def attach(self, connection: Connection, start_ns: int) -> None:
-        """Take evidence from `connection` from here on; its exposures begin at `start_ns`."""
+    def attach(self, connection: Connection, start_ns: int, deciding: int | None) -> None:
+        """Take evidence from `connection`, and of the thread that decides, from here on; its exposures begin at `start_ns`."""
         connection.evidence = self.evidence
-        self.evidence.watch(connection.reader.thread_id)
+        self.evidence.watch(connection.reader.thread_id, deciding)
         self.block_ns, self._asked, self._damaged = start_ns, False, 0
 
     def poll_s(self, now_ns: int) -> float:
@@ -47,6 +47,11 @@ class Lateness:
     def patience_ns(self) -> int:
         """How long after a block the next one is overdue; 0 where the device has been asked already."""
         return 0 if self._asked else self._patience_ns
+
+    @property
+    def longest_ns(self) -> int:
+        """How long after a block the next one is overdue."""
+        return self._patience_ns
 
     def block_came(self, arrival_ns: int) -> None:
         """Note that the stream goes on."""

@@ -60,6 +60,8 @@ class LinkReader:
         self._visits = 0  # how often the loop has read
         self._helping = False
         self._stopping = False
+        self._needed = threading.Event()  # the helper
+        self._needed.set()
         self._thread: threading.Thread | None = None
         if not link.virtual:
             self._thread = threading.Thread(target=self._watch, name="pans-link-reader", daemon=True)
@@ -111,12 +113,17 @@ class LinkReader:
                 size -= len(more[0].data)
         return chunks
 
-    def lend(self) -> bool:
-        """Leave the link to the caller, who reads it himself until `take_back`; False where chunks wait or somebody reads."""
+    def lend(self, *, long: bool = False) -> bool:
+        """Leave the link to the caller, who reads it himself until `take_back`; False where chunks wait or somebody reads.
+
+        With `long` the helper sleeps meanwhile: it need not look whether the loop is busy.
+        """
         self._away = False
         self._visits += 1
         if not self._chunks and self._death is None and self._reading.acquire(blocking=False):
             if not self._chunks:  # the helper has put none before it let go
+                if long:
+                    self._needed.clear()
                 return True
             self._reading.release()
         self._away = True
@@ -125,12 +132,15 @@ class LinkReader:
     def take_back(self) -> None:
         """Read for a busy loop again; it counts as busy from here on."""
         self._reading.release()
+        if not self._needed.is_set():
+            self._needed.set()
         self._visits += 1
         self._away = True
 
     def stop(self) -> None:
         """Stop the thread; the link stays as it is."""
         self._stopping = True
+        self._needed.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             with self._ready:
                 self._ready.notify_all()
@@ -182,6 +192,7 @@ class LinkReader:
         seen = -1
         try:
             while not self._stopping:
+                self._needed.wait()
                 time.sleep(LOOK_EVERY_S)
                 if self._away and self._visits == seen:
                     self._help()

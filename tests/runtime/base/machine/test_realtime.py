@@ -18,12 +18,15 @@ from pans.base.errors import UsageError
 from pans.base.machine.realtime import (
     GRANTED,
     ThreadCounts,
+    apart,
     arm_realtime,
     bound,
     busy_core,
     check_core,
+    deciding_core,
     fault_words,
     isolated_cores,
+    off_the_deciding_core,
     scheduled,
     shallow_idle,
     steal_ms,
@@ -73,6 +76,29 @@ def test_a_thread_of_real_time_priority_is_not_shut_out_by_its_own_spinner() -> 
             assert os.sched_getscheduler(0) == os.SCHED_FIFO
             assert os.sched_getparam(0).sched_priority == 2
     assert spinners() == []
+
+
+def test_the_thread_that_decides_gets_a_core_that_a_simulator_leaves_alone() -> None:
+    """One run of a machine has it; what the user has bound stays as it is."""
+    before, core = os.sched_getaffinity(0), deciding_core()
+    if core is None:
+        pytest.skip("one core, or this process is confined to some of them")
+    with off_the_deciding_core() as is_off:
+        assert is_off
+        assert os.sched_getaffinity(0) == before - {core}
+        assert deciding_core() is None  # confined: nothing is bound
+    ended = threading.Event()
+    thread = threading.Thread(target=ended.wait)
+    thread.start()
+    assert thread.native_id is not None
+    with apart(thread.native_id) as place, apart(threading.get_native_id()) as refused:
+        if place["deciding_core"] == core:  # else another run of this machine has it
+            assert os.sched_getaffinity(thread.native_id) == {core}
+        assert "another run decides on core" in refused["deciding_core"]
+        assert os.sched_getaffinity(0) == before
+    assert os.sched_getaffinity(thread.native_id) == before
+    ended.set()
+    thread.join()
 
 
 def test_a_core_that_is_not_there_is_refused_with_those_that_are() -> None:
@@ -137,7 +163,10 @@ def test_real_time_is_asked_for_with_a_device_and_not_with_a_simulated_one(
     welcome = SimpleNamespace(facts={"simulated": told})
     reader = SimpleNamespace(thread_id=None)
     connection = SimpleNamespace(link=link, reader=reader, session=SimpleNamespace(welcome=welcome))
-    run: Any = SimpleNamespace(connection=connection, config=RunOptions(**options), realtime={})
+    receiver = SimpleNamespace(thread_id=None)
+    run: Any = SimpleNamespace(
+        connection=connection, config=RunOptions(**options), realtime=dict[str, Any](), receiver=receiver
+    )
     with _granted(run):
         assert ("sched_fifo" in run.realtime, "mlockall" in run.realtime) == (asked, asked)
 
