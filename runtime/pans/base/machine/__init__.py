@@ -31,7 +31,7 @@ from .realtime import (
 
 if TYPE_CHECKING:
     from .jit import FOLDER, inner, kernel_folder, njit, outer
-    from .jit_bytes import as_float32, bare, copy_span, load4, load8, spin
+    from .jit_bytes import as_float32, bare, copy_span, load2, load4, load8, spin
 
 __all__ = [
     "FIFO_PRIORITY",
@@ -53,6 +53,7 @@ __all__ = [
     "isolated_cores",
     "kernel_folder",
     "lacking",
+    "load2",
     "load4",
     "load8",
     "load_average",

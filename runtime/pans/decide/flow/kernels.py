@@ -306,7 +306,7 @@ def _take_frames(buffer, payload, stop, facts, slot_offsets, flow, mask):  # typ
     if flow.state[NEXT] != first:  # the block before was left out: it did not fit the plan
         return 0
     tick, period = stream.block_times(buffer, payload)
-    if period != facts[core.PERIOD_TICKS] or load4(buffer, payload + _U(32)) != _NO_OBJECT:
+    if period != facts[core.PERIOD_TICKS] or load4(buffer, payload + stream.OBJECT_AT) != _NO_OBJECT:
         return 0
     if tick < core.planned_tick(first, facts, slot_offsets) - period:
         return 0
@@ -335,7 +335,7 @@ def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
             return core.ODD
         if not stream.mark_fits(buffer, payload, state, state[core.N_CLASSES]):
             return core.ODD
-        number = np.int64(load4(buffer, payload + _U(4)))
+        number = np.int64(load4(buffer, payload + stream.MARK_OBJECT_AT))
         if number < state[MARKED]:
             return core.ODD
         state[MARKED] = number + 1

@@ -284,7 +284,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
 @inner
 def load_session(buffer, start):  # type: ignore[no-untyped-def]
     """The session of the body at `start`, int64."""
-    return np.int64(load4(buffer, _U(start) + _U(4)))
+    return np.int64(load4(buffer, _U(start) + stream.SESSION_AT))
 
 
 @inner
@@ -335,7 +335,7 @@ def unpack_blocks(kept, messages, stamps, bits):  # type: ignore[no-untyped-def]
     for i in range(messages.shape[0]):
         if messages[i, ring.WHAT] == stream.CLICKS:
             payload = _U(messages[i, ring.BEGIN] + stream.BODY_HEADER)
-            count = np.int64(load4(kept, payload + _U(28)) & _U(0xFFFF))
+            count = stream.block_count(kept, payload)
             if used + count > stamps.size:
                 break
             stream.unpack_clicks(kept, payload, count, stamps[used:], bits[used:])

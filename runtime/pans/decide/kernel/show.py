@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from pans.base.machine import inner, load4
+from pans.base.machine import inner, load2, load4
 from pans.decide.still import kernels as core
 from pans.protocol.session import COMMAND_WINDOW
-from pans.protocol.wire import HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS, crc32_span
+from pans.protocol.wire import ACK_DTYPE, HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS, crc32_span, payload_offsets
 from pans.protocol.wire import kernels as stream
 
 from . import arrays as ring
 from .system_calls import AGAIN, INTERRUPTED, now_ns, wait_for, write_now
 
 ACK_BYTES = STRUCTS["ACK"].size
+LAST_AT, REFUSED_AT, MASK_AT, STATUS_AT, TEXT_BYTES_AT = payload_offsets(
+    ACK_DTYPE, "last_id", "refused_id", "refused_mask", "status", "text_bytes"
+)
 ID_AT, EXPOSURE_AT = HEADER.size, HEADER.size + STRUCTS["COMMAND"].size
 TAIL_AT = EXPOSURE_AT + 8
 IS_ODD, IS_DONE, IS_REFUSED = range(3)  # what `take_ack` says of an acknowledgement
@@ -130,15 +133,14 @@ def take_ack(buffer, start, stop, control):  # type: ignore[no-untyped-def]
     at = start + _U(stream.BODY_HEADER)
     if stop - at < _U(ACK_BYTES) or control[ring.WAITING]:
         return IS_ODD
-    last, refused = np.int64(load4(buffer, at)), np.int64(load4(buffer, at + _U(4)))
-    outcome = load4(buffer, at + _U(12))
-    status, text_bytes = outcome & _U(0xFFFF), outcome >> _U(16)
+    last, refused = np.int64(load4(buffer, at + LAST_AT)), np.int64(load4(buffer, at + REFUSED_AT))
+    status, text_bytes = load2(buffer, at + STATUS_AT), load2(buffer, at + TEXT_BYTES_AT)
     if stop - at != _U(ACK_BYTES) + text_bytes or text_bytes > _U(MAX_ACK_TEXT_BYTES) or (status and not refused):
         return IS_ODD
     oldest = control[ring.OLDEST_ID]
     if not oldest <= last < control[ring.NEXT_ID] or last - oldest > COMMAND_WINDOW:
         return IS_ODD
-    fresh = load4(buffer, at + _U(8)) & ((_U(2) << _U(last - oldest)) - _U(1))
+    fresh = load4(buffer, at + MASK_AT) & ((_U(2) << _U(last - oldest)) - _U(1))
     own = oldest >= control[ring.FIRST_ID]
     is_refused = refused == last and last == oldest and own and status != _U(0) and fresh == _U(1)
     if not is_refused and (fresh != _U(0) or refused >= oldest):

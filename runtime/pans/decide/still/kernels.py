@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pans.base.machine import inner, load4, load8
+from pans.base.machine import inner, load2, load4, load8
 from pans.bundle.backends import NO_LABEL
 from pans.decide.decision import DecisionFlag
 from pans.protocol.wire import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
@@ -186,7 +186,7 @@ def is_ours(buffer, start, stop, state):  # type: ignore[no-untyped-def]
     return (
         stop >= start + _U(stream.BODY_HEADER)
         and stream.is_plain(buffer, start)
-        and load4(buffer, start + _U(4)) == _U(state[SESSION])
+        and load4(buffer, start + stream.SESSION_AT) == _U(state[SESSION])
     )
 
 
@@ -195,8 +195,11 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
     """Remember an object's truth; False, and nothing done, when the message is not the next one."""
     if not stream.is_next_mark(buffer, payload, stop, state):
         return False
-    number, first = np.int64(load4(buffer, payload + _U(4))), np.int64(load8(buffer, payload + _U(12)))
-    fits = load4(buffer, payload + _U(8)) >> _U(16) == _U(0)  # it stands still
+    number, first = (
+        np.int64(load4(buffer, payload + stream.MARK_OBJECT_AT)),
+        np.int64(load8(buffer, payload + stream.MARK_FIRST_AT)),
+    )
+    fits = load2(buffer, payload + stream.HALF_AT) == _U(0)  # it stands still
     fits = (
         fits and number < _NO_OBJECT and number * state[VISIT_EXPOSURES] == first and first < state[stream.END_EXPOSURE]
     )
@@ -253,7 +256,7 @@ def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-
     if first + count > (visit + 1) * state[VISIT_EXPOSURES]:
         return False
     tick, period = stream.block_times(buffer, payload)
-    number = np.int64(load4(buffer, payload + _U(32)))
+    number = np.int64(load4(buffer, payload + stream.OBJECT_AT))
     if number != visit % _NO_OBJECT and number != _NO_OBJECT:
         return False
     if period != state[PERIOD_TICKS] or tick < planned_tick(first, state, windows.offsets) - period:
@@ -296,15 +299,14 @@ def _is_due(visit, relative, state, windows):  # type: ignore[no-untyped-def]
 
 @inner
 def _block_of(buffer, payload, state, marks, windows):  # type: ignore[no-untyped-def]
-    shape = load4(buffer, payload + _U(28))
-    first = np.int64(load8(buffer, payload + _U(16)))
+    first = np.int64(load8(buffer, payload + stream.FIRST_AT))
     tick, period = stream.block_times(buffer, payload)
     number = state[OBJECT]
     known = number != _NO_OBJECT and marks.objects[number % MARK_SLOTS] == number
     truth = np.int64(marks.truths[number % MARK_SLOTS]) if known else np.int64(_UNKNOWN)
     return Block(
-        np.int64(shape & _U(0xFFFF)),
-        shape >> _U(16),
+        stream.block_count(buffer, payload),
+        load2(buffer, payload + stream.WIDTH_AT),
         payload + _U(stream.BLOCK_HEADER),
         first,
         first - state[VISIT] * state[VISIT_EXPOSURES],
