@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from inner_kernels import called
 
+from pans.decide.core_state import CORE_DTYPE
 from pans.protocol.tracker import MEMORY_BYTES, Gap, StreamTracker
-from pans.protocol.wire import Frame, FrameDecoder
+from pans.protocol.wire import Frame, FrameDecoder, kernels
 from pans.protocol.wire import messages as wire
 from pans.protocol.wire.framing import content_crc
 from pans.protocol.wire.messages import ClickBlock, Mark
@@ -74,14 +76,20 @@ def test_what_is_missing_before_a_message(then: list[Frame], gaps: list[Gap | No
     assert {name: found[name] for name in wanted | counts} == wanted | counts
 
 
+def by_kernel(tracker: StreamTracker, next_seq: int, exposures: int) -> None:
+    """Let the kernel account for a message with so many exposures; `next_seq` follows it."""
+    called(kernels.go_on)(tracker.cells.view(CORE_DTYPE)[0], exposures)
+    assert tracker.next_seq == next_seq
+
+
 def test_marks_taken_elsewhere_do_not_hide_a_loss() -> None:
-    tracker = StreamTracker()
+    tracker = StreamTracker(np.zeros(1, CORE_DTYPE))
     tracker.accept(clicks(0, 0, 4))
     tracker.accept(mark(2))  # message 1, with four exposures, is lost
-    tracker.advance((4, 4), messages=1, exposures=0)  # a mark that the kernel took
+    by_kernel(tracker, 4, exposures=0)  # a mark
     assert tracker.accept(clicks(4, 8, 4))[1] == Gap(4, 4, 1, 0)
     tracker.accept(mark(6))
-    tracker.advance((8, 16), messages=1, exposures=4)  # exposures follow without a gap: what was lost held none
+    by_kernel(tracker, 8, exposures=4)  # they follow without a gap: what was lost held none
     assert tracker.accept(clicks(8, 20, 4, drops=4))[1] == Gap(16, 4, 0, 4)
     counters = tracker.counters
     assert (counters.messages, counters.exposures, counters.unexplained_drops) == (7, 16, 0)

@@ -15,13 +15,11 @@ import numpy.typing as npt
 from pans.bundle.backends import Decider
 from pans.decide.decision import DECISION_DTYPE, CoreEvent, Output
 from pans.decide.plan.plan import Plan
-from pans.decide.still import kernels as core_kernels
 from pans.decide.still.core import Core
 from pans.decide.still.kernel_state import CoreState
 from pans.decide.still.kernels import DecisionTables
 from pans.protocol.session import STREAM_TYPES
 from pans.protocol.wire import CHUNK_BYTES, MARK_DTYPE, Frame, FrameDecoder, Messages, MessageType, unpack_body
-from pans.protocol.wire import kernels as place
 
 from . import arrays as ring
 from .arrays import I64, U8, Decoder, Drive, Rings, make_rings, no_drive
@@ -57,10 +55,10 @@ class Counts(NamedTuple):
 
 
 class Steps(Protocol):
-    """The compiled steps of a core (still/kernel_state.CoreState, flow/core.FlowCore): they lend its state to kernels and take it back.
+    """The compiled steps of a core (still/kernel_state.CoreState, flow/core.FlowCore).
 
-    `walk` is a tuple of arrays of its own class, for which receive.py chooses the kernel; its `state` begins with the columns of
-    decide/still/kernels.py, its `rows` are decisions. `block_rows` are most of one block. `takes`: messages may be
+    `walk` is a tuple of arrays of its own class, for which receive.py chooses the kernel; its `state` is the record of the core
+    (decide/core_state.py), its `rows` are decisions. `block_rows` are most of one block. `takes`: messages may be
     taken now; `decides`: the kernel gives each label at once.
     """
 
@@ -75,10 +73,6 @@ class Steps(Protocol):
 
     @property
     def block_rows(self) -> int: ...
-
-    def load(self) -> None: ...
-
-    def store(self) -> None: ...
 
     def rows(self, first: int, stop: int) -> npt.NDArray[np.void]: ...
 
@@ -104,7 +98,7 @@ class Kernel:
         self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
         self._drive = no_drive() if drive is None else drive
         self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
-        self.state: I64 = steps.walk.state
+        self.state: npt.NDArray[np.void] = steps.walk.state
         self.control[ring.FD] = -1
         self.control[ring.BLOCK_ROWS] = steps.block_rows
         self.control[ring.SENT_EXPOSURE] = self.control[ring.SENT_STATE] = -1
@@ -130,12 +124,9 @@ class Kernel:
     def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits, more: bool = False) -> int:
         self._prepare(fd, limits, more)
         ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
-        before = self.said.messages if more else 0
-        self.said = Counts._make((*self.control[ring.ERRNO :].tolist(), int(self.state[core_kernels.N_ROWS])))
+        self.said = Counts._make((*self.control[ring.ERRNO :].tolist(), int(self.state[0].n_rows)))
         if not more:
             self.begin, self.end = _NOTHING, self.said
-        if self.said.messages > before:
-            self.steps.store()
         return int(ended)
 
     def look(self) -> Counts:
@@ -162,10 +153,6 @@ class Kernel:
             control[ring.BUDGET] += self.said.messages
         control[ring.OPEN] = steps.takes
         control[ring.ADDS] = more
-        if more:  # what came before is stored
-            self.state[place.MESSAGES] = self.state[place.EXPOSURES] = 0
-        else:
-            steps.load()
 
     def feed(self, chunks: Sequence[tuple[int, Bytes]]) -> int:
         """Take what was read elsewhere: one read or more, each with the time at which it came.

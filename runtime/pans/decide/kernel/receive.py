@@ -182,7 +182,7 @@ def _begin(walk, control):  # type: ignore[no-untyped-def]
         for column in range(ring.ERRNO, ring.N_CONTROL):
             control[column] = 0
         control[ring.FIRST_ID], control[ring.URGENT] = control[ring.NEXT_ID], 0
-        walk.state[core.N_ROWS] = 0
+        walk.state[0].n_rows = 0
     control[ring.FIRST_NOTE], control[ring.FIRST_ARRIVAL] = control[ring.N_NOTES], control[ring.N_ARRIVALS]
 
 
@@ -248,7 +248,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
         if not _has_room(walk, rings, control, stop - start):
             return ring.FULL
         if buffer[start] == _ACK and control[ring.DRIVES]:
-            if load_session(buffer, start) != walk.state[core.SESSION]:
+            if load_session(buffer, start) != walk.state[0].session:
                 return ring.ODD
             said = take_ack(buffer, _U(start), _U(stop), control)
             if said == IS_ODD:
@@ -263,7 +263,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
         decoded_ns = now_ns(scratch)
         took = take_message(walk, buffer, _U(start), _U(stop))
         if took >= core.TOOK_MARK:
-            stream.hear(buffer, _U(start), _U(stop), walk.heard, walk.state)
+            stream.hear(buffer, _U(start), _U(stop), walk.heard, walk.state[0])
         if took >= core.TOOK_BLOCK:
             control[ring.URGENT] |= took - core.TOOK_BLOCK
             decided_ns = now_ns(scratch)
@@ -296,7 +296,7 @@ def _has_room(walk, rings, control, size):  # type: ignore[no-untyped-def]
         and control[ring.N_MESSAGES] < rings.messages.shape[0]
         and control[ring.N_ANSWERS] < rings.answers.shape[0]
         and control[ring.N_SHOWS] < rings.shows.shape[0]
-        and walk.state[core.N_ROWS] + control[ring.BLOCK_ROWS] <= walk.rows.size
+        and walk.state[0].n_rows + control[ring.BLOCK_ROWS] <= walk.rows.size
     )
 
 
@@ -319,7 +319,7 @@ def _put_step(walk, steps, control, decoded_ns, decided_ns, recorded_ns):  # typ
     step = steps[control[ring.N_STEPS]]
     step[ring.ARRIVAL], step[ring.DECODED] = control[ring.ARRIVAL_NS], decoded_ns
     step[ring.DECIDED], step[ring.RECORDED] = decided_ns, recorded_ns
-    step[ring.END_TICK], step[ring.ROWS] = walk.state[core.LAST_TICK], walk.state[core.N_ROWS]
+    step[ring.END_TICK], step[ring.ROWS] = walk.state[0].last_tick, walk.state[0].n_rows
     step[ring.MESSAGES], step[ring.SHOWS] = control[ring.N_MESSAGES], control[ring.N_SHOWS]
     control[ring.N_STEPS] += 1
     control[ring.BLOCK_NS] = control[ring.ARRIVAL_NS]

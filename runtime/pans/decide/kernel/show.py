@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from pans.base.machine import inner, load2, load4
-from pans.decide.still import kernels as core
 from pans.protocol.session import COMMAND_WINDOW
 from pans.protocol.wire import ACK_DTYPE, HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS, crc32_span, payload_offsets
 from pans.protocol.wire import kernels as stream
@@ -32,8 +31,8 @@ _U = np.uint64
 def following(walk, drive):  # type: ignore[no-untyped-def]
     """Exposure and state of the next step: of the walk under way, or of the next one when this one is over or lost."""
     slots, walks = drive.sizes[0], drive.sizes[1]
-    cycle = walk.state[stream.NEXT_EXPOSURE] // slots
-    step = drive.next_step[walk.state[stream.NEXT_EXPOSURE] - cycle * slots]
+    cycle = walk.state[0].next_exposure // slots
+    step = drive.next_step[walk.state[0].next_exposure - cycle * slots]
     if step < drive.slot_of.size:
         state = _walk_state(walk, cycle // walks, cycle % walks, step)
         if state >= 0:
@@ -44,7 +43,7 @@ def following(walk, drive):  # type: ignore[no-untyped-def]
 @inner
 def _walk_state(walk, visit, window, step):  # type: ignore[no-untyped-def]
     """As DecisionWindows.walk_state: -1 when the walk is over, or what came before is not known."""
-    if visit != walk.state[core.VISIT]:
+    if visit != walk.state[0].visit:
         return np.int64(0) if step == 0 else np.int64(-1)
     node = walk.windows.walks.nodes[window]
     known = 0 <= node < walk.windows.walks.successors.shape[0] and walk.windows.seen[window, 0] == step
@@ -85,7 +84,7 @@ def send_show(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-
     """Name what follows the exposures taken, unless that has been said; False when it could not be sent whole."""
     exposure, state = following(walk, drive)
     said = exposure == control[ring.SENT_EXPOSURE] and state == control[ring.SENT_STATE]
-    if said or exposure >= walk.state[stream.END_EXPOSURE]:
+    if said or exposure >= walk.state[0].end_exposure:
         return True
     unanswered = control[ring.NEXT_ID] - control[ring.OLDEST_ID]
     if control[ring.WAITING] or unanswered >= COMMAND_WINDOW:

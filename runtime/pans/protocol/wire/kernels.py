@@ -2,7 +2,8 @@
 
 Kernels take arrays and allocate nothing. `unstuff_frames` gives the frames and counts that the protocol document asks for
 (tests/runtime/protocol/wire/test_framing.py has a plain decoder). The kernel of the live loop takes messages that are in order and
-without loss, with the account of the stream's place in an array, and leaves all others to `StreamTracker`.
+without loss, and leaves all others to `StreamTracker`. Both go on from one record: `place` is its row, `place.next_seq` and so on
+(protocol/tracker.py, decide/core_state.py).
 """
 
 from __future__ import annotations
@@ -25,9 +26,6 @@ from .schema import (
     payload_offsets,
 )
 
-# Where the stream stands, the first columns of a walk's state, int64: as StreamTracker knows it, the exposure at which the plan ends,
-# and what the walk has taken.
-NEXT_SEQ, NEXT_EXPOSURE, DROPS, END_EXPOSURE, MESSAGES, EXPOSURES, N_PLACE = range(7)
 CLICKS, FRAMES, MARK = int(MessageType.CLICKS), int(MessageType.FRAMES), int(MessageType.MARK)
 BODY_HEADER, BLOCK_HEADER, MARK_BYTES = HEADER.size, BLOCK_HEADER_BYTES, STRUCTS["MARK"].size
 # Where the fields stand in a payload. CLICKS, FRAMES and MARK begin with the sequence number.
@@ -274,12 +272,12 @@ def unpack_clicks(buffer, payload, count, stamps, bits):  # type: ignore[no-unty
 def _follows(buffer, payload, count, place):  # type: ignore[no-untyped-def]
     """Whether a block of `count` exposures is the next one, without loss, within the plan and the range of its fields."""
     return not (
-        load4(buffer, payload + SEQ_AT) != _U(place[NEXT_SEQ])
-        or load4(buffer, payload + DROPS_AT) != _U(place[DROPS])
+        load4(buffer, payload + SEQ_AT) != _U(place.next_seq)
+        or load4(buffer, payload + DROPS_AT) != _U(place.drops)
         or load8(buffer, payload + TICK_AT) >= LARGEST
-        or load8(buffer, payload + FIRST_AT) != _U(place[NEXT_EXPOSURE])
+        or load8(buffer, payload + FIRST_AT) != _U(place.next_exposure)
         or load4(buffer, payload + PERIOD_AT) == _U(0)
-        or place[NEXT_EXPOSURE] + count > place[END_EXPOSURE]
+        or place.next_exposure > place.end_exposure - count
     )
 
 
@@ -289,7 +287,7 @@ def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
 
     Its truth is compared with -1 alone here: how many classes there are, the caller knows.
     """
-    if stop - payload != _U(MARK_BYTES) or load4(buffer, payload + SEQ_AT) != _U(place[NEXT_SEQ]):
+    if stop - payload != _U(MARK_BYTES) or load4(buffer, payload + SEQ_AT) != _U(place.next_seq):
         return False
     photons = load4(buffer, payload + PHOTONS_AT)
     return (
@@ -303,7 +301,7 @@ def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
 @inner
 def mark_fits(buffer, payload, place, n_classes):  # type: ignore[no-untyped-def]
     """Whether a MARK's truth is one of `n_classes` or unknown, and its exposure near the stream's place, as decide/follower.py asks."""
-    away = np.int64(load8(buffer, payload + MARK_FIRST_AT)) - place[NEXT_EXPOSURE]
+    away = np.int64(load8(buffer, payload + MARK_FIRST_AT)) - place.next_exposure
     near = -MAX_GAP_EXPOSURES <= away <= MAX_GAP_EXPOSURES
     return near and -1 <= mark_truth(buffer, payload) < n_classes
 
@@ -311,10 +309,12 @@ def mark_fits(buffer, payload, place, n_classes):  # type: ignore[no-untyped-def
 @inner
 def go_on(place, count):  # type: ignore[no-untyped-def]
     """Account for the next message, with `count` exposures."""
-    place[NEXT_SEQ] = (place[NEXT_SEQ] + 1) & 0xFFFFFFFF
-    place[MESSAGES] += 1
-    place[NEXT_EXPOSURE] += count
-    place[EXPOSURES] += count
+    place.next_seq = (place.next_seq + 1) & 0xFFFFFFFF
+    place.messages += 1
+    place.next_exposure += count
+    place.exposures += count
+    if count:
+        place.lost_before = 0  # what was lost before these exposures held none
 
 
 @inner
@@ -329,7 +329,7 @@ def hear(buffer, start, stop, heard, place):  # type: ignore[no-untyped-def]
 
     The CRC need not stand behind the body: it does not in a recording.
     """
-    number = (place[NEXT_SEQ] - 1) & 0xFFFFFFFF
+    number = (place.next_seq - 1) & 0xFFFFFFFF
     row = heard[number % _WINDOW]
     row[0], row[1] = number, np.int64(crc32_span(buffer, start, stop, _SCHEMA))
 

@@ -184,7 +184,6 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
             while True:
                 ours.send(bytes(64))
         turn.control[ring.FD], turn.control[ring.NEXT_ID], turn.control[ring.OLDEST_ID] = ours.fileno(), 5, 5
-        steps.load()
         scratch = np.zeros(4, np.int64)
         assert not called(answer.send_show)(steps.walk, drive, turn.rings, turn.control, scratch)
         size = int(turn.rings.shows[0, ring.END])

@@ -19,7 +19,7 @@ from pans.decide.decision import DecisionFlag
 from pans.decide.kernel.calls import StreamCore
 from pans.decide.plan.plan import Plan
 from pans.decide.still import kernel_state
-from pans.decide.still.kernel_state import count_crc_tables
+from pans.decide.still.tables import count_crc_tables
 from pans.protocol.wire import DeviceState, MessageType, StateReason
 from pans.protocol.wire import messages as wire
 from pans.protocol.wire.messages import ClickBlock, FrameBlock, Mark, Status
