@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +42,9 @@ from pans.protocol.wire import (
 
 from .core_state import CORE_DTYPE, LARGEST
 from .decision import BeyondPlan, CoreEvent, Output, StreamEndUnknown, joined
+
+if TYPE_CHECKING:
+    from .dark.guard import DarkGuard
 
 
 class PlanRules:
@@ -193,6 +196,7 @@ class Follower:
     """
 
     moving = False  # whether objects flow past
+    guard: DarkGuard | None = None  # of the dark counts; None: they are only added up
 
     n_decisions = StateField(CORE_DTYPE)
     n_abstained = StateField(CORE_DTYPE)

@@ -20,7 +20,7 @@ from pans.protocol.wire.schema import MAX_GAP_EXPOSURES, RECEIVE_WINDOW
 
 
 def clicks(seq: int, first: int, n: int, drops: int = 0) -> Frame:
-    block = ClickBlock(seq % (1 << 32), drops, 10 * first, first, 10, 0, np.zeros(n, np.uint16), np.ones(n, np.uint8))
+    block = ClickBlock(seq % (1 << 32), drops, 10 * first % (1 << 60), first, 10, 0, np.zeros(n, np.uint16), np.ones(n, np.uint8))
     return FrameDecoder().feed(wire.encode_clicks(block, 1))[0]
 
 
@@ -202,6 +202,18 @@ def test_another_stream_begins_anew_and_the_totals_go_on() -> None:
     tracker.finish(7, 3)
     tracker.restart()
     assert tracker.open
+
+
+def test_an_exposure_beyond_the_state_is_known_exactly() -> None:
+    """The block that ends with exposure 2^63 - 1 is followed by 2^63, which no field of the state holds."""
+    tracker = StreamTracker()
+    tracker.resume((0, 2**63 - 2, 0))
+    assert tracker.accept(clicks(0, 2**63 - 2, 2))[1] is None
+    assert tracker.position == (1, 2**63, 0)
+    assert tracker.accept(clicks(1, 2**63 - 1, 1)) == (None, None)  # it came already
+    assert tracker.counters.malformed == 1
+    tracker.next_exposure = 2**63 - 1
+    assert tracker.next_exposure == 2**63 - 1
 
 
 @pytest.mark.parametrize("first", [0, 2**32 - 3])

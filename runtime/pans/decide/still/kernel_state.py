@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pans.bundle.backends import NO_LABEL, Decider, verdicts_of
+from pans.bundle.backends import NO_LABEL, Decider
 from pans.decide.decision import DECISION_DTYPE, DecisionFlag
 from pans.protocol.wire import Mark
 
@@ -81,7 +81,7 @@ class CoreState:
         if self.decides or not len(rows):
             return rows
         whole = np.flatnonzero(rows["flags"] == 0)
-        labels, probabilities = finite_labels(*verdicts_of(self._decider, self._counts[first + whole], self._shots))
+        labels, probabilities = finite_labels(*self._decider.verdicts(self._counts[first + whole], self._shots))
         rows["label"][whole], rows["probability"][whole] = labels, probabilities
         silent = labels == NO_LABEL
         why = np.where(probabilities > 0, int(DecisionFlag.AMBIGUOUS), int(DecisionFlag.NOT_FINITE))

@@ -23,10 +23,10 @@ def decision_tables(decider: Decider, shots: int, plan: Plan) -> DecisionTables:
     n_features = decider.n_features
     labels, probabilities = np.zeros(0, np.uint16), np.zeros(0, np.float32)
     radix = np.zeros(n_features, np.int64)
-    found = getattr(decider, "radix", None) if plan.automaton is None else None
-    radix = radix if found is None else np.array(found, np.int64)  # writable, always: one type to the compiler
-    if found is not None or (plan.automaton is not None and getattr(decider, "automaton", None) is plan.automaton):
-        labels, probabilities = finite_labels(getattr(decider, "labels"), getattr(decider, "probabilities"))  # noqa: B009
+    found = decider.look_up if decider.automaton is plan.automaton else None
+    if found is not None:
+        labels, probabilities = finite_labels(found.labels, found.probabilities)
+        radix = np.array(found.radix, np.int64)  # writable, always: one type to the compiler
     table, zero = count_crc_tables(n_features, shots * plan.largest)
     by_word = shots == 1 and plan.mode == "parallel" and found is not None and n_features <= WORD_FEATURES
     n_bytes = -(-n_features // 8) if by_word else 0

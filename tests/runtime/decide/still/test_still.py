@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plans import parallel, shot_major
 
-from pans.bundle.backends import NO_LABEL
+from pans.bundle.backends import NO_LABEL, Decider
 from pans.bundle.backends.verdict import Verdict, softmax_winner
 from pans.decide.dark.cusum import ChannelWatch
 from pans.decide.dark.guard import DarkGuard
@@ -24,7 +24,7 @@ N_FEATURES = 3
 PLAN = shot_major(N_FEATURES, 2)  # 4 slots per cycle, 2 cycles per object
 
 
-class CountingDecider:
+class CountingDecider(Decider):
     """Decides the number of clicks; remembers what it was asked."""
 
     name, n_features, n_classes = "counting", N_FEATURES, N_FEATURES + 1
