@@ -20,7 +20,9 @@ from pans.protocol.wire.schema import MAX_GAP_EXPOSURES, RECEIVE_WINDOW
 
 
 def clicks(seq: int, first: int, n: int, drops: int = 0) -> Frame:
-    block = ClickBlock(seq % (1 << 32), drops, 10 * first % (1 << 60), first, 10, 0, np.zeros(n, np.uint16), np.ones(n, np.uint8))
+    block = ClickBlock(
+        seq % (1 << 32), drops, 10 * first % (1 << 60), first, 10, 0, np.zeros(n, np.uint16), np.ones(n, np.uint8)
+    )
     return FrameDecoder().feed(wire.encode_clicks(block, 1))[0]
 
 

@@ -86,6 +86,11 @@ class FlowCore(Follower):
         self.block_rows = plan.block_exposures + 1 + MAX_PASSAGES
         self._facts: Any = self.state[0]  # by name
         self.walk = self._new_walk(plan, n)
+        rows = np.zeros(self.block_rows, DECISION_DTYPE), np.zeros((self.block_rows, kernels.N_PASSAGE), np.int64)
+        counts: I64 = np.zeros((self.block_rows, settings.pool, n), np.int64)
+        self._own = self.walk._replace(
+            rows=rows[0], passages=rows[1], counts=counts
+        )  # for `step`: the rows of a call stay
         self._ring = self.walk.flow
         self._passing: Any = self._ring.ring[0]
         self.dark_channels, self.empty_channels = self._ring.dark_channels, self._ring.empty_channels
@@ -140,6 +145,7 @@ class FlowCore(Follower):
         self._guard = guard
         if guard is not None and guard.policy != "warn":  # each verdict depends on what it has found
             self.walk = self.walk._replace(tables=undecided(self.walk.tables))
+            self._own = self._own._replace(tables=self.walk.tables)
         self._watch_on()
 
     @property
@@ -238,7 +244,7 @@ class FlowCore(Follower):
         """
         guard = self.guard
         events: list[CoreEvent] = [] if block is None or guard is None else [*guard.take(block)]
-        decided = self._decided(rows)
+        decided = self._decided(self.walk, rows)
         if self.watches_empty:
             events = [*self.watch(empty)]
         self.matcher.settle(behind)
@@ -255,9 +261,9 @@ class FlowCore(Follower):
 
     # -- one decision --------------------------------------------------------------------------------------------------
 
-    def _decided(self, rows: slice) -> Output:
-        """Give verdicts to the rows that wait for one, compare all with the truth, and ask for pulses."""
-        walk, guard = self.walk, self.guard
+    def _decided(self, walk: FlowWalk, rows: slice) -> Output:
+        """Give verdicts to the rows of `walk` that wait for one, compare all with the truth, and ask for pulses."""
+        guard = self.guard
         decisions, passages, actions = list[Decision](), list[Passage](), list[Action]()
         for at in range(rows.start, rows.stop):
             row, counts = walk.rows[at], walk.counts[at]
@@ -351,9 +357,8 @@ class FlowCore(Follower):
         output, done, facts = Output([], [], None), False, self._facts
         watch_at, facts.watch_at = int(facts.watch_at), _NEVER  # `_take` tells the guard itself
         while not done:
-            facts.n_rows = 0
-            done = bool(kernels.settle(self.walk, stop, origin_tick, flags))
-            output = joined(output, self._decided(slice(0, int(facts.n_rows))))
+            some, done = self._stepped(kernels.settle, stop, origin_tick, flags)
+            output = joined(output, some)
         facts.watch_at, facts.asks = watch_at, 0  # the pulses are in the output
         return output
 
@@ -370,9 +375,15 @@ class FlowCore(Follower):
 
     def _close(self) -> Output:
         """Give up what the end of the stream leaves open."""
-        self._facts.n_rows = 0
-        kernels.close_passage(self.walk, min(self.last_tick, LARGEST))
-        return self._decided(slice(0, int(self._facts.n_rows)))
+        return self._stepped(kernels.close_passage, min(self.last_tick, LARGEST))[0]
+
+    def _stepped(self, kernel: Any, *arguments: int) -> tuple[Output, bool]:
+        """Run a compiled step on rows of its own; return what it decides, and whether it is done."""
+        facts = self._facts
+        kept, facts.n_rows = int(facts.n_rows), 0
+        done = kernel(self._own, *arguments)
+        n, facts.n_rows = int(facts.n_rows), kept
+        return self._decided(self._own, slice(0, n)), bool(done)
 
     def _give_up(self) -> Output:
         output, passing = self._close(), self._passing

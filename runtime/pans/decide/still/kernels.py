@@ -1,8 +1,7 @@
 """The kernel of the core: decoded CLICKS, FRAMES and MARK bodies in, rows of the decision log out.
 
 `take_frames` and `take_clicks` receive the ordinary message: in order, nothing lost, a block that fits the plan. Any other they leave
-untouched. Their caller gives it to `still.Core`, which goes on from the same state by `settle`, `push_frames` and `push_clicks`. Nothing is
-allocated.
+untouched. Their caller gives it to `still.Core`, which goes on from the same state by `step_frames` or `step_clicks`. Nothing is allocated.
 """
 
 from __future__ import annotations
@@ -341,52 +340,47 @@ def _top_mask(windows):  # type: ignore[no-untyped-def]
 
 
 @outer
-def settle(walk, visit, relative, tick, flags):  # type: ignore[no-untyped-def]
-    """Settle the windows before exposure `relative` of `visit` that will never be complete, at `tick`; `flags` go with each.
+def step_clicks(walk, visit, relative, count, number, tick, period, flags):  # type: ignore[no-untyped-def]
+    """Count `count` exposures of object `number`, in `stamps` and `bits`, from exposure `relative` of `visit` on, and settle windows.
 
-    False when more is to be settled: a call ends with the visit under way, and when the rows are full.
+    Without exposures, those before `relative` are settled that will never be complete, visit by visit: False where more are left, or the
+    rows are full. Before exposures all is settled. Exposure e of the visit ends at `tick` + e * `period`; `flags` go with each row.
     """
     walk = bare(walk)
     state, windows = walk.state[0], walk.windows
-    end = relative if state.visit >= visit else state.visit_exposures
-    first, zero = state.visit * state.visit_exposures, np.int64(0)
-    block = Block(end, _U(0), _U(0), first, zero, tick, zero, state.object_index, np.int64(_UNKNOWN), zero)
-    _settle(block, state, windows, walk.tables, walk.rows, walk.counts, flags)
-    if state.n_rows == walk.rows.size:
-        return False
-    if state.visit >= visit:
-        return True
-    _enter(state.visit + 1, np.int64(_NO_OBJECT), state, windows)
-    return False
+    if count:
+        _enter(visit, number, state, windows)
+        _add_clicks(relative, windows.stamps[:count], windows.bits[:count], windows)
+    return _settle_visit(walk, visit, relative + count, tick, period, flags)
 
 
 @outer
-def push_clicks(walk, count, first, number, tick, period):  # type: ignore[no-untyped-def]
-    """Count `count` exposures of object `number` from `first` on, which stand in `stamps` and `bits`, and settle what they complete.
-
-    All before them is settled. The first one ends at `tick`, the others `period` ticks apart.
-    """
-    walk = bare(walk)
-    state, windows, zero = walk.state[0], walk.windows, np.int64(0)
-    visit = first // state.visit_exposures
-    _enter(visit, number, state, windows)
-    relative = first - visit * state.visit_exposures
-    _add_clicks(relative, windows.stamps[:count], windows.bits[:count], windows)
-    block = Block(count, _U(0), _U(0), first, relative, tick, period, number, np.int64(_UNKNOWN), zero)
-    _settle(block, state, windows, walk.tables, walk.rows, walk.counts, 0)
-
-
-@outer
-def push_frames(walk, words, width, first, number, tick, period):  # type: ignore[no-untyped-def]
-    """As `push_clicks`, of frames: uint8 words of `width` bytes behind one another."""
+def step_frames(walk, words, width, visit, relative, number, tick, period, flags):  # type: ignore[no-untyped-def]
+    """As `step_clicks`, of frames: uint8 words of `width` bytes behind one another."""
     walk = bare(walk)
     state, windows = walk.state[0], walk.windows
-    visit = first // state.visit_exposures
+    if words.size == 0:
+        return _settle_visit(walk, visit, relative, tick, period, flags)
     _enter(visit, number, state, windows)
-    relative = first - visit * state.visit_exposures
-    count, unknown = np.int64(words.size) // width, np.int64(_UNKNOWN)
-    block = Block(count, _U(width), _U(0), first, relative, tick, period, number, unknown, _top_mask(windows))
+    count, first = np.int64(words.size) // width, visit * state.visit_exposures + relative
+    times, unknown = tick + relative * period, np.int64(_UNKNOWN)
+    block = Block(count, _U(width), _U(0), first, relative, times, period, number, unknown, _top_mask(windows))
     _decide_frames(words, block, state, windows, walk.tables, walk.rows, walk.counts)
+    return True
+
+
+@inner
+def _settle_visit(walk, visit, relative, tick, period, flags):  # type: ignore[no-untyped-def]
+    """Settle the windows of the visit under way, before `relative` if it is `visit`; False when more are left, or rows are full."""
+    state, windows, zero = walk.state[0], walk.windows, np.int64(0)
+    end, first = relative if state.visit >= visit else state.visit_exposures, state.visit * state.visit_exposures
+    block = Block(end, _U(0), _U(0), first, zero, tick, period, state.object_index, np.int64(_UNKNOWN), zero)
+    _settle(block, state, windows, walk.tables, walk.rows, walk.counts, flags)
+    if state.visit >= visit:
+        return state.n_rows < walk.rows.size
+    if state.n_rows < walk.rows.size:
+        _enter(state.visit + 1, np.int64(_NO_OBJECT), state, windows)
+    return False
 
 
 # -- the windows of a block ------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from .kernels import DecisionTables, FrameWalkArrays, WalkArrays, make_marks
 from .tables import no_tables
 from .window_kernels import N_TALLIES, Walks, WindowArrays
 
+_NO_WORDS = np.zeros(0, np.uint8)
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
 MAX_VISIT_EXPOSURES = 1 << 24
 WINDOWS_SEEN = 64
@@ -111,7 +112,7 @@ class DecisionWindows:
         if tables is None:
             tables = no_tables(n_features, shots * plan.largest)
         self.decides = bool(tables.labels.size)
-        rows = np.zeros(self.block_rows, DECISION_DTYPE)
+        rows = np.zeros(self.block_rows + 1, DECISION_DTYPE)  # more than one visit fills
         self.counts: I64 = np.zeros((0 if self.decides else len(rows), n_features), np.int64)  # of the latest rows
         marks, heard = make_marks(), np.full((1, 2), -1, np.int64) if heard is None else heard
         kind = FrameWalkArrays if self.parallel else WalkArrays
@@ -143,17 +144,17 @@ class DecisionWindows:
         Its first exposure ends at `end_tick`. Returns the decisions on the windows that it completes, oldest first; they are valid until
         the next call.
         """
-        first, number = block.exposure_index, block.object_index
-        times = signed(first), number, signed(end_tick), block.period_ticks
+        visit, relative = divmod(block.exposure_index, self.visit_exposures)
+        times = signed(end_tick - relative * block.period_ticks), block.period_ticks, 0
         if isinstance(block, FrameBlock):
             n, width = block.words.shape
             words = np.array(block.words, np.uint8).reshape(-1)  # one type to the compiler, whatever the message is
-            rows, _ = self._run(kernels.push_frames, words, width, *times)
+            rows, _ = self._run(kernels.step_frames, words, width, visit, relative, block.object_index, *times)
         else:
             n, arrays = len(block.patterns), self.walk.windows
             arrays.stamps[:n], arrays.bits[:n] = block.patterns, block.bits
-            rows, _ = self._run(kernels.push_clicks, n, *times)
-        self._pushed = first + n
+            rows, _ = self._run(kernels.step_clicks, visit, relative, n, block.object_index, *times)
+        self._pushed = block.exposure_index + n
         return rows
 
     def follows(self, exposure_index: int) -> bool:
@@ -168,8 +169,13 @@ class DecisionWindows:
         visit, relative = divmod(exposure_index, self.visit_exposures)
         done = False
         while not done:
-            rows, done = self._run(kernels.settle, visit, relative, signed(tick), flags)
+            rows, done = self._settled(visit, relative, signed(tick), flags)
             yield rows
+
+    def _settled(self, visit: int, relative: int, tick: int, flags: int) -> tuple[Rows, bool]:
+        if self.parallel:
+            return self._run(kernels.step_frames, _NO_WORDS, 1, visit, relative, NO_OBJECT, tick, 0, flags)
+        return self._run(kernels.step_clicks, visit, relative, 0, NO_OBJECT, tick, 0, flags)
 
     def _run(self, kernel: Any, *arguments: Any) -> tuple[Rows, Any]:
         """Return the rows of `walk` that a compiled step writes, and what it returns; the rows of a call, and their number, stay."""
@@ -225,13 +231,8 @@ class DecisionWindows:
         self.visit, self._pushed = 0, -1
 
     def warm_up(self) -> None:
-        """Compile or load the kernels of `push` and `skip_to`, without counting anything."""
-        times = self.visit * self.visit_exposures, self.object_index, 0, 0
-        self._run(kernels.settle, self.visit, 0, 0, 0)
-        if self.parallel:
-            self._run(kernels.push_frames, np.zeros(0, np.uint8), 1, *times)
-        else:
-            self._run(kernels.push_clicks, 0, *times)
+        """Compile or load the kernel of `push` and `skip_to`, without counting anything."""
+        self._settled(self.visit, 0, 0, 0)
 
 
 def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
