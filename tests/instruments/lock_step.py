@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from pans.base.errors import LinkError
+from pans.protocol.links import Link
 
 
-class LockStepLink:
+class LockStepLink(Link):
     """A link whose emulator lives on when a run closes it, as hardware does, until `end`; see `Link`."""
 
     simulated, virtual = False, True

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from mutated_sessions import Mutation, Session, Stage, mutate
 
+from pans.protocol.links import Link
 from pans.protocol.session import STREAM_TYPES
 from pans.protocol.wire import DeviceState, MessageType, StateReason
 from pans.protocol.wire import messages as wire
@@ -44,7 +45,7 @@ def _another(payload: bytes, name: str, **changes: Any) -> bytes:
     return payload
 
 
-class LyingLink:
+class LyingLink(Link):
     """An ordinary link around another one; `told` counts the messages that lie."""
 
     def __init__(self, link: Any, lie: Lie | None, stage: Stage) -> None:

@@ -21,6 +21,7 @@ from pans.bundle.backends.choose import make_decider
 from pans.decide.still.core import Core
 from pans.live.loop import run_live
 from pans.live.options import RunOptions
+from pans.protocol.links import Link
 from pans.protocol.wire import messages as wire
 from pans.protocol.wire.framing import Frame, FrameDecoder, encode_frame
 from pans.protocol.wire.schema import ALL_MESSAGES, AUTOMATON_MESSAGES, Field, wrong_facts
@@ -148,7 +149,7 @@ class Evidence(NamedTuple):
         return known.get((kind, name), name in always.get(kind, ()))
 
 
-class MutatedLink:
+class MutatedLink(Link):
     """An ordinary link around another one; `changed` counts changed messages, `impossible` has those that the evidence excludes."""
 
     def __init__(self, link: Any, mutations: tuple[Mutation, ...], evidence: Evidence) -> None:

@@ -125,7 +125,7 @@ class Heard:
         return self.messages == other.messages and bool(self.digest.digest() == other.digest.digest())
 
 
-class ObservedLink:
+class ObservedLink(Link):
     """An ordinary link around another one, with books on what passed: messages by session, answers, gates, acknowledged commands."""
 
     def __init__(self, link: Any) -> None:

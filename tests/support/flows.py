@@ -40,7 +40,7 @@ def plan_of(block: int, dark: bool = False) -> Plan:
     )
 
 
-class LowestChannel:
+class LowestChannel(Decider):
     """The class is the lowest channel that clicked, 3 if none of 0..2 did; sure when it clicked in every shot."""
 
     name, n_features, n_classes = "lowest", N_FEATURES, 4

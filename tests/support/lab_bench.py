@@ -21,6 +21,7 @@ from pans.decide.still import Core
 from pans.instrument.profile import load_profile
 from pans.live.loop import Observers, Recovery, RunResult, run_live
 from pans.live.options import RunOptions
+from pans.protocol.links import Link
 from pans.record.recorder import Recorder
 
 FASHION = ROOT / "runtime/pans/shipped" / "fashion10.pans"
@@ -40,7 +41,7 @@ def profile_text(mode: str, deadline_us: float = 1e6) -> str:
     return text if mode == "sequential" else text.replace("channels = 1\n", f"channels = {D_F}\n")
 
 
-class VirtualLab:
+class VirtualLab(Link):
     """A link of the package's contract to a firmware in this process, in virtual time: 30 us each way, some writes and reads lost."""
 
     simulated, virtual, name = True, True, "lab"

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from pans.protocol.links import Link
 from pans_sim.ports.shell import open_port, serve
 
 
@@ -22,7 +23,7 @@ def served(device: Any, clock: Any, listen: str = "tcp:127.0.0.1:0") -> Iterator
         port.close()
 
 
-class Wrapped:
+class Wrapped(Link):
     """A link around `link`, to be overridden; reads come one by one, since `read_ahead` is not passed on."""
 
     def __init__(self, link: Any) -> None:

@@ -169,7 +169,7 @@ def open_sim(url: str) -> Link:
     return VirtualLink(instrument, clock, url)
 
 
-class ChildLink:
+class ChildLink(Link):
     """An instrument in a process of its own, reached through the runtime's ordinary serial link."""
 
     simulated = True
@@ -191,9 +191,18 @@ class ChildLink:
 
     def _connect(self) -> None:
         self._link = open_link(self._url)
-        self.read = self._link.read
-        self.write = self._link.write
-        self.now_ns = self._link.now_ns
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Link.read`."""
+        return self._link.read(timeout_s)
+
+    def write(self, data: bytes) -> None:
+        """See `Link.write`."""
+        self._link.write(data)
+
+    def now_ns(self) -> int:
+        """See `Link.now_ns`."""
+        return self._link.now_ns()
 
     def fileno(self) -> int | None:
         """Return the port's descriptor."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 from pans.base.errors import LinkError
-from pans.protocol.links import count_delimiters
+from pans.protocol.links import Link, count_delimiters
 from pans_sim.device.clock import DeviceClock, SteppedDevice
 
 from .faulty import FaultyDevice
@@ -18,11 +18,12 @@ START_NS = 1_000_000_000
 NS_PER_S = 1_000_000_000
 
 
-class VirtualLink:
+class VirtualLink(Link):
     """A link to a stepped device; `read` advances time to the next emission or the time-out, whichever is first."""
 
     simulated = True
     virtual = True
+    reads_ahead = True
 
     def __init__(self, device: SteppedDevice, clock: DeviceClock, name: str) -> None:
         self.name = name

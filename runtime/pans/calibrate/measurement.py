@@ -208,6 +208,7 @@ class CalibrationCore(Follower):
         return not self.parallel and block.largest == self.plan.largest
 
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
+        self._skip_to(block.exposure_index, block.tick)
         self.take_block(block)
         return Output([], [], None)
 

@@ -12,14 +12,14 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pans.decide.plan.marks import Marks
 from pans.decide.plan.plan import Plan
-from pans.protocol.tracker import MEMORY_BYTES, StreamTracker
+from pans.protocol.tracker import MEMORY_BYTES, StateField, StreamTracker
 from pans.protocol.wire import (
     DARK_PATTERN,
     MAX_GAP_EXPOSURES,
@@ -40,7 +40,11 @@ from pans.protocol.wire import (
     decode_status,
 )
 
+from .core_state import CORE_DTYPE, LARGEST
 from .decision import BeyondPlan, CoreEvent, Output, StreamEndUnknown, joined
+
+if TYPE_CHECKING:
+    from .dark.guard import DarkGuard
 
 
 class PlanRules:
@@ -192,18 +196,27 @@ class Follower:
     """
 
     moving = False  # whether objects flow past
+    guard: DarkGuard | None = None  # of the dark counts; None: they are only added up
+
+    n_decisions = StateField(CORE_DTYPE)
+    n_abstained = StateField(CORE_DTYPE)
+    last_tick = StateField(CORE_DTYPE, LARGEST)
+    jitter_ticks = StateField(CORE_DTYPE, LARGEST)  # most that a block's end differed from the plan
+    start_tick = StateField(CORE_DTYPE, LARGEST)
+    end_exposure = StateField(CORE_DTYPE, LARGEST + 1)
 
     def __init__(self, plan: Plan, n_cycles: int, n_classes: int = ANY_CLASS) -> None:
         self.contradictions: Counter[str] = Counter()  # messages that the plan or others exclude, by what is wrong
         self.n_classes = n_classes
-        self.start_tick = 0
+        self.state: npt.NDArray[np.void] = np.zeros(1, CORE_DTYPE)
+        self.cells = self.state.view(np.int64)
+        self.beyond: dict[str, int] = {}
+        facts = self.state[0]
+        facts.exposure_ticks, facts.period_ticks = plan.exposure_ticks, plan.slot_period_ticks
+        facts.cycle_ticks, facts.n_classes = plan.cycle_ticks, n_classes
         self.completed = False
-        self.tracker = StreamTracker()
+        self.tracker = StreamTracker(self.state)
         self.marks = Marks()
-        self.n_decisions = 0
-        self.n_abstained = 0
-        self.last_tick = 0
-        self.jitter_ticks = 0  # most that a block's end differed from the plan
         self.exposed = NOTHING_EXPOSED  # what the device told of all streams
         self.untold = 0  # exposures of all streams that ended, of which EXPOSED should have told
         self.plan = plan
@@ -239,7 +252,7 @@ class Follower:
         raise NotImplementedError
 
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
-        """Decide on a block that fits and is the next one."""
+        """Settle what lies before a block that fits, and decide on the block."""
         raise NotImplementedError
 
     def _skip_to(self, exposure_index: int, tick: int) -> Output:
@@ -359,9 +372,7 @@ class Follower:
         self.last_tick = end_tick
         planned = self.start_tick + self._rules.planned(message.exposure_index + n_exposures - 1)
         self.jitter_ticks = max(self.jitter_ticks, abs(end_tick - planned - self._exposure_ticks))
-        skipped = self._skip_to(message.exposure_index, message.tick)
-        taken = self._take(message, n_exposures, end_tick)
-        return joined(Output(skipped.decisions, events, None, skipped.passages, skipped.actions), taken, end_tick)
+        return joined(Output([], events, None), self._take(message, n_exposures, end_tick), end_tick)
 
     def _take_mark(self, mark: Mark) -> Output:
         wrong = self._rules.of_mark(mark, self.tracker.next_exposure, self.end_exposure)

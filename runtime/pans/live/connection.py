@@ -154,7 +154,7 @@ class Connection:
             while self.session.welcome is None:
                 self.pump(SETUP_POLL_S)
         except LinkError as error:
-            if isinstance(error, DeviceError) or not getattr(self.link, "is_shared", bool)():
+            if isinstance(error, DeviceError) or not self.link.is_shared():
                 raise
             raise LinkError(
                 f"{self.link.name} is in use by another program, and answers one at a time: {error.message}",

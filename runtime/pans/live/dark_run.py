@@ -159,7 +159,7 @@ class DarkRun:
 
         Not while the detector is in a state that changes them: that is named already, and is no change of light.
         """
-        guard = getattr(run.core, "guard", None)
+        guard = run.core.guard
         counts = guard is None or not guard.present
         found = self.light.take(_measured_clicks(output.decisions)) if counts else []
         if self.states is not None and isinstance(run.core, Core):

@@ -144,7 +144,7 @@ def settled_blocks(kernel: Kernel) -> Iterator[Output]:
     by_block = core.guard is not None and not core.watches_empty  # it wants to see every block
     spans, heads = kernel.heads(MessageType.FRAMES, BLOCK_DTYPE)
     behind = (heads["exposure_index"] + heads["count"]).astype(np.int64)  # the exposure that follows each block
-    empty = {told[0]: told for told in core.told_empty()}
+    empty = {told[0]: told for told in core.told_empty(kernel.end.told)}
     places = np.flatnonzero(kernel.messages[:, ring.WHAT] == int(MessageType.MARK)).tolist()
     marks, row = deque(zip(places, map(mark_of, kernel.marks()))), kernel.begin.rows
     first = kernel.begin.messages

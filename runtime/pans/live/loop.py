@@ -22,7 +22,7 @@ from pans.base.errors import DeviceError, LinkError, RecordingError
 from pans.base.machine import GRANTED, ThreadCounts, apart, arm_realtime, busy_core
 from pans.bundle.sensor import Bundle
 from pans.decide import Follower, exposure_timing
-from pans.decide.dark import DarkGuard, dark_report
+from pans.decide.dark import dark_report
 from pans.decide.kernel import BATCH_NS
 from pans.decide.plan import Plan
 from pans.decide.still import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS, Core
@@ -252,7 +252,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
     dark = one if one == 1.0 else -math.expm1(run.plan.channels_at_once * math.log1p(-one))
     tallies, stream = run.core.tallies, run.core.tracker.counters
     found = dark_report(dark, int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
-    guard: DarkGuard | None = getattr(run.core, "guard", None)
+    guard = run.core.guard
     fit, announced = run.connection.known_clock().fit, run.connection.session.tells_exposed
     told, tolerance_us = run.core.exposed, profile.exposure_tolerance_us(run.plan.exposure_us)
     return RunResult(

@@ -314,7 +314,7 @@ class Receiver:
         run = self._run
         connection, link = run.connection, run.connection.link
         chunks, self._asked = connection.chunks(poll_s, asked=self._asked), False
-        core, ahead = self._core, hasattr(link, "read_ahead")
+        core, ahead = self._core, link.reads_ahead
         gathers = isinstance(core, Core) and core.takes and run.driver is None and (core.windows.parallel or ahead)
         if not (link.virtual and gathers and chunks) or self._prompt:
             return chunks

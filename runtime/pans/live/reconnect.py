@@ -11,10 +11,9 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, repeat
-from typing import Any
 
 from pans.base.errors import DeviceError, LinkError
-from pans.protocol.links import Link, open_link
+from pans.protocol.links import Link, opened_again
 
 from .connection import Connection
 from .run import LiveRun
@@ -38,14 +37,8 @@ class Recovery:
 
     @classmethod
     def of(cls, link: Link, url: str, give_up_s: float) -> Recovery:
-        """Return the way back to `link`: its own `reopen` and `pause` where it has them, else the URL and the wall clock."""
-
-        def by_url(lost: Link) -> Link:
-            lost.close()
-            return open_link(url)
-
-        reopen: Any = (lambda lost: lost.reopen()) if hasattr(link, "reopen") else by_url
-        return cls(reopen, give_up_s, getattr(link, "pause", time.sleep))
+        """Return the way back to `link`, which `url` names."""
+        return cls(lambda lost: opened_again(lost, url), give_up_s, link.pause)
 
 
 def reconnect(

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pans.base.console import html_card
 from pans.base.errors import DamagedFileError, UsageError
 from pans.base.files import likeness, npz_bytes, scene_arrays, shipped_scene, write_file
-from pans.bundle.backends import Decider, PictureDecider, Verdict, Verdicts, make_decider, verdicts_of
+from pans.bundle.backends import Decider, PictureDecider, Verdict, Verdicts, make_decider
 from pans.bundle.sensor import Bundle
 from pans.decide import DECISION_DTYPE, Decision, DecisionFlag, Follower, Place, exposure_timing
 from pans.decide.dark import recorded_guard
@@ -36,8 +36,11 @@ ASKED = DecisionFlag.NOT_FINITE | DecisionFlag.AMBIGUOUS  # abstained after the 
 _NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, MalformedMessage)
 
 
-class ClickLog:
-    """Stands between a core and its back end, whichever, and remembers the clicks of every decision that it is asked for."""
+class ClickLog(Decider):
+    """Stands between a core and its back end, whichever, and remembers the clicks of every decision that it is asked for.
+
+    It has neither `look_up` nor `automaton`: a kernel would decide by them.
+    """
 
     def __init__(self) -> None:
         self.counts: list[NDArray[np.int64]] = []
@@ -47,9 +50,17 @@ class ClickLog:
     def over(self, decider: Decider) -> Decider:
         """Return the back end that the core is to ask."""
         self._back_end = decider
-        for name in ("name", "n_features", "n_classes", "scores_batch", "decide_batch"):
-            setattr(self, name, getattr(decider, name))
-        return cast("Decider", self)  # and no more: a kernel would take the tables of a back end that shows them
+        self.name, self.n_features, self.n_classes = decider.name, decider.n_features, decider.n_classes
+        self.largest = decider.largest
+        return self
+
+    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
+        """As `Decider`."""
+        return self._back_end.scores_batch(counts, shots)
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """As `Decider`."""
+        return self._back_end.decide_batch(counts, shots)
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """As `Decider`."""
@@ -61,7 +72,7 @@ class ClickLog:
         """Decide many at once, as the kernel asks for."""
         self.counts += list(counts.copy())
         self.shots = shots
-        return verdicts_of(self._back_end, counts, shots)
+        return self._back_end.verdicts(counts, shots)
 
     def note(self, decisions: Sequence[Decision]) -> None:
         """Take the decisions in their order: those that were asked for, in the order of asking."""
@@ -187,7 +198,7 @@ def _rebuilt(recording: Recording, bundle: Bundle, pictures: ClickLog | None) ->
         automaton, confidence = automaton_of(config, bundle), float(config.get("confidence", 0.0))
         backend = str(config.get("backend", "auto"))
         decider = make_decider(bundle, shots=shots, backend=backend, confidence=confidence, dose=walk_dose(config))
-        plan = sent.plan(tick_hz, getattr(decider, "automaton", automaton), bundle.largest)
+        plan = sent.plan(tick_hz, decider.automaton or automaton, bundle.largest)
         if pictures is not None:
             decider = pictures.over(decider)
         guard = recorded_guard(config.get("dark", {}).get("guard", {}), plan, bundle, shots)

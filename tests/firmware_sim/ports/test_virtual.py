@@ -30,7 +30,7 @@ def test_many_reads_in_one_call_are_those_made_one_by_one(frames: int, size: int
         connection = Connection(link)
         connection.handshake()  # STATUS comes once a second from here on
         if not at_once:
-            link.read_ahead = None
+            link.reads_ahead = False
         chunks = connection.reader.ahead(1.5, frames, size, link.now_ns() + seconds * 10**9)
         found.append([(arrival_ns, len(data)) for arrival_ns, data in chunks])
     assert found[0] == found[1]

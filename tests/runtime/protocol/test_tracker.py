@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from inner_kernels import called
 
+from pans.decide.core_state import CORE_DTYPE
 from pans.protocol.tracker import MEMORY_BYTES, Gap, StreamTracker
-from pans.protocol.wire import Frame, FrameDecoder
+from pans.protocol.wire import Frame, FrameDecoder, kernels
 from pans.protocol.wire import messages as wire
 from pans.protocol.wire.framing import content_crc
 from pans.protocol.wire.messages import ClickBlock, Mark
@@ -18,7 +20,9 @@ from pans.protocol.wire.schema import MAX_GAP_EXPOSURES, RECEIVE_WINDOW
 
 
 def clicks(seq: int, first: int, n: int, drops: int = 0) -> Frame:
-    block = ClickBlock(seq % (1 << 32), drops, 10 * first, first, 10, 0, np.zeros(n, np.uint16), np.ones(n, np.uint8))
+    block = ClickBlock(
+        seq % (1 << 32), drops, 10 * first % (1 << 60), first, 10, 0, np.zeros(n, np.uint16), np.ones(n, np.uint8)
+    )
     return FrameDecoder().feed(wire.encode_clicks(block, 1))[0]
 
 
@@ -74,14 +78,20 @@ def test_what_is_missing_before_a_message(then: list[Frame], gaps: list[Gap | No
     assert {name: found[name] for name in wanted | counts} == wanted | counts
 
 
+def by_kernel(tracker: StreamTracker, next_seq: int, exposures: int) -> None:
+    """Let the kernel account for a message with so many exposures; `next_seq` follows it."""
+    called(kernels.go_on)(tracker.cells.view(CORE_DTYPE)[0], exposures)
+    assert tracker.next_seq == next_seq
+
+
 def test_marks_taken_elsewhere_do_not_hide_a_loss() -> None:
-    tracker = StreamTracker()
+    tracker = StreamTracker(np.zeros(1, CORE_DTYPE))
     tracker.accept(clicks(0, 0, 4))
     tracker.accept(mark(2))  # message 1, with four exposures, is lost
-    tracker.advance((4, 4), messages=1, exposures=0)  # a mark that the kernel took
+    by_kernel(tracker, 4, exposures=0)  # a mark
     assert tracker.accept(clicks(4, 8, 4))[1] == Gap(4, 4, 1, 0)
     tracker.accept(mark(6))
-    tracker.advance((8, 16), messages=1, exposures=4)  # exposures follow without a gap: what was lost held none
+    by_kernel(tracker, 8, exposures=4)  # they follow without a gap: what was lost held none
     assert tracker.accept(clicks(8, 20, 4, drops=4))[1] == Gap(16, 4, 0, 4)
     counters = tracker.counters
     assert (counters.messages, counters.exposures, counters.unexplained_drops) == (7, 16, 0)
@@ -194,6 +204,18 @@ def test_another_stream_begins_anew_and_the_totals_go_on() -> None:
     tracker.finish(7, 3)
     tracker.restart()
     assert tracker.open
+
+
+def test_an_exposure_beyond_the_state_is_known_exactly() -> None:
+    """The block that ends with exposure 2^63 - 1 is followed by 2^63, which no field of the state holds."""
+    tracker = StreamTracker()
+    tracker.resume((0, 2**63 - 2, 0))
+    assert tracker.accept(clicks(0, 2**63 - 2, 2))[1] is None
+    assert tracker.position == (1, 2**63, 0)
+    assert tracker.accept(clicks(1, 2**63 - 1, 1)) == (None, None)  # it came already
+    assert tracker.counters.malformed == 1
+    tracker.next_exposure = 2**63 - 1
+    assert tracker.next_exposure == 2**63 - 1
 
 
 @pytest.mark.parametrize("first", [0, 2**32 - 3])

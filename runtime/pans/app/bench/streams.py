@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.bundle.automaton import Automaton, reachable_automaton, walk_nodes
+from pans.bundle.automaton import reachable_automaton, walk_nodes
 from pans.bundle.backends import Decider
 from pans.bundle.sensor import Bundle, Shown, make_bundle
 from pans.decide import DECISION_DTYPE
@@ -71,7 +71,7 @@ def sequential_plan(bundle: Bundle, decider: Decider, *, host: bool = False) -> 
 
     With `host` the host drives the walk: there is no dark slot, and a block for each exposure.
     """
-    automaton: Automaton | None = getattr(decider, "automaton", None)
+    automaton = decider.automaton
     lit = np.arange(bundle.n_features) if automaton is None else np.full(automaton.n_slots, ADAPTIVE_PATTERN)
     pattern = (lit if host else np.concatenate([[DARK_PATTERN], lit])).astype(np.uint16)
     shot = np.where(pattern == DARK_PATTERN, NO_SHOT, 0).astype(np.uint16)

@@ -164,9 +164,7 @@ def recording_header(
     options: RunOptions, profile: Profile, bundle_sha256: str, decider: Decider, n_objects: int, plan: Plan
 ) -> dict[str, Any]:
     """What a recording must say to be understood alone; units are in the keys."""
-    from pans.bundle.backends import choice_of
-
-    dose = getattr(decider, "dose", None)
+    dose = decider.dose
     return {
         "bundle_sha256": bundle_sha256,
         "command": options.command,
@@ -176,7 +174,7 @@ def recording_header(
         "config": {
             **{name: getattr(options, name) for name in ("shots", "trials", "seconds", "deadline_us", "order")},
             **{"objects": n_objects, "dark_slots_per_cycle": options.dark_slots, "tick_hz": profile.clock.tick_hz},
-            **{"backend": decider.name, "backend_choice": dict(choice_of(decider))},
+            **{"backend": decider.name, "backend_choice": dict(decider.choice)},
             "realtime_requested": options.realtime,
             **({"mode": "parallel"} if profile.mode == "parallel" else {}),
             **({"drive": plan.drive, "confidence": options.confidence} if plan.drive else {}),

@@ -296,7 +296,7 @@ class _Run:
                 dark_slots_per_cycle=options.dark_slots,
                 order=options.order,
                 drive=options.drive,
-                automaton=getattr(decider, "automaton", None),
+                automaton=decider.automaton,
             )
             if self.plan.automaton is not None:
                 say(f"pans: {drive_words(self.dark.profile, bundle, self.plan)}")

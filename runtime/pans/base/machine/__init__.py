@@ -35,7 +35,7 @@ from .realtime import (
 
 if TYPE_CHECKING:
     from .jit import FOLDER, inner, kernel_folder, njit, outer
-    from .jit_bytes import as_float32, bare, copy_span, fence, load4, load8, spin
+    from .jit_bytes import as_float32, bare, copy_span, fence, load2, load4, load8, spin
 
 __all__ = [
     "FIFO_PRIORITY",
@@ -61,6 +61,7 @@ __all__ = [
     "isolated_cores",
     "kernel_folder",
     "lacking",
+    "load2",
     "load4",
     "load8",
     "load_average",

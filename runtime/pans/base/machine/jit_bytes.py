@@ -42,6 +42,10 @@ if numba.config.DISABLE_JIT:
         """Return four bytes of uint8 `data` from place `i` on, little-endian, as a uint64."""
         return np.uint64(int.from_bytes(data[int(i) : int(i) + 4], "little"))
 
+    def load2(data: Any, i: Any) -> Any:
+        """Return two bytes of uint8 `data` from place `i` on, little-endian, as a uint64."""
+        return np.uint64(int.from_bytes(data[int(i) : int(i) + 2], "little"))
+
     def copy_span(source: Any, start: Any, stop: Any, target: Any, at: Any) -> None:
         """Copy source[start:stop] to target[at:], uint8, which may be the same array."""
         target[int(at) : int(at) + int(stop) - int(start)] = source[int(start) : int(stop)].copy()
@@ -82,6 +86,11 @@ else:
     def load4(typing_context, data, i):  # type: ignore[no-untyped-def]
         """Four bytes of `data`, contiguous uint8, from place `i` (uint64) on, little-endian, as a uint64."""
         return types.uint64(_bytes_of(data), types.uint64), _loads(32)
+
+    @intrinsic
+    def load2(typing_context, data, i):  # type: ignore[no-untyped-def]
+        """Two bytes of `data`, contiguous uint8, from place `i` (uint64) on, little-endian, as a uint64."""
+        return types.uint64(_bytes_of(data), types.uint64), _loads(16)
 
     @intrinsic
     def copy_span(typing_context, source, start, stop, target, at):  # type: ignore[no-untyped-def]
@@ -148,8 +157,7 @@ def _loads(bits: int) -> Any:
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         at = _place(context, builder, signature.args[0], *arguments)
-        kind = context.get_value_type(types.uint64 if bits == 64 else types.uint32)
-        value = builder.load(builder.bitcast(at, kind.as_pointer()))
+        value = builder.load(builder.bitcast(at, ir.IntType(bits).as_pointer()))
         value.align = 1
         if sys.byteorder == "big":
             value = builder.bswap(value)

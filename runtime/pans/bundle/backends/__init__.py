@@ -25,10 +25,8 @@ from .verdict import (
     Verdict,
     Verdicts,
     checked_counts,
-    choice_of,
     log_evidence,
     softmax_winner,
-    verdicts_of,
 )
 
 if TYPE_CHECKING:
@@ -51,7 +49,6 @@ __all__ = [
     "backend_names",
     "bundle_layers",
     "checked_counts",
-    "choice_of",
     "count_table",
     "decide_clicks",
     "expected_walk",
@@ -62,7 +59,6 @@ __all__ = [
     "n_features_of",
     "pattern_light",
     "softmax_winner",
-    "verdicts_of",
     "walked_within",
 ]
 

@@ -16,7 +16,7 @@ from pans.base.machine import outer
 from pans.bundle.automaton import Automaton, DoseCap, capped, log_scores, stopped
 from pans.bundle.sensor.facts import Bundle
 
-from .verdict import NO_LABEL, Verdict, Verdicts, checked_counts, demand_golden
+from .verdict import NO_LABEL, Decider, LookUp, Verdict, Verdicts, checked_counts, demand_golden
 
 
 @outer
@@ -51,7 +51,7 @@ def walk_words(
     return -1
 
 
-class AutomatonDecider:
+class AutomatonDecider(Decider):
     """Decides by the leaf that a click word reaches; `automaton` is the one that runs, stopped early where that was asked for."""
 
     name = "automaton"
@@ -68,6 +68,7 @@ class AutomatonDecider:
         self.n_features, self.n_classes = self.automaton.n_bits, self.automaton.n_classes
         self.posteriors = self.automaton.posteriors[self.automaton.n_states :]  # of the leaves
         self.labels, self.probabilities = leaf_verdicts(self.automaton, confidence)
+        self.look_up = LookUp(self.labels, self.probabilities, np.zeros(self.n_features, np.int64))
         self._leaf, self._exposures = np.zeros(1, np.uint32), np.zeros(1, np.uint16)
         self._one = np.zeros((1, self.n_features), np.int64)
         self._demand_golden(bundle, whole)

@@ -22,7 +22,7 @@ from pans.bundle.sensor.facts import Bundle
 from .onnx import OnnxDecider, PictureDecider
 from .table import count_table, fits_count_table, word_table
 from .verdict import Decider as Decider
-from .verdict import Verdict, Verdicts, checked_counts, verdicts_of
+from .verdict import Verdict, Verdicts, checked_counts
 
 BACKENDS = ("auto", "table", "count-table", "sparse", "onnx", "int8", "int8-onnx", "float64", "automaton")
 GROUP = "pans.backends"
@@ -129,7 +129,7 @@ def _choose(bundle: Bundle, shots: int) -> Decider:
 def median_us(decider: Decider, shots: int, calls: int = MEASURED_CALLS) -> float:
     """Return the median time of one decision in microseconds, over varied clicks with a fixed seed."""
     rng = np.random.default_rng(CLICKS_SEED)
-    most = shots * getattr(decider, "largest", 1)
+    most = shots * decider.largest
     counts: NDArray[np.int64] = rng.integers(0, most + 1, size=(calls, decider.n_features))
     times: list[int] = []
     for row in counts:
@@ -170,10 +170,10 @@ def decide_clicks(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend:
         found = word_means(found, d_f).astype(np.int64)
     with as_usage_error():
         counts = checked_counts(found, shots * largest, d_f)
-    return verdicts_of(make_decider(bundle, shots=shots, backend=backend), counts, shots)
+    return make_decider(bundle, shots=shots, backend=backend).verdicts(counts, shots)
 
 
-class OfferedDecider:
+class OfferedDecider(Decider):
     """What another package's `point` makes for `bundle`, as a `Decider`; every answer of it is checked.
 
     It is not compared with the golden vectors, for it may decide by other means than the head. Of photon numbers up to `largest` it gets

@@ -15,12 +15,12 @@ from pans.base.errors import UsageError
 from pans.bundle.heads.head import open_head
 from pans.bundle.sensor.facts import Bundle, words_among
 
-from .verdict import Verdict, Verdicts, checked_counts, demand_golden, softmax_winners
+from .verdict import Decider, LookUp, Verdict, Verdicts, checked_counts, demand_golden, softmax_winners
 
 COUNT_TABLE_ROWS_MAX = 1 << 16  # of a table that is made when a bundle is loaded: a fraction of a second
 
 
-class TableDecider:
+class TableDecider(Decider):
     """Scores, label and probability of every vector of counts 0..`exposures`: (exposures+1)**d_f rows, channel 0 the lowest digit."""
 
     def __init__(
@@ -28,7 +28,7 @@ class TableDecider:
     ) -> None:
         """`scores` float32 (rows, classes) of counts over `shots` shots; `choice` says why this back end was chosen."""
         self.name = "table" if shots == 1 else "count-table"
-        self.choice: Mapping[str, Any] = choice or {}
+        self.choice = choice or {}
         self.scores, self.exposures, self.shots, self.n_classes = scores, exposures, shots, scores.shape[1]
         self.n_features = n_features_of(len(scores), exposures + 1)
         self.radix: NDArray[np.int64] = (exposures + 1) ** np.arange(self.n_features, dtype=np.int64)
@@ -36,6 +36,7 @@ class TableDecider:
         self.probabilities: NDArray[np.float32]  # (rows,), of the winning class
         wide, self.probabilities = softmax_winners(scores)
         self.labels = wide.astype(np.uint8) if exposures == 1 and self.n_classes <= 256 else wide
+        self.look_up = LookUp(self.labels, self.probabilities, self.radix)
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """Decide from clicks per pattern, int64 (d_f,); UsageError for other shots, or counts that no row has."""

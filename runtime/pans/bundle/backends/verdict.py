@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pans.base.errors import DamagedFileError
+from pans.bundle.automaton import Automaton, DoseCap
 from pans.bundle.sensor.facts import Bundle, golden_violation
 
 NO_LABEL = 0xFFFF  # the label of a decision that abstained
@@ -29,20 +31,37 @@ class Verdict(NamedTuple):
     probability: float
 
 
+class Verdicts(NamedTuple):
+    """Labels uint16 (n,) and probabilities float32 (n,), 0.0 where the scores were not finite."""
+
+    labels: NDArray[np.uint16]
+    probabilities: NDArray[np.float32]
+
+
+class LookUp(NamedTuple):
+    """Every answer of a back end: the label and the probability of each row.
+
+    The row is the sum of counts * `radix`, int64 (d_f,); of an automaton it is the leaf, and `radix` is 0.
+    """
+
+    labels: NDArray[Any]
+    probabilities: NDArray[np.float32]
+    radix: NDArray[np.int64]
+
+
 class Decider(Protocol):
-    """One back end, ready to answer; ties go to the lowest label."""
+    """One back end, ready to answer; ties go to the lowest label. A back end inherits what it does not have of its own."""
 
-    @property
-    def name(self) -> str:
-        """The name by which it is asked for (backends.backend_names, without `auto`)."""
-
-    @property
-    def n_features(self) -> int:
-        """Number of patterns, d_f."""
-
-    @property
-    def n_classes(self) -> int:
-        """Number of classes."""
+    name: str  # by which it is asked for (backends.backend_names, without `auto`)
+    n_features: int  # patterns, d_f
+    n_classes: int
+    largest: int = 1  # photon number of one exposure
+    choice: Mapping[str, Any] = MappingProxyType(
+        {}
+    )  # how it was chosen, for the record; empty where it was asked for by name
+    automaton: Automaton | None = None  # that chooses the patterns, stopped early where that was asked for
+    dose: DoseCap | None = None  # at which its walks end
+    look_up: LookUp | None = None  # by which kernels decide without a call
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """Decide one object from its clicks per pattern, int64 (d_f,), 0..shots, over `shots` shots."""
@@ -53,12 +72,9 @@ class Decider(Protocol):
     def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
         """Return the labels, int64 (n,), of click counts, integers (n, d_f)."""
 
-
-class Verdicts(NamedTuple):
-    """Labels uint16 (n,) and probabilities float32 (n,), 0.0 where the scores were not finite."""
-
-    labels: NDArray[np.uint16]
-    probabilities: NDArray[np.float32]
+    def verdicts(self, counts: NDArray[Any], shots: int) -> Verdicts:
+        """Decide many objects, integers (n, d_f), each as `decide` would decide it alone where the back end can."""
+        return softmax_winners(self.scores_batch(counts, shots))
 
 
 def softmax_winner(scores: NDArray[np.floating[Any]]) -> Verdict:
@@ -94,21 +110,6 @@ def log_evidence(scores: NDArray[np.floating[Any]], floor: float = 1e-6) -> NDAr
     return np.maximum(logs, math.log(floor))
 
 
-def verdicts_of(decider: Decider, counts: NDArray[Any], shots: int) -> Verdicts:
-    """Decide many objects, integers (n, d_f), with any back end, each as it would decide it alone where it can."""
-    own = getattr(decider, "verdicts", None)
-    if own is not None:
-        found: Verdicts = own(counts, shots)
-        return found
-    return softmax_winners(decider.scores_batch(counts, shots))
-
-
-def choice_of(decider: Decider) -> Mapping[str, Any]:
-    """Return how the back end was chosen, for the record: {} where it was asked for by name."""
-    found: Mapping[str, Any] = getattr(decider, "choice", {})
-    return found
-
-
 def checked_counts(counts: ArrayLike, most: int, n_features: int) -> NDArray[np.int64]:
     """Return click counts as int64 (n, d_f); ValueError for another shape or type, or a count beyond 0..`most`."""
     values = np.asarray(counts)
@@ -121,7 +122,7 @@ def checked_counts(counts: ArrayLike, most: int, n_features: int) -> NDArray[np.
     return values.astype(np.int64)
 
 
-class ScoredDecider:
+class ScoredDecider(Decider):
     """What back ends share that score many objects at once; a subclass has `_scores`, and perhaps a faster `decide`.
 
     Where the detector counts photons up to `largest`, one exposure of a number up to L is L exposures that can click.
@@ -130,7 +131,6 @@ class ScoredDecider:
     name = ""
 
     def __init__(self, bundle: Bundle) -> None:
-        self.choice: Mapping[str, Any] = {}
         self.n_features, self.n_classes, self.largest = bundle.n_features, bundle.n_classes, bundle.largest
 
     def _scores(self, counts: NDArray[np.int64], exposures: int) -> NDArray[np.floating[Any]]:

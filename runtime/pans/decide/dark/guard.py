@@ -201,7 +201,7 @@ def extra_probability(present: F64, before: F64) -> F64:
     return np.maximum(1.0 - (1.0 - present) / (1.0 - before), 0.0)
 
 
-class MixedHead:
+class MixedHead(Decider):
     """A head asked for all that some channels may have meant: `weights[i]` float64 (found, meant) of channel `channels[i]`."""
 
     name = "mixed"

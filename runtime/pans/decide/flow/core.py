@@ -17,20 +17,19 @@ import numpy.typing as npt
 
 from pans.base.errors import UsageError
 from pans.bundle.backends import NO_LABEL, Decider, Verdict, log_evidence, softmax_winner
+from pans.decide.core_state import LARGEST
 from pans.decide.dark.guard import DarkGuard
 from pans.decide.dark.health import Finding
 from pans.decide.decision import DECISION_DTYPE, Action, CoreEvent, Decision, DecisionFlag, Output, Passage, joined
 from pans.decide.follower import Follower
 from pans.decide.plan.marks import mark_of
 from pans.decide.plan.plan import Plan
-from pans.decide.still import kernels as columns
-from pans.decide.still.kernel_state import decision_tables, load_core, store_core
-from pans.decide.still.kernels import DecisionTables
-from pans.decide.still.windows import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
+from pans.decide.still.tables import decision_tables, undecided
+from pans.decide.still.window_kernels import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
 from pans.protocol.wire import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock, Mark, Status
 
 from . import kernels
-from .kernels import FlowArrays, FlowWalk
+from .kernels import RING_DTYPE, FlowArrays, FlowWalk
 from .matching import PassageMatcher
 from .settings import WATCHED_FRAMES, FlowLimits, FlowSettings, Q
 
@@ -40,7 +39,7 @@ ROWS_MORE = 2048  # decisions of one call, beside those of a block
 MOST_BLOCKS = (
     4096  # whose empty frames have not been told yet: as many as the rings keep times of (decide/kernel/arrays.py)
 )
-_LARGEST = (1 << 62) - 1
+_NEVER = 1 << 62  # more empty frames than ever come
 _PART = (1 << Q) - 1
 _GAP, _ABSTAINED, _NOT_FINITE, _AMBIGUOUS = (
     int(flag) for flag in (DecisionFlag.GAP, DecisionFlag.ABSTAINED, DecisionFlag.NOT_FINITE, DecisionFlag.AMBIGUOUS)
@@ -81,12 +80,19 @@ class FlowCore(Follower):
         self.dark_probability = 0.0  # of a click, that the limits were worked out with
         self.gated = gated  # classes for which a pulse is asked
         self._cycles_before = 0  # in streams that have ended
-        self._told = self._now_told = 0  # of walk.empty: accounted for, and there in the present batch
+        self._told = 0  # of walk.empty
         self._dark_cycle = plan.slots_per_cycle if plan.slot_pattern[-1] == DARK_PATTERN else 0
         self._period_ticks, self._max_block = plan.slot_period_ticks, plan.block_exposures
         self.block_rows = plan.block_exposures + 1 + MAX_PASSAGES
+        self._facts: Any = self.state[0]  # by name
         self.walk = self._new_walk(plan, n)
+        rows = np.zeros(self.block_rows, DECISION_DTYPE), np.zeros((self.block_rows, kernels.N_PASSAGE), np.int64)
+        counts: I64 = np.zeros((self.block_rows, settings.pool, n), np.int64)
+        self._own = self.walk._replace(
+            rows=rows[0], passages=rows[1], counts=counts
+        )  # for `step`: the rows of a call stay
         self._ring = self.walk.flow
+        self._passing: Any = self._ring.ring[0]
         self.dark_channels, self.empty_channels = self._ring.dark_channels, self._ring.empty_channels
         if self._is_tape:
             self._prepare_tape(plan)
@@ -94,18 +100,16 @@ class FlowCore(Follower):
     def _new_walk(self, plan: Plan, n: int) -> FlowWalk:
         # two halves: one is filled while the other is accounted for
         limits, pool, n_rows = self.limits, self.settings.pool, 2 * self.block_rows + ROWS_MORE
-        state = np.zeros(kernels.N_FACTS, np.int64)
-        state[columns.EXPOSURE_TICKS], state[columns.PERIOD_TICKS] = plan.exposure_ticks, plan.slot_period_ticks
-        state[columns.CYCLE_TICKS], state[kernels.MAX_BLOCK] = plan.cycle_ticks, plan.block_exposures
-        state[columns.N_CLASSES], state[kernels.DARK_EVERY] = self.n_classes, self._dark_cycle
-        state[kernels.FRAMES] = self.frames
+        facts = self._facts
+        facts.max_block, facts.dark_every, facts.frames = plan.block_exposures, self._dark_cycle, self.frames
+        facts.watch_at = _NEVER
         # of what looks for passages; none where their times are known
         looks = np.array([] if self._is_tape else limits[:8], np.int64)
         flow = FlowArrays(
             np.zeros(limits.ring, np.uint64),
             np.zeros(limits.ring, np.int16),
             looks,
-            np.zeros(kernels.N_STATE, np.int64),
+            np.zeros(1, RING_DTYPE),
             np.zeros(n, np.int64),
             np.zeros(n, np.int64),
             np.zeros((MAX_PASSAGES, kernels.N_COLUMNS), np.int64),
@@ -114,10 +118,10 @@ class FlowCore(Follower):
         gated[sorted(self.gated)] = 1
         tables = decision_tables(self.decider, self.shots, plan)
         if pool > 1:  # evidence is added up by the back end
-            tables = _undecided(tables)
+            tables = undecided(tables)
         # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
         return FlowWalk(
-            state,
+            self.state,
             flow,
             plan.slot_offset_ticks.astype(np.int64),
             np.full(1, (1 << n) - 1, np.uint64),
@@ -141,31 +145,33 @@ class FlowCore(Follower):
     def guard(self, guard: DarkGuard | None) -> None:
         self._guard = guard
         if guard is not None and guard.policy != "warn":  # each verdict depends on what it has found
-            self.walk = self.walk._replace(tables=_undecided(self.walk.tables))
+            self.walk = self.walk._replace(tables=undecided(self.walk.tables))
+            self._own = self._own._replace(tables=self.walk.tables)
+        self._watch_on()
 
     @property
     def tallies(self) -> I64:
         """Dark exposures, dark clicks and wrong patterns (never seen: static patterns carry no stamp), int64 (still/windows.N_TALLIES,)."""
         tallies: I64 = np.zeros(N_TALLIES, np.int64)
-        n_dark = int(self._ring.state[kernels.DARK_FRAMES])
+        n_dark = int(self._passing.dark_frames)
         tallies[DARK_EXPOSURES], tallies[DARK_CLICKS] = n_dark * len(self.dark_channels), self.dark_channels.sum()
         return tallies
 
     @property
     def empty_frames(self) -> int:
         """Light frames far from every object; their clicks per channel are `empty_channels`."""
-        return int(self._ring.state[kernels.EMPTY_FRAMES])
+        return int(self._passing.empty_frames)
 
     @property
     def n_passages(self) -> int:
         """Objects so far."""
-        return int(self.walk.state[kernels.OBJECTS])
+        return int(self._facts.objects)
 
     @property
     def bars_per_s(self) -> float | None:
         """A tape's speed: as it was said, or as it was last found; None of cells."""
-        pitch, nominal = self.walk.state[kernels.PITCH], self.walk.state[kernels.NOMINAL_PITCH]
-        return float(self.settings.bars_per_s * nominal / pitch) if self._is_tape else None
+        facts = self._facts
+        return float(self.settings.bars_per_s * facts.nominal_pitch / facts.pitch) if self._is_tape else None
 
     def cycles_left(self, n_cycles: int) -> int:
         """Return how many of `n_cycles` cycles stand out: those that have not begun."""
@@ -176,11 +182,17 @@ class FlowCore(Follower):
         """Whether the guard is told of the empty field: there are no dark frames."""
         return self.guard is not None and not self._dark_cycle
 
+    def begin(self, start_tick: int, n_cycles: int) -> Output:
+        """See Follower."""
+        output = super().begin(start_tick, n_cycles)
+        self._facts.marked = self.marks.following
+        return output
+
     # -- the kernel ----------------------------------------------------------------------------------------------------
 
     def steps(self, session: int) -> FlowCore:
         """See Follower."""
-        self.walk.state[columns.SESSION] = session
+        self._facts.session = session
         return self
 
     @property
@@ -197,21 +209,13 @@ class FlowCore(Follower):
         """Return the rows from `first` to `stop`."""
         return self.walk.rows[first:stop]
 
-    def load(self) -> None:
-        """Copy what the core and its tracker know into the kernel's state."""
-        state = self.walk.state
-        load_core(self, state)
-        state[kernels.ASKS], state[kernels.MARKED] = 0, self.marks.following
-        state[kernels.WATCH_AT] = self.watched_frames + WATCHED_FRAMES if self.watches_empty else 1 << 62
+    def _watch_on(self) -> None:
+        """Let the kernel tell of the empty field again once it has given enough."""
+        self._facts.watch_at = self.watched_frames + WATCHED_FRAMES if self.watches_empty else _NEVER
 
-    def store(self, state: I64) -> None:
-        """Copy what the kernel did back: its state, or what that was when a batch was handed over."""
-        store_core(self, state.tolist())
-        self._now_told = int(state[kernels.TOLD])
-
-    def told_empty(self) -> list[list[int]]:
-        """Return what the empty field gave and has not been accounted for: rows of `FlowWalk.empty`."""
-        first, self._told = self._told, self._now_told
+    def told_empty(self, told: int) -> list[list[int]]:
+        """Return what the empty field gave up to its `told`-th telling and has not been accounted for: rows of `FlowWalk.empty`."""
+        first, self._told = self._told, told
         return self.walk.empty[np.arange(first, self._told) % MOST_BLOCKS].tolist()
 
     def leave_ticks(self, first: int, stop: int) -> I64:
@@ -241,7 +245,7 @@ class FlowCore(Follower):
         """
         guard = self.guard
         events: list[CoreEvent] = [] if block is None or guard is None else [*guard.take(block)]
-        decided = self._decided(rows)
+        decided = self._decided(self.walk, rows)
         if self.watches_empty:
             events = [*self.watch(empty)]
         self.matcher.settle(behind)
@@ -258,9 +262,9 @@ class FlowCore(Follower):
 
     # -- one decision --------------------------------------------------------------------------------------------------
 
-    def _decided(self, rows: slice) -> Output:
-        """Give verdicts to the rows that wait for one, compare all with the truth, and ask for pulses."""
-        walk, guard = self.walk, self.guard
+    def _decided(self, walk: FlowWalk, rows: slice) -> Output:
+        """Give verdicts to the rows of `walk` that wait for one, compare all with the truth, and ask for pulses."""
+        guard = self.guard
         decisions, passages, actions = list[Decision](), list[Passage](), list[Action]()
         for at in range(rows.start, rows.stop):
             row, counts = walk.rows[at], walk.counts[at]
@@ -316,7 +320,7 @@ class FlowCore(Follower):
     def warm_up(self) -> None:
         """Run every compiled kernel of the hot path once, before arming, on state of its own."""
         ring, block = self._ring, np.frombuffer(bytes(8 * 2), np.uint8).reshape(2, 8)
-        state, words, counts = np.zeros_like(ring.state), ring.words.copy(), ring.counts.copy()
+        state, words, counts = np.zeros_like(ring.ring), ring.words.copy(), ring.counts.copy()
         spare, mask = np.zeros_like(self.dark_channels), self.walk.mask[0]
         kernels.put_frames(block, 0, words, counts, self._dark_cycle, state, spare, mask)
         kernels.skip_frames(2, 3, words, counts, state)
@@ -337,54 +341,60 @@ class FlowCore(Follower):
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
         assert isinstance(block, FrameBlock)  # _fits has seen to it
         ring, first = self._ring, block.exposure_index
+        skipped = self._skip_to(first, block.tick)
         ends_dark, mask = self._dark_cycle, self.walk.mask[0]
-        kernels.put_frames(block.words, first, ring.words, ring.counts, ends_dark, ring.state, self.dark_channels, mask)
+        kernels.put_frames(block.words, first, ring.words, ring.counts, ends_dark, ring.ring, self.dark_channels, mask)
         events = [] if self.guard is None or not self._dark_cycle else self.guard.take(block)
         stop = first + n_exposures
         output = self._settle(stop, end_tick - (stop - 1) * self._period_ticks, 0)
         if self.guard is not None and self.watches_empty:
             events = self._watch_empty(self.guard, self.empty_frames, self.empty_channels)
+            self._watch_on()
         self.matcher.settle(stop)
-        return output._replace(events=events)
+        return joined(skipped, output._replace(events=events))
 
     def _settle(self, stop: int, origin_tick: int, flags: int) -> Output:
         """Decide on what exposures before `stop` settle; exposure e ended at `origin_tick` + e periods. With `flags` none is decided."""
-        output, done = Output([], [], None), False
+        output, done, facts = Output([], [], None), False, self._facts
+        watch_at, facts.watch_at = int(facts.watch_at), _NEVER  # `_take` tells the guard itself
         while not done:
-            self.load()
-            self.walk.state[kernels.WATCH_AT] = 1 << 62
-            done = bool(kernels.settle(self.walk, stop, origin_tick, flags))
-            self.store(self.walk.state)
-            output = joined(output, self._decided(slice(0, int(self.walk.state[columns.N_ROWS]))))
+            some, done = self._stepped(kernels.settle, stop, origin_tick, flags)
+            output = joined(output, some)
+        facts.watch_at, facts.asks = watch_at, 0  # the pulses are in the output
         return output
 
     def _skip_to(self, exposure_index: int, tick: int) -> Output:
         ring, output = self._ring, Output([], [], None)
-        following = int(ring.state[kernels.NEXT])
+        following = int(self._passing.next_exposure)
         if exposure_index <= following:
             return output
         self.matcher.add_gap(following, exposure_index)
         if self._is_tape:
             output = self._settle(exposure_index, tick - exposure_index * self._period_ticks, _GAP)
-        kernels.skip_frames(following, exposure_index, ring.words, ring.counts, ring.state)
+        kernels.skip_frames(following, exposure_index, ring.words, ring.counts, ring.ring)
         return output
 
     def _close(self) -> Output:
         """Give up what the end of the stream leaves open."""
-        self.load()
-        kernels.close_passage(self.walk, min(self.last_tick, _LARGEST))
-        self.store(self.walk.state)
-        return self._decided(slice(0, int(self.walk.state[columns.N_ROWS])))
+        return self._stepped(kernels.close_passage, min(self.last_tick, LARGEST))[0]
+
+    def _stepped(self, kernel: Any, *arguments: int) -> tuple[Output, bool]:
+        """Run a compiled step on rows of its own; return what it decides, and whether it is done."""
+        facts = self._facts
+        kept, facts.n_rows = int(facts.n_rows), 0
+        done = kernel(self._own, *arguments)
+        n, facts.n_rows = int(facts.n_rows), kept
+        return self._decided(self._own, slice(0, n)), bool(done)
 
     def _give_up(self) -> Output:
-        output, state = self._close(), self._ring.state
+        output, passing = self._close(), self._passing
         self._cycles_before += -(-self.tracker.next_exposure // self._slots_per_cycle)
         if self.guard is not None:
             self.guard.restart()
         self.matcher.finish()
-        dark, empty = state[kernels.DARK_FRAMES], state[kernels.EMPTY_FRAMES]
-        state[:] = 0
-        state[kernels.DARK_FRAMES], state[kernels.EMPTY_FRAMES] = dark, empty
+        dark, empty = passing.dark_frames, passing.empty_frames
+        self._ring.ring[:] = 0
+        passing.dark_frames, passing.empty_frames = dark, empty
         if self._is_tape:
             self._begin_tape()
         return output
@@ -403,50 +413,54 @@ class FlowCore(Follower):
         """See Follower."""
         is_new = mark.object_index == NO_OBJECT or self.marks.get(mark.object_index) is None
         super().remember(mark)
+        if (
+            self.marks.following > self._facts.marked
+        ):  # never of a mark that a kernel has taken, which may go on meanwhile
+            self._facts.marked = self.marks.following
         if is_new:
             self.matcher.add_mark(mark)
 
     # -- parts of a recording ------------------------------------------------------------------------------------------
 
     def _place(self) -> dict[str, Any] | None:
-        ring, state = self._ring, self.walk.state
-        if ring.state[kernels.STATE] == kernels.OPEN:
+        ring, facts, passing = self._ring, self._facts, self._passing
+        if passing.phase == kernels.OPEN:
             return None
         if self.guard is not None and self.guard.policy != "warn":
             return None  # what it has learnt decides too
         kept, tracks = 2 * self.limits.longest, self._is_tape and self.settings.track > 0
         if self._is_tape:
-            kept = max(self.frames, int(state[kernels.PITCH]) >> Q) + (2 * self.frames + 2 if tracks else 0)
-        slots = np.arange(int(ring.state[kernels.NEXT]) - kept, int(ring.state[kernels.NEXT])) & (len(ring.words) - 1)
+            kept = max(self.frames, int(facts.pitch) >> Q) + (2 * self.frames + 2 if tracks else 0)
+        slots = np.arange(int(passing.next_exposure) - kept, int(passing.next_exposure)) & (len(ring.words) - 1)
         found: dict[str, Any] = {
             "passages": self.n_passages,
             "cycles_before": self._cycles_before,
-            "state": ring.state.tolist(),
+            "state": ring.ring.view(np.int64).tolist(),
             "words": ring.words[slots].astype("<u8").tobytes().hex(),
             "counts": ring.counts[slots].tolist(),
         }
         if self._is_tape:
-            found["position"] = int(state[kernels.POSITION])
+            found["position"] = int(facts.position)
         if tracks:
-            found |= {"middle": self._middle(kernels.MIDDLE), "pitch": int(state[kernels.PITCH])}
-            found["before"] = [int(state[kernels.BEFORE]), self._middle(kernels.BEFORE_MIDDLE)]
+            found |= {"middle": _whole(facts.middle, facts.middle_part), "pitch": int(facts.pitch)}
+            found["before"] = [int(facts.before), _whole(facts.before_middle, facts.before_part)]
         return found
 
     def _go_on_from(self, place: dict[str, Any]) -> None:
-        ring, state = self._ring, self.walk.state
-        state[kernels.OBJECTS], self._cycles_before = int(place["passages"]), int(place["cycles_before"])
-        ring.state[:] = place["state"]
-        stop = int(ring.state[kernels.NEXT])
+        ring, facts = self._ring, self._facts
+        facts.objects, self._cycles_before = int(place["passages"]), int(place["cycles_before"])
+        ring.ring.view(np.int64)[:] = place["state"]
+        stop = int(self._passing.next_exposure)
         slots = np.arange(stop - len(place["counts"]), stop) & (len(ring.words) - 1)
         ring.words[slots] = np.frombuffer(bytes.fromhex(place["words"]), "<u8")
         ring.counts[slots] = place["counts"]
         if self._is_tape:
-            state[kernels.POSITION] = int(place["position"])
-            self._put_middle(kernels.MIDDLE, self._origin + int(place["position"]) * self._nominal_pitch)
+            facts.position = int(place["position"])
+            facts.middle, facts.middle_part = _parts(self._origin + int(place["position"]) * self._nominal_pitch)
         if self._is_tape and self.settings.track:
-            self._put_middle(kernels.MIDDLE, int(place["middle"]))
-            state[kernels.PITCH], state[kernels.BEFORE] = int(place["pitch"]), int(place["before"][0])
-            self._put_middle(kernels.BEFORE_MIDDLE, int(place["before"][1]))
+            facts.middle, facts.middle_part = _parts(int(place["middle"]))
+            facts.pitch, facts.before = int(place["pitch"]), int(place["before"][0])
+            facts.before_middle, facts.before_part = _parts(int(place["before"][1]))
         self.matcher.forget_marks(stop - self.frames // 2)  # they were decided in the part before
 
     # -- a tape --------------------------------------------------------------------------------------------------------
@@ -471,28 +485,25 @@ class FlowCore(Follower):
 
     def _begin_tape(self) -> None:
         """Look for position 0, or the first one whose window does not begin before the stream."""
-        pitch, state = self._nominal_pitch, self.walk.state
+        pitch, facts = self._nominal_pitch, self._facts
         position = max(0, -self._origin // pitch)
         while self.window_of(self._origin + position * pitch) < 0:
             position += 1
-        state[kernels.PITCH] = state[kernels.NOMINAL_PITCH] = pitch
-        state[kernels.TRACK], state[kernels.POSITION] = self.settings.track, position
-        self._put_middle(kernels.MIDDLE, self._origin + position * pitch)
-        state[kernels.BEFORE] = -1
-        self._put_middle(kernels.BEFORE_MIDDLE, 0)
+        facts.pitch = facts.nominal_pitch = pitch
+        facts.track, facts.position = self.settings.track, position
+        facts.middle, facts.middle_part = _parts(self._origin + position * pitch)
+        facts.before, facts.before_middle, facts.before_part = -1, 0, 0
 
     def window_of(self, middle: int) -> int:
         """Return the first exposure of the window that is centred at `middle`, in 2^-Q exposures."""
         return (middle - ((self.frames - 1) << (Q - 1)) + (1 << (Q - 1))) >> Q
 
-    def _middle(self, column: int) -> int:
-        """Return the time at `column` of the state and the one behind it, in 2^-Q exposures."""
-        return (int(self.walk.state[column]) << Q) + int(self.walk.state[column + 1])
 
-    def _put_middle(self, column: int, middle: int) -> None:
-        self.walk.state[column], self.walk.state[column + 1] = middle >> Q, middle & _PART
+def _whole(exposures: int, part: int) -> int:
+    """Return a time of the state in 2^-Q exposures; Python's integers hold any."""
+    return (int(exposures) << Q) + int(part)
 
 
-def _undecided(tables: DecisionTables) -> DecisionTables:
-    """Return tables that decide nothing."""
-    return tables._replace(labels=tables.labels[:0].copy(), probabilities=tables.probabilities[:0].copy())
+def _parts(middle: int) -> tuple[int, int]:
+    """Invert `_whole`."""
+    return middle >> Q, middle & _PART

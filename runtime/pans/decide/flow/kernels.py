@@ -21,15 +21,30 @@ from pans.bundle.backends import NO_LABEL
 from pans.decide.decision import DecisionFlag
 from pans.decide.still import kernels as core
 from pans.decide.still.kernels import DecisionTables
-from pans.decide.still.windows import sum_up
+from pans.decide.still.window_kernels import sum_up
+from pans.protocol.tracker import state_dtype
 from pans.protocol.wire import NO_OBJECT, UNKNOWN_TRUTH
 from pans.protocol.wire import kernels as stream
 
 from .settings import WATCHED_FRAMES, Q
 
-# ring state, int64 (N_STATE,)
-NEXT, SUM, SEEN, STATE, FIRST, CLICKS, MOMENT, FLAGS, HOLD, WHOLE_SINCE, EMPTY_FRAMES, DARK_FRAMES, BUSY = range(13)
-N_STATE = 13
+RING_DTYPE = state_dtype(  # what follows the ring; parts of a recording hold it in this order
+    (
+        "next_exposure",
+        "recent_clicks",  # of the onset's window, in as many frames
+        "recent_frames",
+        "phase",  # IDLE, OPEN or BLIND
+        "first",  # frame of the open passage, its clicks, their moment, and BROKEN or TOO_LONG
+        "clicks",
+        "moment",
+        "faults",
+        "hold_until",  # no onset before
+        "whole_since",  # the exposure from which on no frame is missing
+        "empty_frames",
+        "dark_frames",
+        "busy_at",  # when an object was in sight last
+    )
+)
 IDLE, OPEN, BLIND = 0, 1, 2
 # a passage, int64 (N_COLUMNS,): its frames, where it is centred (times 256), clicks, BROKEN or TOO_LONG, the exposure that settled it
 P_FIRST, P_LAST, P_CENTRE, P_CLICKS, P_FLAGS, P_RELEASE, N_COLUMNS = range(7)
@@ -39,15 +54,6 @@ DARK, NEVER_CAME = -1, -2
 # limits, int64: the first eight of settings.FlowLimits
 W, ON, OFF, LONGEST, REFRACTORY, BACKGROUND, VALLEY_FRAMES, VALLEY_SIGMA2 = range(8)
 
-# stream state, int64 (N_FACTS,): the columns of a core's state, and of a flow alone the most frames of a block, the frames of a cycle that
-# ends with a dark one (0: none does), from how many empty frames on they are told, the frames of a decision, objects so far, how often the
-# empty field was told, above which numbers no passage has been marked, whether a pulse is asked for; ...
-MAX_BLOCK, DARK_EVERY, WATCH_AT, FRAMES, OBJECTS, TOLD, MARKED, ASKS = range(core.N_STATE, core.N_STATE + 8)
-# ... of a tape the middle of the next window in whole exposures and 2^-Q of one, the pitch and what it is by the settings, and how fast it
-# is followed; the window before (-1: not known) and its middle; the position
-MIDDLE, MIDDLE_PART, PITCH, NOMINAL_PITCH, TRACK, BEFORE, BEFORE_MIDDLE, BEFORE_PART, POSITION, N_FACTS = range(
-    ASKS + 1, ASKS + 11
-)
 W_FIRST, W_LAST, W_CENTRE, W_LEAVE, W_CLICKS, N_PASSAGE = range(6)  # of decision.Passage
 _GAP, _ABSTAINED, _NOT_FINITE, _AMBIGUOUS, _COINCIDENCE, _INCOMPLETE = (
     int(DecisionFlag[name]) for name in ("GAP", "ABSTAINED", "NOT_FINITE", "AMBIGUOUS", "COINCIDENCE", "INCOMPLETE")
@@ -63,14 +69,14 @@ class FlowArrays(NamedTuple):
     words: npt.NDArray[np.uint64]
     counts: npt.NDArray[np.int16]
     limits: npt.NDArray[np.int64]
-    state: npt.NDArray[np.int64]
+    ring: npt.NDArray[np.void]
     dark_channels: npt.NDArray[np.int64]
     empty_channels: npt.NDArray[np.int64]
     out: npt.NDArray[np.int64]
 
 
 class FlowWalk(NamedTuple):
-    """What the kernel continues of a flow: the stream's place and the settings, int64 (N_FACTS,), the ring, and what comes of each object.
+    """What the kernel continues of a flow: the state, CORE_DTYPE (1,), the ring, and what comes of each object.
 
     `offsets` int64 (slots of a cycle,) in ticks; `mask` uint64 (1,) of the channels; `sure` float64 (1,): below it a posterior is
     ambiguous; `gated` uint8 (classes,): of which a pulse is asked. Decisions stand in `rows`, DECISION_DTYPE (m,), in the same place
@@ -79,7 +85,7 @@ class FlowWalk(NamedTuple):
     each channel, since the run began. `heard` is StreamTracker's.
     """
 
-    state: npt.NDArray[np.int64]
+    state: npt.NDArray[np.void]
     flow: FlowArrays
     offsets: npt.NDArray[np.int64]
     mask: npt.NDArray[np.uint64]
@@ -120,7 +126,7 @@ def _tally(word, channels):  # type: ignore[no-untyped-def]
 
 
 @outer
-def put_frames(frames, first, words, counts, dark_cycle, state, dark_channels, channel_mask):  # type: ignore[no-untyped-def]
+def put_frames(frames, first, words, counts, dark_cycle, ring, dark_channels, channel_mask):  # type: ignore[no-untyped-def]
     """Put frames uint8 (n, bytes), the first one exposure number `first`, into the ring.
 
     Frames of the plan that are dark are tallied in `dark_channels` int64 (d_f,) instead.
@@ -134,7 +140,7 @@ def put_frames(frames, first, words, counts, dark_cycle, state, dark_channels, c
         word &= channel_mask
         slot = (first + i) & mask
         if dark_cycle and (first + i) % dark_cycle == dark_cycle - 1:
-            state[DARK_FRAMES] += 1
+            ring[0].dark_frames += 1
             _tally(word, dark_channels)
             words[slot], counts[slot] = numba.uint64(0), DARK
         else:
@@ -142,81 +148,81 @@ def put_frames(frames, first, words, counts, dark_cycle, state, dark_channels, c
 
 
 @outer
-def skip_frames(first, stop, words, counts, state):  # type: ignore[no-untyped-def]
+def skip_frames(first, stop, words, counts, ring):  # type: ignore[no-untyped-def]
     """Say that exposures `first`..`stop` - 1 never came: the windows start afresh, an open passage is broken."""
-    mask = len(words) - 1
+    state, mask = ring[0], len(words) - 1
     for exposure in range(max(first, stop - len(words)), stop):
         words[exposure & mask], counts[exposure & mask] = numba.uint64(0), NEVER_CAME
-    state[SUM] = state[SEEN] = 0
-    state[WHOLE_SINCE] = state[NEXT] = stop
-    if state[STATE] == OPEN:
-        state[FLAGS] |= BROKEN
+    state.recent_clicks = state.recent_frames = 0
+    state.whole_since = state.next_exposure = stop
+    if state.phase == OPEN:
+        state.faults |= BROKEN
 
 
 @inner
 def _close(state, limits, last, release, flags, row):  # type: ignore[no-untyped-def]
     """Write the open passage into `row`: the centroid is that of the clicks beyond the background's."""
-    n = release - state[FIRST] + 1
-    light = (state[CLICKS] << 16) - limits[BACKGROUND] * n
-    moment = (state[MOMENT] << 16) - limits[BACKGROUND] * (n * (n - 1) // 2)
-    centre = 128 * (last - state[FIRST])
+    n = release - state.first + 1
+    light = (state.clicks << 16) - limits[BACKGROUND] * n
+    moment = (state.moment << 16) - limits[BACKGROUND] * (n * (n - 1) // 2)
+    centre = 128 * (last - state.first)
     if light > 0:
         centre = min(max(moment // (light >> 8 if light >> 8 else 1), 0), 256 * n)
-    row[P_FIRST], row[P_LAST], row[P_CENTRE] = state[FIRST], last, (state[FIRST] << 8) + centre
-    row[P_CLICKS], row[P_FLAGS], row[P_RELEASE] = state[CLICKS], state[FLAGS] | flags, release
-    state[HOLD] = release + 1 + limits[REFRACTORY]
+    row[P_FIRST], row[P_LAST], row[P_CENTRE] = state.first, last, (state.first << 8) + centre
+    row[P_CLICKS], row[P_FLAGS], row[P_RELEASE] = state.clicks, state.faults | flags, release
+    state.hold_until = release + 1 + limits[REFRACTORY]
 
 
 @outer
-def scan(stop, words, counts, limits, state, empty_channels, out):  # type: ignore[no-untyped-def]
-    """Follow the click sums over exposures state[NEXT]..stop - 1, which are in the ring; return the number of passages in `out`.
+def scan(stop, words, counts, limits, ring, empty_channels, out):  # type: ignore[no-untyped-def]
+    """Follow the click sums over exposures ring[0].next_exposure..stop - 1, which are in the ring; return the number of passages in `out`.
 
     An onset is a sum of `W` frames of at least `ON` clicks; the release is the first sum of at most `OFF`. A passage holds its frames from
     the first of the onset's to the last of the release's; `last` is the last frame before the quiet ones. Frames further than half the
     longest passage from any object or gap are empty, and tallied in `empty_channels` int64 (d_f,): nearer ones see the faint edges
     of cells. Stops early when `out` is full.
     """
-    mask = len(words) - 1
+    state, mask = ring[0], len(words) - 1
     n = 0
     width, guard = limits[W], max(limits[W], limits[LONGEST] // 2)
-    for exposure in range(state[NEXT], stop):
+    for exposure in range(state.next_exposure, stop):
         clicks = counts[exposure & mask]
         clicks = clicks if clicks > 0 else 0
-        state[SUM] += clicks
-        if state[SEEN] == width:
+        state.recent_clicks += clicks
+        if state.recent_frames == width:
             oldest = counts[(exposure - width) & mask]
-            state[SUM] -= oldest if oldest > 0 else 0
+            state.recent_clicks -= oldest if oldest > 0 else 0
         else:
-            state[SEEN] += 1
-        if state[STATE] == OPEN:
-            state[CLICKS] += clicks
-            state[MOMENT] += clicks * (exposure - state[FIRST])
-            if state[SEEN] == width and state[SUM] <= limits[OFF]:
+            state.recent_frames += 1
+        if state.phase == OPEN:
+            state.clicks += clicks
+            state.moment += clicks * (exposure - state.first)
+            if state.recent_frames == width and state.recent_clicks <= limits[OFF]:
                 _close(state, limits, exposure - width, exposure, 0, out[n])
-                state[STATE] = IDLE
+                state.phase = IDLE
                 n += 1
-            elif exposure - state[FIRST] >= 2 * limits[LONGEST]:
+            elif exposure - state.first >= 2 * limits[LONGEST]:
                 _close(state, limits, exposure, exposure, TOO_LONG, out[n])
-                state[STATE] = BLIND
+                state.phase = BLIND
                 n += 1
-        elif state[STATE] == BLIND:
-            if state[SEEN] == width and state[SUM] <= limits[OFF]:
-                state[STATE] = IDLE
-        elif state[SEEN] == width and state[SUM] >= limits[ON] and exposure >= state[HOLD]:
+        elif state.phase == BLIND:
+            if state.recent_frames == width and state.recent_clicks <= limits[OFF]:
+                state.phase = IDLE
+        elif state.recent_frames == width and state.recent_clicks >= limits[ON] and exposure >= state.hold_until:
             first = exposure - width + 1
-            state[STATE], state[FIRST], state[CLICKS], state[MOMENT] = OPEN, first, state[SUM], 0
-            state[FLAGS] = BROKEN if first - state[WHOLE_SINCE] < width else 0
+            state.phase, state.first, state.clicks, state.moment = OPEN, first, state.recent_clicks, 0
+            state.faults = BROKEN if first - state.whole_since < width else 0
             for back in range(width):
                 earlier = counts[(first + back) & mask]
-                state[MOMENT] += back * (earlier if earlier > 0 else 0)
-        if state[STATE] != IDLE:
-            state[BUSY] = exposure
+                state.moment += back * (earlier if earlier > 0 else 0)
+        if state.phase != IDLE:
+            state.busy_at = exposure
         empty = exposure - guard
-        if state[BUSY] < empty - guard and state[WHOLE_SINCE] <= empty - guard and counts[empty & mask] >= 0:
-            state[EMPTY_FRAMES] += 1
+        if state.busy_at < empty - guard and state.whole_since <= empty - guard and counts[empty & mask] >= 0:
+            state.empty_frames += 1
             if counts[empty & mask] > 0:
                 _tally(words[empty & mask], empty_channels)
-        state[NEXT] = exposure + 1
+        state.next_exposure = exposure + 1
         if n == len(out):
             break
     return n
@@ -299,20 +305,20 @@ def total_clicks(counts, first, stop):  # type: ignore[no-untyped-def]
 @inner
 def _take_frames(buffer, payload, stop, facts, slot_offsets, flow, mask):  # type: ignore[no-untyped-def]
     """Put the frames from `payload` to `stop` into the ring and return how many; 0, and nothing done, where they are not ordinary."""
-    first = facts[stream.NEXT_EXPOSURE]
+    first = facts.next_exposure
     count, width = stream.next_block(buffer, payload, stop, facts)
-    if count == 0 or count > facts[MAX_BLOCK] or 8 * width < flow.dark_channels.size:
+    if count == 0 or count > facts.max_block or 8 * width < flow.dark_channels.size:
         return 0
-    if flow.state[NEXT] != first:  # the block before was left out: it did not fit the plan
+    if flow.ring[0].next_exposure != first:  # the block before was left out: it did not fit the plan
         return 0
     tick, period = stream.block_times(buffer, payload)
-    if period != facts[core.PERIOD_TICKS] or load4(buffer, payload + _U(32)) != _NO_OBJECT:
+    if period != facts.period_ticks or load4(buffer, payload + stream.OBJECT_AT) != _NO_OBJECT:
         return 0
     if tick < core.planned_tick(first, facts, slot_offsets) - period:
         return 0
     frames_at = np.int64(payload) + stream.BLOCK_HEADER
     frames = buffer[frames_at : frames_at + count * width].reshape(count, width)
-    put_frames(frames, first, flow.words, flow.counts, facts[DARK_EVERY], flow.state, flow.dark_channels, mask)
+    put_frames(frames, first, flow.words, flow.counts, facts.dark_every, flow.ring, flow.dark_channels, mask)
     stream.go_on(facts, count)
     core.note_end(tick, count, facts, slot_offsets)
     return count
@@ -327,18 +333,18 @@ def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
     A mark is only counted: who compares decisions with the truth looks for it in what was kept. One of a passage that may have been marked
     before is ODD.
     """
-    state, payload = walk.state, start + _U(stream.BODY_HEADER)
+    state, payload = walk.state[0], start + _U(stream.BODY_HEADER)
     if not core.is_ours(buffer, start, stop, state):
         return core.ODD
     if buffer[start] == stream.MARK:
         if not stream.is_next_mark(buffer, payload, stop, state):
             return core.ODD
-        if not stream.mark_fits(buffer, payload, state, state[core.N_CLASSES]):
+        if not stream.mark_fits(buffer, payload, state, state.n_classes):
             return core.ODD
-        number = np.int64(load4(buffer, payload + _U(4)))
-        if number < state[MARKED]:
+        number = np.int64(load4(buffer, payload + stream.MARK_OBJECT_AT))
+        if number < state.marked:
             return core.ODD
-        state[MARKED] = number + 1
+        state.marked = number + 1
         stream.go_on(state, np.int64(0))
         return core.TOOK_MARK
     if buffer[start] != stream.FRAMES:
@@ -346,9 +352,9 @@ def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
     count = _take_frames(buffer, payload, stop, state, walk.offsets, walk.flow, walk.mask[0])
     if count == 0:
         return core.ODD
-    behind = state[stream.NEXT_EXPOSURE]
-    _settle(walk, behind, state[core.LAST_TICK] - (behind - 1) * state[core.PERIOD_TICKS], 0)
-    asks, state[ASKS] = state[ASKS], 0
+    behind = state.next_exposure
+    _settle(walk, behind, state.last_tick - (behind - 1) * state.period_ticks, 0)
+    asks, state.asks = state.asks, 0
     return core.TOOK_URGENT if asks else core.TOOK_BLOCK
 
 
@@ -368,15 +374,15 @@ def _settle(walk, behind, origin, flags):  # type: ignore[no-untyped-def]
         if not _take_bars(walk, behind, origin, flags):
             return False
         if not flags:
-            flow.state[NEXT] = behind
+            flow.ring[0].next_exposure = behind
         return True
-    while flow.state[NEXT] < behind:
-        if walk.state[core.N_ROWS] + flow.out.shape[0] > walk.rows.size:
+    while flow.ring[0].next_exposure < behind:
+        if walk.state[0].n_rows + flow.out.shape[0] > walk.rows.size:
             return False
-        n = scan(behind, flow.words, flow.counts, flow.limits, flow.state, flow.empty_channels, flow.out)
+        n = scan(behind, flow.words, flow.counts, flow.limits, flow.ring, flow.empty_channels, flow.out)
         for i in range(n):
             _take_passage(walk, flow.out[i], origin)
-    if flow.state[EMPTY_FRAMES] >= walk.state[WATCH_AT]:
+    if flow.ring[0].empty_frames >= walk.state[0].watch_at:
         _tell_empty(walk, behind)
     return True
 
@@ -385,27 +391,27 @@ def _settle(walk, behind, origin, flags):  # type: ignore[no-untyped-def]
 def close_passage(walk, last_tick):  # type: ignore[no-untyped-def]
     """Give up the passage that is open at the end of a stream, whose last exposure ended at `last_tick`."""
     walk = bare(walk)
-    flow, state, frames = walk.flow.state, walk.state, walk.state[FRAMES]
-    if walk.flow.limits.size == 0 or flow[STATE] != OPEN:
+    ring, state = walk.flow.ring[0], walk.state[0]
+    if walk.flow.limits.size == 0 or ring.phase != OPEN:
         return
-    first, last = flow[FIRST], flow[NEXT] - 1
-    passage = walk.passages[state[core.N_ROWS]]
+    first, last = ring.first, ring.next_exposure - 1
+    passage = walk.passages[state.n_rows]
     passage[W_FIRST], passage[W_LAST], passage[W_CENTRE] = first, last, (first + last) // 2
-    passage[W_LEAVE], passage[W_CLICKS] = last_tick, flow[CLICKS]
-    _put_row(walk, max(0, last + 1 - frames), last_tick, _INCOMPLETE)
-    flow[STATE] = IDLE
+    passage[W_LEAVE], passage[W_CLICKS] = last_tick, ring.clicks
+    _put_row(walk, max(0, last + 1 - state.frames), last_tick, _INCOMPLETE)
+    ring.phase = IDLE
 
 
 @inner
 def _tell_empty(walk, behind):  # type: ignore[no-untyped-def]
     """Keep what the empty field gave up to here."""
-    state, flow = walk.state, walk.flow
-    row = walk.empty[state[TOLD] % walk.empty.shape[0]]
-    row[0], row[1] = behind, flow.state[EMPTY_FRAMES]
+    state, flow = walk.state[0], walk.flow
+    row = walk.empty[state.told % walk.empty.shape[0]]
+    row[0], row[1] = behind, flow.ring[0].empty_frames
     for channel in range(flow.empty_channels.size):
         row[2 + channel] = flow.empty_channels[channel]
-    state[TOLD] += 1
-    state[WATCH_AT] = flow.state[EMPTY_FRAMES] + _WATCHED
+    state.told += 1
+    state.watch_at = flow.ring[0].empty_frames + _WATCHED
 
 
 # -- cells -----------------------------------------------------------------------------------------------------------------
@@ -414,8 +420,8 @@ def _tell_empty(walk, behind):  # type: ignore[no-untyped-def]
 @inner
 def _take_passage(walk, found, origin):  # type: ignore[no-untyped-def]
     """Decide on a passage, of a cell; exposure e ended at `origin` + e periods."""
-    flow, state = walk.flow, walk.state
-    limits, frames = flow.limits, state[FRAMES]
+    flow, state = walk.flow, walk.state[0]
+    limits, frames = flow.limits, state.frames
     first, last, centre = found[P_FIRST], found[P_LAST], found[P_CENTRE]
     flags = 0
     if found[P_FLAGS] & BROKEN:
@@ -427,17 +433,17 @@ def _take_passage(walk, found, origin):  # type: ignore[no-untyped-def]
     ):
         flags = _COINCIDENCE
     start = (centre - 128 * (frames - 1) + 128) >> 8
-    if state[DARK_EVERY]:
-        dark = start + state[DARK_EVERY] - 1 - start % state[DARK_EVERY]
+    if state.dark_every:
+        dark = start + state.dark_every - 1 - start % state.dark_every
         if dark < start + frames:
             back, ahead = start + frames - dark, dark + 1 - start
             start += -back if back < ahead else ahead
-    start = max(0, min(start, flow.state[NEXT] - frames))
-    passage = walk.passages[state[core.N_ROWS]]
+    start = max(0, min(start, flow.ring[0].next_exposure - frames))
+    passage = walk.passages[state.n_rows]
     passage[W_FIRST], passage[W_LAST], passage[W_CENTRE] = first, last, (centre + 128) >> 8
-    passage[W_LEAVE] = origin + last * state[core.PERIOD_TICKS]
+    passage[W_LEAVE] = origin + last * state.period_ticks
     passage[W_CLICKS] = found[P_CLICKS]
-    _put_row(walk, start, origin + (start + frames - 1) * state[core.PERIOD_TICKS], flags)
+    _put_row(walk, start, origin + (start + frames - 1) * state.period_ticks, flags)
 
 
 # -- a tape ----------------------------------------------------------------------------------------------------------------
@@ -446,37 +452,37 @@ def _take_passage(walk, found, origin):  # type: ignore[no-untyped-def]
 @inner
 def _take_bars(walk, behind, origin, flags):  # type: ignore[no-untyped-def]
     """Decide on every position whose window ends before exposure `behind`; with `flags` none is decided. False when the rows are full."""
-    state, flow, period = walk.state, walk.flow, walk.state[core.PERIOD_TICKS]
-    frames = state[FRAMES]
+    state, flow = walk.state[0], walk.flow
+    frames, period = state.frames, state.period_ticks
     while True:
-        start = state[MIDDLE] + ((state[MIDDLE_PART] - (frames - 1) * _HALF + _HALF) >> Q)
+        start = state.middle + ((state.middle_part - (frames - 1) * _HALF + _HALF) >> Q)
         last = start + frames - 1
         if last >= behind:
             return True
-        if state[core.N_ROWS] == walk.rows.size:
+        if state.n_rows == walk.rows.size:
             return False
-        pitch = state[PITCH]
+        pitch = state.pitch
         end, since = origin + last * period, max(0, last + 1 - (pitch >> Q))
-        passage = walk.passages[state[core.N_ROWS]]
+        passage = walk.passages[state.n_rows]
         passage[W_FIRST], passage[W_LAST] = since, last
-        passage[W_CENTRE] = state[MIDDLE] + ((state[MIDDLE_PART] + _HALF) >> Q)
+        passage[W_CENTRE] = state.middle + ((state.middle_part + _HALF) >> Q)
         part = pitch & _PART  # of an exposure; times the period it may be longer than a number
         ticks = (pitch >> Q) * period + (((part >> 16) * period + ((part & 0xFFFF) * period >> 16)) >> (Q - 16))
         passage[W_LEAVE] = end + (ticks >> 1)
         passage[W_CLICKS] = 0 if flags else total_clicks(flow.counts, since, last + 1)
-        state[POSITION] += 1
-        if state[TRACK]:
+        state.position += 1
+        if state.track:
             _follow(walk, start, flags != 0)
-        _move_on(state, state[PITCH])
+        _move_on(state, state.pitch)
         _put_row(walk, start, end, flags)
 
 
 @inner
 def _move_on(state, by):  # type: ignore[no-untyped-def]
     """Move the middle of the next window by so many 2^-Q exposures."""
-    part = state[MIDDLE_PART] + by
-    state[MIDDLE] += part >> Q
-    state[MIDDLE_PART] = part & _PART
+    part = state.middle_part + by
+    state.middle += part >> Q
+    state.middle_part = part & _PART
 
 
 @inner
@@ -488,25 +494,25 @@ def _follow(walk, start, lost):  # type: ignore[no-untyped-def]
     much; the mean of both is the edge. Each edge moves the next window by 2^-track of what it is off and the pitch by 2^-(2 track + 2):
     critical damping. Exposures count from the window before, so that no number is too long.
     """
-    state, flow, edges, frames = walk.state, walk.flow, walk.edges, walk.state[FRAMES]
-    before, middle_before, part_before = state[BEFORE], state[BEFORE_MIDDLE], state[BEFORE_PART]
-    state[BEFORE], state[BEFORE_MIDDLE] = np.int64(-1) if lost else start, state[MIDDLE]
-    state[BEFORE_PART] = state[MIDDLE_PART]
+    state, flow, edges = walk.state[0], walk.flow, walk.edges
+    before, middle_before, part_before = state.before, state.before_middle, state.before_part
+    state.before, state.before_middle = np.int64(-1) if lost else start, state.middle
+    state.before_part = state.middle_part
     if lost or before < 0:
         return
-    count_edges(flow.words, flow.counts, before, start, frames, edges)
+    count_edges(flow.words, flow.counts, before, start, state.frames, edges)
     up, down = edges[0], edges[1]
     if up == 0 or down == 0 or edges[4]:
         return
-    between = (frames - 1 + start - before) << (Q - 1)
+    between = (state.frames - 1 + start - before) << (Q - 1)
     found = between + ((edges[3] * up - edges[2] * down) << Q) // (2 * up * down)
     first = ((middle_before - before) << Q) + part_before
-    then = ((state[MIDDLE] - before) << Q) + state[MIDDLE_PART]
-    limit, nominal = state[PITCH] >> 2, state[NOMINAL_PITCH]
+    then = ((state.middle - before) << Q) + state.middle_part
+    limit, nominal = state.pitch >> 2, state.nominal_pitch
     off = min(max(found - ((first + then) >> 1), -limit), limit)
-    _move_on(state, off >> state[TRACK])
-    pitch = state[PITCH] + (off >> (2 * state[TRACK] + 2))
-    state[PITCH] = min(max(pitch, nominal - (nominal >> 3)), nominal + (nominal >> 3))
+    _move_on(state, off >> state.track)
+    pitch = state.pitch + (off >> (2 * state.track + 2))
+    state.pitch = min(max(pitch, nominal - (nominal >> 3)), nominal + (nominal >> 3))
 
 
 # -- one decision ----------------------------------------------------------------------------------------------------------
@@ -515,11 +521,12 @@ def _follow(walk, start, lost):  # type: ignore[no-untyped-def]
 @inner
 def _put_row(walk, first, end, flags):  # type: ignore[no-untyped-def]
     """Decide on the windows from exposure `first` on, which ended at tick `end`; `flags` why they must not be decided."""
-    state, flow, tables, n_row = walk.state, walk.flow, walk.tables, walk.state[core.N_ROWS]
+    state, flow, tables = walk.state[0], walk.flow, walk.tables
+    n_row = state.n_rows
     counts, clicks, crc, unlit = walk.counts[n_row], np.int64(0), np.uint32(0), 0
     label, probability, index = np.int64(_NO_LABEL), np.float32(0.0), np.int64(0)
     if not flags & _GAP:
-        shots = state[FRAMES] // counts.shape[0]
+        shots = state.frames // counts.shape[0]
         for window in range(counts.shape[0]):
             unlit += window_clicks(flow.words, flow.counts, first + window * shots, shots, counts[window])
         if unlit:
@@ -534,14 +541,14 @@ def _put_row(walk, first, end, flags):  # type: ignore[no-untyped-def]
             flags |= _AMBIGUOUS
     if flags:
         label, flags = np.int64(_NO_LABEL), flags | _ABSTAINED
-        state[core.N_ABSTAINED] += 1
+        state.n_abstained += 1
     elif tables.labels.size == 0 or walk.gated[label]:
-        state[ASKS] = 1
+        state.asks = 1
     row = walk.rows[n_row]
-    row["index"], row["tick"], row["exposure_index"] = state[core.N_DECISIONS], end, max(0, first + state[FRAMES] - 1)
-    row["object"], row["shot"], row["clicks"], row["label"] = state[OBJECTS], 0, clicks, label
+    row["index"], row["tick"], row["exposure_index"] = state.n_decisions, end, max(0, first + state.frames - 1)
+    row["object"], row["shot"], row["clicks"], row["label"] = state.objects, 0, clicks, label
     row["truth"], row["flags"], row["probability"] = _UNKNOWN, flags, probability
     row["counts_crc"], row["exposures"] = crc, 0
-    state[core.N_DECISIONS] += 1
-    state[OBJECTS] = (state[OBJECTS] + 1) & _OBJECTS
-    state[core.N_ROWS] += 1
+    state.n_decisions += 1
+    state.objects = (state.objects + 1) & _OBJECTS
+    state.n_rows += 1

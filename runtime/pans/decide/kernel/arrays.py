@@ -34,9 +34,9 @@ SERVES, WAKE_FD, TELL_FD, BATCH_NS, BATCH_MESSAGES, PARK, PARKED, READY, HUNGRY 
 # when it handed over last; the block after which it has reported the next one overdue, when, and whether Python is to see to it
 HANDED_NS, OVERDUE_BLOCK_NS, OVERDUE_NS, OVERDUE = range(41, 45)
 # what a call, or a batch, reports: errno, bytes of the last command that were not sent, when anything of the session came last, up to
-# where each ring and the rows are used, the exposure that comes next, and why it ended
+# where each ring and the rows are used, the exposure that comes next, how often a flow has told of the empty field, and why it ended
 ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT = range(45, 55)
-STOP_ROW, FOLLOWING, ENDED, N_CONTROL = range(55, 59)
+STOP_ROW, FOLLOWING, TOLD, ENDED, N_CONTROL = range(55, 60)
 
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)
@@ -64,7 +64,6 @@ class Rings(NamedTuple):
     notes: I64  # (n, 4): waits for bytes: began, asked until, ended
     arrivals: I64
     handed: I64  # (N_CONTROL,): `control` as it was when a batch was handed over
-    handed_state: I64  # the state of the walk at that time
     spare: U8  # what is read from and written to the pipes
 
 
@@ -90,13 +89,13 @@ class Drive(NamedTuple):
     sizes: I64
 
 
-def make_rings(state_size: int) -> Rings:
-    """Return rings in memory that has been touched, for a walk whose state has `state_size` numbers."""
+def make_rings() -> Rings:
+    """Return rings in memory that has been touched."""
     kept: U8 = np.full(KEPT_BYTES, 1, np.uint8)
     messages, answers, shows, notes = (np.full((MANY, 4), 1, np.int64) for _ in range(4))
     steps, arrivals = np.full((MANY, N_STEP), 1, np.int64), np.full(MANY, 1, np.int64)
-    handed, handed_state = np.full(N_CONTROL, 0, np.int64), np.full(state_size, 0, np.int64)
-    return Rings(kept, steps, messages, answers, shows, notes, arrivals, handed, handed_state, np.full(64, 1, np.uint8))
+    handed, spare = np.full(N_CONTROL, 0, np.int64), np.full(64, 1, np.uint8)
+    return Rings(kept, steps, messages, answers, shows, notes, arrivals, handed, spare)
 
 
 def no_drive() -> Drive:

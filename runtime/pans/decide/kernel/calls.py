@@ -53,14 +53,15 @@ class Counts(NamedTuple):
     kept: int
     rows: int
     following: int
+    told: int
     ended: int
 
 
 class Steps(Protocol):
-    """The compiled steps of a core (still/kernel_state.CoreState, flow/core.FlowCore): they lend its state to kernels and take it back.
+    """The compiled steps of a core (still/kernel_state.CoreState, flow/core.FlowCore).
 
-    `walk` is a tuple of arrays of its own class, for which receive.py chooses the kernel; its `state` begins with the columns of
-    decide/still/kernels.py, its `rows` are decisions. `block_rows` are most of one block. `takes`: messages may be
+    `walk` is a tuple of arrays of its own class, for which receive.py chooses the kernel; its `state` is the record of the core
+    (decide/core_state.py), its `rows` are decisions. `block_rows` are most of one block. `takes`: messages may be
     taken now; `decides`: the kernel gives each label at once.
     """
 
@@ -75,10 +76,6 @@ class Steps(Protocol):
 
     @property
     def block_rows(self) -> int: ...
-
-    def load(self) -> None: ...
-
-    def store(self, state: I64) -> None: ...
 
     def rows(self, first: int, stop: int) -> npt.NDArray[np.void]: ...
 
@@ -100,8 +97,7 @@ class Kernel:
         from .receive import turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
-        self.state: I64 = steps.walk.state
-        self.rings: Rings = make_rings(self.state.size)
+        self.rings: Rings = make_rings()
         self.begin = self.end = _NOTHING
         self._kernel = turn
         self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
@@ -133,19 +129,16 @@ class Kernel:
             control[ring.FD] = fd
         control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
         control[ring.FLOOR_NS], control[ring.OPEN] = limits.floor_ns, self.steps.takes
-        self.steps.load()
         ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, control, self._scratch)
-        self._report(control, self.state)
+        self._report(control)
         return int(ended)
 
-    def _report(self, control: I64, state: I64) -> None:
+    def _report(self, control: I64) -> None:
         """Take over what a call, or a batch, says of itself."""
         self.reported, self.end = control, Counts._make(control[ring.ERRNO :].tolist())
         first, row = control[[ring.FIRST, ring.FIRST_ROW]].tolist()
         kept = int(control[ring.HALF]) * (ring.KEPT_BYTES // int(control[ring.HALVES]))
-        self.begin = Counts._make((0, 0, 0, *[first] * 6, kept, row, 0, 0))
-        if self.end.messages > first:
-            self.steps.store(state)
+        self.begin = Counts._make((0, 0, 0, *[first] * 6, kept, row, 0, 0, 0))
 
     # -- in a thread of its own ----------------------------------------------------------------------------------------
 
@@ -168,13 +161,12 @@ class Kernel:
         control = self.control
         control[ring.PATIENCE_NS], control[ring.FLOOR_NS], control[ring.OPEN] = patience_ns, floor_ns, self.steps.takes
         control[ring.BATCH_NS], control[ring.BATCH_MESSAGES] = batch_ns, BATCH_MESSAGES
-        self.steps.load()
 
     def receive_batch(self) -> bool:
         """Look at the batch that a serving kernel has handed over; False where there is none. `release` gives its half back."""
         if not self.control[ring.READY]:
             return False
-        self._report(self.rings.handed, self.rings.handed_state)
+        self._report(self.rings.handed)
         return True
 
     def release(self) -> bool:

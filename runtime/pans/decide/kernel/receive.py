@@ -225,9 +225,6 @@ def _hand_over(walk, rings, control, ended, scratch):  # type: ignore[no-untyped
     _report(walk, control, ended)
     for column in range(ring.N_CONTROL):
         rings.handed[column] = control[column]
-    for column in range(walk.state.size):
-        rings.handed_state[column] = walk.state[column]
-    walk.state[stream.MESSAGES] = walk.state[stream.EXPOSURES] = 0
     control[ring.HALF] = 1 - control[ring.HALF]
     _begin(walk, control)
     fence()  # the batch is whole before READY says so
@@ -323,14 +320,14 @@ def _begin(walk, control):  # type: ignore[no-untyped-def]
         control[column] = control[ring.FIRST]
     control[ring.KEPT] = half * (ring.KEPT_BYTES // halves)
     control[ring.URGENT] = 0
-    walk.state[core.N_ROWS] = control[ring.FIRST_ROW]
+    walk.state[0].n_rows = control[ring.FIRST_ROW]
 
 
 @inner
 def _report(walk, control, ended):  # type: ignore[no-untyped-def]
     """Complete what `control` says of the call, or batch, that ends."""
-    control[ring.STOP_ROW], control[ring.FOLLOWING] = walk.state[core.N_ROWS], walk.state[stream.NEXT_EXPOSURE]
-    control[ring.ENDED] = ended
+    control[ring.STOP_ROW], control[ring.FOLLOWING] = walk.state[0].n_rows, walk.state[0].next_exposure
+    control[ring.TOLD], control[ring.ENDED] = walk.state[0].told, ended
 
 
 @inner
@@ -395,7 +392,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
         if not _has_room(walk, control, stop - start):
             return ring.FULL
         if buffer[start] == _ACK and control[ring.DRIVES]:
-            if load_session(buffer, start) != walk.state[core.SESSION]:
+            if load_session(buffer, start) != walk.state[0].session:
                 return ring.ODD
             said = take_ack(buffer, _U(start), _U(stop), control)
             if said == IS_ODD:
@@ -406,7 +403,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
             continue
         if control[ring.SERVES] and (buffer[start] == _ACK or buffer[start] == _PONG):
             # an answer changes nothing that the core knows: the session gets it with the batch, from `answers`
-            if load_session(buffer, start) != walk.state[core.SESSION]:
+            if load_session(buffer, start) != walk.state[0].session:
                 return ring.ODD
             _keep(buffer, start, stop, rings.kept, rings.answers, ring.N_ANSWERS, control)
             control[ring.PLACE] += 1
@@ -416,7 +413,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
         decoded_ns = now_ns(scratch)
         took = take_message(walk, buffer, _U(start), _U(stop))
         if took >= core.TOOK_MARK:
-            stream.hear(buffer, _U(start), _U(stop), walk.heard, walk.state)
+            stream.hear(buffer, _U(start), _U(stop), walk.heard, walk.state[0])
         if took >= core.TOOK_BLOCK:
             control[ring.URGENT] |= took - core.TOOK_BLOCK
             decided_ns = now_ns(scratch)
@@ -437,7 +434,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
 @inner
 def load_session(buffer, start):  # type: ignore[no-untyped-def]
     """The session of the body at `start`, int64."""
-    return np.int64(load4(buffer, _U(start) + _U(4)))
+    return np.int64(load4(buffer, _U(start) + stream.SESSION_AT))
 
 
 @inner
@@ -449,7 +446,7 @@ def _has_room(walk, control, size):  # type: ignore[no-untyped-def]
         and control[ring.N_MESSAGES] < control[ring.LIMIT]
         and control[ring.N_ANSWERS] < control[ring.LIMIT]
         and control[ring.N_SHOWS] < control[ring.LIMIT]
-        and walk.state[core.N_ROWS] + control[ring.BLOCK_ROWS] <= control[ring.ROW_LIMIT]
+        and walk.state[0].n_rows + control[ring.BLOCK_ROWS] <= control[ring.ROW_LIMIT]
     )
 
 
@@ -472,7 +469,7 @@ def _put_step(walk, steps, control, decoded_ns, decided_ns, recorded_ns):  # typ
     step = steps[control[ring.N_STEPS]]
     step[ring.ARRIVAL], step[ring.DECODED] = control[ring.ARRIVAL_NS], decoded_ns
     step[ring.DECIDED], step[ring.RECORDED] = decided_ns, recorded_ns
-    step[ring.END_TICK], step[ring.ROWS] = walk.state[core.LAST_TICK], walk.state[core.N_ROWS]
+    step[ring.END_TICK], step[ring.ROWS] = walk.state[0].last_tick, walk.state[0].n_rows
     step[ring.MESSAGES], step[ring.SHOWS] = control[ring.N_MESSAGES], control[ring.N_SHOWS]
     control[ring.N_STEPS] += 1
     control[ring.BLOCK_NS] = control[ring.ARRIVAL_NS]
@@ -488,7 +485,7 @@ def unpack_blocks(kept, messages, stamps, bits):  # type: ignore[no-untyped-def]
     for i in range(messages.shape[0]):
         if messages[i, ring.WHAT] == stream.CLICKS:
             payload = _U(messages[i, ring.BEGIN] + stream.BODY_HEADER)
-            count = np.int64(load4(kept, payload + _U(28)) & _U(0xFFFF))
+            count = stream.block_count(kept, payload)
             if used + count > stamps.size:
                 break
             stream.unpack_clicks(kept, payload, count, stamps[used:], bits[used:])

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from pans.base.machine import inner, load4
-from pans.decide.still import kernels as core
+from pans.base.machine import inner, load2, load4
 from pans.protocol.session import COMMAND_WINDOW
-from pans.protocol.wire import HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS, crc32_span
+from pans.protocol.wire import ACK_DTYPE, HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS, crc32_span, payload_offsets
 from pans.protocol.wire import kernels as stream
 
 from . import arrays as ring
 from .system_calls import AGAIN, INTERRUPTED, now_ns, wait_for, write_now
 
 ACK_BYTES = STRUCTS["ACK"].size
+LAST_AT, REFUSED_AT, MASK_AT, STATUS_AT, TEXT_BYTES_AT = payload_offsets(
+    ACK_DTYPE, "last_id", "refused_id", "refused_mask", "status", "text_bytes"
+)
 ID_AT, EXPOSURE_AT = HEADER.size, HEADER.size + STRUCTS["COMMAND"].size
 TAIL_AT = EXPOSURE_AT + 8
 IS_ODD, IS_DONE, IS_REFUSED = range(3)  # what `take_ack` says of an acknowledgement
@@ -29,8 +31,8 @@ _U = np.uint64
 def following(walk, drive):  # type: ignore[no-untyped-def]
     """Exposure and state of the next step: of the walk under way, or of the next one when this one is over or lost."""
     slots, walks = drive.sizes[0], drive.sizes[1]
-    cycle = walk.state[stream.NEXT_EXPOSURE] // slots
-    step = drive.next_step[walk.state[stream.NEXT_EXPOSURE] - cycle * slots]
+    cycle = walk.state[0].next_exposure // slots
+    step = drive.next_step[walk.state[0].next_exposure - cycle * slots]
     if step < drive.slot_of.size:
         state = _walk_state(walk, cycle // walks, cycle % walks, step)
         if state >= 0:
@@ -41,7 +43,7 @@ def following(walk, drive):  # type: ignore[no-untyped-def]
 @inner
 def _walk_state(walk, visit, window, step):  # type: ignore[no-untyped-def]
     """As DecisionWindows.walk_state: -1 when the walk is over, or what came before is not known."""
-    if visit != walk.state[core.VISIT]:
+    if visit != walk.state[0].visit:
         return np.int64(0) if step == 0 else np.int64(-1)
     node = walk.windows.walks.nodes[window]
     known = 0 <= node < walk.windows.walks.successors.shape[0] and walk.windows.seen[window, 0] == step
@@ -82,7 +84,7 @@ def send_show(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-
     """Name what follows the exposures taken, unless that has been said; False when it could not be sent whole."""
     exposure, state = following(walk, drive)
     said = exposure == control[ring.SENT_EXPOSURE] and state == control[ring.SENT_STATE]
-    if said or exposure >= walk.state[stream.END_EXPOSURE]:
+    if said or exposure >= walk.state[0].end_exposure:
         return True
     unanswered = control[ring.NEXT_ID] - control[ring.OLDEST_ID]
     if control[ring.WAITING] or unanswered >= COMMAND_WINDOW:
@@ -130,15 +132,14 @@ def take_ack(buffer, start, stop, control):  # type: ignore[no-untyped-def]
     at = start + _U(stream.BODY_HEADER)
     if stop - at < _U(ACK_BYTES) or control[ring.WAITING]:
         return IS_ODD
-    last, refused = np.int64(load4(buffer, at)), np.int64(load4(buffer, at + _U(4)))
-    outcome = load4(buffer, at + _U(12))
-    status, text_bytes = outcome & _U(0xFFFF), outcome >> _U(16)
+    last, refused = np.int64(load4(buffer, at + LAST_AT)), np.int64(load4(buffer, at + REFUSED_AT))
+    status, text_bytes = load2(buffer, at + STATUS_AT), load2(buffer, at + TEXT_BYTES_AT)
     if stop - at != _U(ACK_BYTES) + text_bytes or text_bytes > _U(MAX_ACK_TEXT_BYTES) or (status and not refused):
         return IS_ODD
     oldest = control[ring.OLDEST_ID]
     if not oldest <= last < control[ring.NEXT_ID] or last - oldest > COMMAND_WINDOW:
         return IS_ODD
-    fresh = load4(buffer, at + _U(8)) & ((_U(2) << _U(last - oldest)) - _U(1))
+    fresh = load4(buffer, at + MASK_AT) & ((_U(2) << _U(last - oldest)) - _U(1))
     own = oldest >= control[ring.FIRST_ID]
     is_refused = refused == last and last == oldest and own and status != _U(0) and fresh == _U(1)
     if not is_refused and (fresh != _U(0) or refused >= oldest):

@@ -6,7 +6,7 @@ for bit. `Core.step` returns an `Output`; a window that overlaps a gap gives a d
 
 from __future__ import annotations
 
-import zlib
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,10 @@ from pans.decide.plan.plan import Plan
 from pans.protocol.wire import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark
 
 from .kernel_state import CoreState, IdleSteps
-from .windows import DecisionWindows, Window
+from .tables import decision_tables, undecided
+from .windows import DecisionWindows
 
-NO_FLAGS = DecisionFlag(0)
+_INCOMPLETE = int(DecisionFlag.INCOMPLETE | DecisionFlag.ABSTAINED)
 _NOT_MEASURED = int(DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN)
 
 
@@ -33,7 +34,9 @@ class Core(Follower):
     def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, guard: DarkGuard | None = None) -> None:
         super().__init__(plan, n_cycles, decider.n_classes or ANY_CLASS)  # 0: pictures
         self.guard = guard  # of the dark counts; None: they are only added up
-        self.windows = DecisionWindows(plan, decider.n_features, shots)
+        self._tables = decision_tables(decider, shots, plan)
+        own = self._tables if guard is None else undecided(self._tables)  # a guard sees each window, and has a say
+        self.windows = DecisionWindows(plan, decider.n_features, shots, own, self.state, self.tracker.heard)
         self.shots = shots
         self.decider = decider
         self._visits_before = 0  # in streams that have ended
@@ -61,7 +64,7 @@ class Core(Follower):
         if not self.takes:
             return super().steps(session)
         if self._bulk is None:
-            self._bulk = CoreState(self, self.windows, self.plan, self.decider, self.shots)
+            self._bulk = CoreState(self, self.windows, self._tables, self.decider, self.shots)
         if not self._session_known:
             self._bulk.begin(session)
             self._session_known = True
@@ -86,7 +89,7 @@ class Core(Follower):
     def watch_blocks(self, stamps: NDArray[np.uint16], bits: NDArray[np.uint8], first: int) -> list[Finding]:
         """Let the guard, which only warns, see exposures from `first` on that kernels have taken; `watch_objects` follows."""
         assert self.guard is not None
-        return self.guard.take(ClickBlock(0, 0, 0, first, 0, self.windows.position[2], stamps, bits))
+        return self.guard.take(ClickBlock(0, 0, 0, first, 0, self.windows.object_index, stamps, bits))
 
     def watch_objects(self, rows: NDArray[np.void]) -> None:
         """Let the guard see the decisions that the exposures of `watch_blocks` gave, DECISION_DTYPE (n,)."""
@@ -101,7 +104,7 @@ class Core(Follower):
         """
         assert self.guard is not None
         first = int(heads["exposure_index"][0])
-        events = self.guard.take(FrameBlock(0, 0, 0, first, 0, self.windows.position[2], words))
+        events = self.guard.take(FrameBlock(0, 0, 0, first, 0, self.windows.object_index, words))
         lit = cut_out(self.windows.lit, first, len(words))
         begins = np.cumsum(heads["count"], dtype=np.int64) - heads["count"]
         some = np.logical_or.reduceat(lit, begins)
@@ -118,23 +121,22 @@ class Core(Follower):
         return self.windows.fits(block)
 
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
-        decisions = []
+        parts = (
+            [] if self.windows.follows(block.exposure_index) else self.windows.skip_to(block.exposure_index, block.tick)
+        )
+        decisions = self._decided(parts)
         events = [] if self.guard is None else self.guard.take(block)
-        for window in self.windows.push(block):
-            before_end = (block.exposure_index + n_exposures - 1 - window.last_exposure) * block.period_ticks
-            decisions.append(self._decide(window, end_tick - before_end))
-        return Output(decisions, events, None)
+        rows = self.windows.push(block, end_tick - (n_exposures - 1) * block.period_ticks)
+        return Output([*decisions, *self._decided([rows])], events, None)
 
     def _skip_to(self, exposure_index: int, tick: int) -> Output:
-        return Output([self._decide(window, tick) for window in self.windows.skip_to(exposure_index)], [], None)
+        return Output(self._decided(self.windows.skip_to(exposure_index, tick)), [], None)
 
     def _give_up(self) -> Output:
         self._visits_before += self.windows.visits_begun
         if self.guard is not None:
             self.guard.restart()
-        windows = self.windows.restart()
-        decisions = [self._decide(window, self.last_tick, DecisionFlag.INCOMPLETE) for window in windows]
-        return Output(decisions, [], None)
+        return Output(self._decided(self.windows.restart(self.last_tick, _INCOMPLETE)), [], None)
 
     def _place(self) -> dict[str, Any] | None:
         if self.guard is not None and self.guard.policy != "warn":
@@ -148,47 +150,39 @@ class Core(Follower):
     def _nothing_left(self) -> bool:
         return self.windows.visits_begun * self.windows.visit_exposures >= self.end_exposure
 
-    def _decide(self, window: Window, tick: int, flags: DecisionFlag = NO_FLAGS) -> Decision:
+    def _decided(self, parts: Iterable[NDArray[np.void]]) -> list[Decision]:
+        """Return the decisions of rows, each part of one object, with the truth; where a back end is asked, it is here."""
+        decisions = list[Decision]()
+        for rows in parts:
+            if not len(rows):
+                continue
+            number = int(rows["object"][0])
+            mark = None if number == NO_OBJECT else self.marks.get(number)
+            rows["truth"] = UNKNOWN_TRUTH if mark is None else mark.truth
+            found = [Decision._make(row) for row in rows.tolist()]
+            if not self.windows.decides:
+                found = [self._judged(*both) for both in zip(found, self.windows.counts)]
+            decisions += found
+        return decisions
+
+    def _judged(self, row: Decision, counts: NDArray[np.int64]) -> Decision:
+        """Return a row that kernels have left to the back end, from the clicks of its window, int64 (d_f,)."""
+        flags, guard, decider = DecisionFlag(row.flags), self.guard, self.decider
         label, probability = NO_LABEL, 0.0
-        if window.missing:
-            flags |= DecisionFlag.GAP
-        if window.wrong:
-            flags |= DecisionFlag.WRONG_PATTERN
-        if flags:
-            flags |= DecisionFlag.ABSTAINED
-        elif self.guard is not None:
-            self.guard.take_object(window.counts, window.object_index)
-        decider = self.decider
-        if self.guard is not None:
-            flags |= self.guard.flags
-            decider = self.guard.decider(decider)
-        if flags & DecisionFlag.ABSTAINED:
-            self.n_abstained += 1
-        else:
-            label, probability = decider.decide(window.counts, self.shots)
-            if self.guard is not None:
-                self.guard.count_word(window.counts)
+        if guard is not None:
+            if not flags:
+                guard.take_object(counts, row.object)
+            flags |= guard.flags
+            decider = guard.decider(decider)
+        if not flags & DecisionFlag.ABSTAINED:
+            label, probability = decider.decide(counts, self.shots)
+            if guard is not None:
+                guard.count_word(counts)
             if not probability > 0:  # the scores were not finite: their label means nothing
                 flags |= DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
                 label, probability = NO_LABEL, 0.0
-                self.n_abstained += 1
             elif label == NO_LABEL:
                 flags |= DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED
-                self.n_abstained += 1
-        mark = self.marks.get(window.object_index)
-        decision = Decision(
-            number=self.n_decisions,
-            tick=tick,
-            exposure_index=window.last_exposure,
-            object=window.object_index,
-            shot=window.first_shot,
-            clicks=int(window.counts.sum()),
-            label=label,
-            truth=UNKNOWN_TRUTH if mark is None or window.object_index == NO_OBJECT else mark.truth,
-            flags=int(flags),
-            probability=probability,
-            counts_crc=zlib.crc32(window.counts.tobytes()),
-            exposures=window.exposures,
-        )
-        self.n_decisions += 1
-        return decision
+        if flags & DecisionFlag.ABSTAINED and not row.flags:  # kernels have counted the others
+            self.n_abstained += 1
+        return row._replace(label=label, probability=probability, flags=int(flags))

@@ -1,7 +1,7 @@
 """The kernel of the core: decoded CLICKS, FRAMES and MARK bodies in, rows of the decision log out.
 
-It takes the ordinary case: messages in order, nothing lost, blocks that fit the plan. Any other message it leaves untouched: its caller
-gives it to `still.Core`, whose state this kernel continues (kernel_state.py joins them). It never allocates.
+`take_frames` and `take_clicks` receive the ordinary message: in order, nothing lost, a block that fits the plan. Any other they leave
+untouched. Their caller gives it to `still.Core`, which goes on from the same state by `step_frames` or `step_clicks`. Nothing is allocated.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pans.base.machine import inner, load4, load8
+from pans.base.machine import bare, inner, load2, load4, load8, outer
 from pans.bundle.backends import NO_LABEL
 from pans.decide.decision import DecisionFlag
 from pans.protocol.wire import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 from pans.protocol.wire import kernels as stream
 
-from .windows import (
+from .window_kernels import (
     DARK_CLICKS,
     DARK_EXPOSURES,
     ONES,
@@ -26,6 +26,7 @@ from .windows import (
     add_exposures,
     add_walks,
     begin_visit,
+    clicks_of,
     complete,
     spill,
     sum_up,
@@ -59,6 +60,13 @@ class MarkArrays(NamedTuple):
     photons: npt.NDArray[np.float32]
 
 
+def make_marks() -> MarkArrays:
+    """Return the marks of no object."""
+    return MarkArrays(
+        np.full(MARK_SLOTS, -1, np.int64), np.full(MARK_SLOTS, 0, np.int16), np.full(MARK_SLOTS, 0, np.float32)
+    )
+
+
 class Block(NamedTuple):
     """An accepted block: its frames (of CLICKS: exposures) from `at` on in the buffer, from exposure `first`, `relative` in the visit, on.
 
@@ -79,12 +87,12 @@ class Block(NamedTuple):
 
 
 class WalkArrays(NamedTuple):
-    """What `take_clicks` continues: state int64 (N_STATE,), marks, windows, tables, rows DECISION_DTYPE (m,), counts int64 (m, d_f).
+    """What `take_clicks` continues: state CORE_DTYPE (1,), marks, windows, tables, rows DECISION_DTYPE (m,), counts int64 (m, d_f).
 
     `heard` is StreamTracker's: whoever calls the kernel fills it.
     """
 
-    state: npt.NDArray[np.int64]
+    state: npt.NDArray[np.void]
     marks: MarkArrays
     windows: WindowArrays
     tables: DecisionTables
@@ -108,9 +116,9 @@ class FrameWalkArrays(WalkArrays):
 
 
 class IdleArrays(NamedTuple):
-    """What the kernel has of a core that takes every message itself: state int64 (N_STATE,), rows DECISION_DTYPE (1,), `heard`."""
+    """What the kernel has of a core that takes every message itself: state CORE_DTYPE (1,), rows DECISION_DTYPE (1,), `heard`."""
 
-    state: npt.NDArray[np.int64]
+    state: npt.NDArray[np.void]
     rows: npt.NDArray[np.void]
     heard: npt.NDArray[np.int64]
 
@@ -120,10 +128,6 @@ class IdleArrays(NamedTuple):
         return take_nothing, ()
 
 
-# state, int64 (N_STATE,): where the stream (stream.N_PLACE columns) and the windows stand; what it continues of Core and DecisionWindows
-N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABSTAINED = range(stream.N_PLACE, stream.N_PLACE + 7)
-LAST_TICK, JITTER, EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK = range(N_ABSTAINED + 1, N_ABSTAINED + 7)
-PERIOD_TICKS, CYCLE_TICKS, N_CLASSES, N_STATE = range(START_TICK + 1, START_TICK + 5)
 # what `take_frames` and `take_clicks` return; TOOK_URGENT is a block of which the caller must know at once
 ODD, TOOK_MARK, TOOK_BLOCK, TOOK_URGENT = range(4)
 MARK_SLOTS = 4096  # as many objects as marks.MAX_MARKS
@@ -136,8 +140,9 @@ _NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
 
 
 @inner
-def take_frames(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+def take_frames(buffer, start, stop, states, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Take a message of a stream of frames, from `start` to `stop`, uint64; ODD, and nothing done, where it is not ordinary."""
+    state = states[0]
     if not is_ours(buffer, start, stop, state):
         return ODD
     kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
@@ -146,16 +151,14 @@ def take_frames(buffer, start, stop, state, marks, windows, tables, rows, counts
     if kind != stream.FRAMES or not _accept_frames(buffer, payload, stop, state, windows):
         return ODD
     block = _block_of(buffer, payload, state, marks, windows)
-    if tables.word_rows.shape[0]:
-        _take_words(buffer, block, state, windows, tables, rows)
-    else:
-        _take_windows(buffer, block, state, windows, tables, rows, counts_out)
+    _decide_frames(buffer, block, state, windows, tables, rows, counts_out)
     return _took(state, tables)
 
 
 @inner
-def take_clicks(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+def take_clicks(buffer, start, stop, states, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Take a message as `take_frames` does, of a stream of one detector's exposures."""
+    state = states[0]
     if not is_ours(buffer, start, stop, state):
         return ODD
     kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
@@ -164,7 +167,7 @@ def take_clicks(buffer, start, stop, state, marks, windows, tables, rows, counts
     if kind != stream.CLICKS or not _accept_clicks(buffer, payload, stop, state, windows):
         return ODD
     block = _block_of(buffer, payload, state, marks, windows)
-    _settle(block, state, windows, tables, rows, counts_out)
+    _settle(block, state, windows, tables, rows, counts_out, 0)
     return _took(state, tables)
 
 
@@ -177,7 +180,7 @@ def take_nothing(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
 @inner
 def _took(state, tables):  # type: ignore[no-untyped-def]
     """TOOK_URGENT where a back end that is not the kernel's has to decide."""
-    return TOOK_URGENT if tables.labels.size == 0 and state[N_ROWS] > 0 else TOOK_BLOCK
+    return TOOK_URGENT if tables.labels.size == 0 and state.n_rows > 0 else TOOK_BLOCK
 
 
 @inner
@@ -186,7 +189,7 @@ def is_ours(buffer, start, stop, state):  # type: ignore[no-untyped-def]
     return (
         stop >= start + _U(stream.BODY_HEADER)
         and stream.is_plain(buffer, start)
-        and load4(buffer, start + _U(4)) == _U(state[SESSION])
+        and load4(buffer, start + stream.SESSION_AT) == _U(state.session)
     )
 
 
@@ -195,12 +198,13 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
     """Remember an object's truth; False, and nothing done, when the message is not the next one."""
     if not stream.is_next_mark(buffer, payload, stop, state):
         return False
-    number, first = np.int64(load4(buffer, payload + _U(4))), np.int64(load8(buffer, payload + _U(12)))
-    fits = load4(buffer, payload + _U(8)) >> _U(16) == _U(0)  # it stands still
-    fits = (
-        fits and number < _NO_OBJECT and number * state[VISIT_EXPOSURES] == first and first < state[stream.END_EXPOSURE]
+    number, first = (
+        np.int64(load4(buffer, payload + stream.MARK_OBJECT_AT)),
+        np.int64(load8(buffer, payload + stream.MARK_FIRST_AT)),
     )
-    if not fits or not stream.mark_fits(buffer, payload, state, state[N_CLASSES]):
+    fits = load2(buffer, payload + stream.HALF_AT) == _U(0)  # it stands still
+    fits = fits and number < _NO_OBJECT and number * state.visit_exposures == first and first < state.end_exposure
+    if not fits or not stream.mark_fits(buffer, payload, state, state.n_classes):
         return False
     slot = number % MARK_SLOTS
     if marks.objects[slot] == number:
@@ -236,84 +240,159 @@ def _accept_clicks(buffer, payload, stop, state, windows):  # type: ignore[no-un
                 return False
     if not _accept(buffer, payload, count, state, windows):
         return False
-    relative = state[stream.NEXT_EXPOSURE] - count - state[VISIT] * state[VISIT_EXPOSURES]
-    counts, seen, tallies, maps = windows.counts, windows.seen, windows.tallies, (windows.feature_at, windows.window_at)
-    if n_states:
-        add_walks(relative, stamps, bits, maps, windows.walks, counts, seen, tallies)
-    else:
-        add_exposures(relative, stamps, bits, windows.feature_at, windows.window_at, counts, seen, tallies)
+    _add_clicks(state.next_exposure - count - state.visit * state.visit_exposures, stamps, bits, windows)
     return True
+
+
+@inner
+def _add_clicks(relative, stamps, bits, windows):  # type: ignore[no-untyped-def]
+    """Count exposures from `relative` in the visit on: the patterns shown, and the clicks or photon numbers."""
+    counts, seen, tallies = windows.counts, windows.seen, windows.tallies
+    feature_at, window_at = windows.feature_at, windows.window_at
+    if windows.walks.successors.shape[0]:
+        add_walks(relative, stamps, bits, (feature_at, window_at), windows.walks, counts, seen, tallies)
+    else:
+        add_exposures(relative, stamps, bits, feature_at, window_at, counts, seen, tallies)
 
 
 @inner
 def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-def]
     """Account for the next block, of `count` exposures, if it fits the plan; else False, and nothing done."""
-    first = state[stream.NEXT_EXPOSURE]
-    visit = first // state[VISIT_EXPOSURES]
-    if first + count > (visit + 1) * state[VISIT_EXPOSURES]:
+    first = state.next_exposure
+    visit = first // state.visit_exposures
+    if first + count > (visit + 1) * state.visit_exposures:
         return False
     tick, period = stream.block_times(buffer, payload)
-    number = np.int64(load4(buffer, payload + _U(32)))
+    number = np.int64(load4(buffer, payload + stream.OBJECT_AT))
     if number != visit % _NO_OBJECT and number != _NO_OBJECT:
         return False
-    if period != state[PERIOD_TICKS] or tick < planned_tick(first, state, windows.offsets) - period:
+    if period != state.period_ticks or tick < planned_tick(first, state, windows.offsets) - period:
         return False
-    if not _is_due(visit, first - visit * state[VISIT_EXPOSURES], state, windows):
+    if not _is_due(visit, first - visit * state.visit_exposures, state, windows):
         return False
-    if visit != state[VISIT]:
-        begin_visit(windows)
-        state[VISIT] = visit
-        state[NEXT_WINDOW] = 0
-    state[OBJECT] = number
+    _enter(visit, number, state, windows)
     stream.go_on(state, count)
     note_end(tick, count, state, windows.offsets)
     return True
 
 
 @inner
+def _enter(visit, number, state, windows):  # type: ignore[no-untyped-def]
+    """Begin `visit` with object `number` before the detector, unless it is under way."""
+    if visit != state.visit:
+        begin_visit(windows)
+        state.visit = visit
+        state.next_window = 0
+    state.object_index = number
+
+
+@inner
 def planned_tick(exposure, state, offsets):  # type: ignore[no-untyped-def]
     """When an exposure begins by the plan."""
     cycle = exposure // offsets.size
-    return state[START_TICK] + cycle * state[CYCLE_TICKS] + offsets[exposure - cycle * offsets.size]
+    return state.start_tick + cycle * state.cycle_ticks + offsets[exposure - cycle * offsets.size]
 
 
 @inner
 def note_end(tick, count, state, offsets):  # type: ignore[no-untyped-def]
     """Note when the last of `count` exposures that were accounted for ended, and how far that is from the plan's time."""
-    state[LAST_TICK] = tick + (count - 1) * state[PERIOD_TICKS] + state[EXPOSURE_TICKS]
-    due = planned_tick(state[stream.NEXT_EXPOSURE] - 1, state, offsets) + state[EXPOSURE_TICKS]
-    state[JITTER] = max(state[JITTER], abs(state[LAST_TICK] - due))
+    state.last_tick = tick + (count - 1) * state.period_ticks + state.exposure_ticks
+    due = planned_tick(state.next_exposure - 1, state, offsets) + state.exposure_ticks
+    state.jitter_ticks = max(state.jitter_ticks, abs(state.last_tick - due))
 
 
 @inner
 def _is_due(visit, relative, state, windows):  # type: ignore[no-untyped-def]
     """Whether no window waits that ended before exposure `relative` of `visit`: a block before this one may have been left out."""
     n_windows = windows.last.size
-    if visit == state[VISIT]:
-        return state[NEXT_WINDOW] == n_windows or windows.last[state[NEXT_WINDOW]] >= relative
-    return visit == state[VISIT] + 1 and state[NEXT_WINDOW] == n_windows and windows.longest[1, 0] >= relative
+    if visit == state.visit:
+        return state.next_window == n_windows or windows.last[state.next_window] >= relative
+    return visit == state.visit + 1 and state.next_window == n_windows and windows.longest[1, 0] >= relative
 
 
 @inner
 def _block_of(buffer, payload, state, marks, windows):  # type: ignore[no-untyped-def]
-    shape = load4(buffer, payload + _U(28))
-    first = np.int64(load8(buffer, payload + _U(16)))
+    first = np.int64(load8(buffer, payload + stream.FIRST_AT))
     tick, period = stream.block_times(buffer, payload)
-    number = state[OBJECT]
+    number = state.object_index
     known = number != _NO_OBJECT and marks.objects[number % MARK_SLOTS] == number
     truth = np.int64(marks.truths[number % MARK_SLOTS]) if known else np.int64(_UNKNOWN)
     return Block(
-        np.int64(shape & _U(0xFFFF)),
-        shape >> _U(16),
+        stream.block_count(buffer, payload),
+        load2(buffer, payload + stream.WIDTH_AT),
         payload + _U(stream.BLOCK_HEADER),
         first,
-        first - state[VISIT] * state[VISIT_EXPOSURES],
-        tick + state[EXPOSURE_TICKS],
+        first - state.visit * state.visit_exposures,
+        tick + state.exposure_ticks,
         period,
         number,
         truth,
-        np.int64(0xFF >> (8 * windows.lanes.size - windows.counts.shape[1])),
+        _top_mask(windows),
     )
+
+
+@inner
+def _top_mask(windows):  # type: ignore[no-untyped-def]
+    return np.int64(0xFF >> (8 * windows.lanes.size - windows.counts.shape[1]))
+
+
+# -- an irregular message --------------------------------------------------------------------------------------------------
+
+
+@outer
+def step_clicks(walk, visit, relative, count, number, tick, period, flags):  # type: ignore[no-untyped-def]
+    """Count `count` exposures of object `number`, in `stamps` and `bits`, from exposure `relative` of `visit` on, and settle windows.
+
+    Without exposures, those before `relative` are settled that will never be complete, visit by visit: False where more are left, or the
+    rows are full. Before exposures all is settled. Exposure e of the visit ends at `tick` + e * `period`; `flags` go with each row.
+    """
+    walk = bare(walk)
+    state, windows = walk.state[0], walk.windows
+    if count:
+        _enter(visit, number, state, windows)
+        _add_clicks(relative, windows.stamps[:count], windows.bits[:count], windows)
+    return _settle_visit(walk, visit, relative + count, tick, period, flags)
+
+
+@outer
+def step_frames(walk, words, width, visit, relative, number, tick, period, flags):  # type: ignore[no-untyped-def]
+    """As `step_clicks`, of frames: uint8 words of `width` bytes behind one another."""
+    walk = bare(walk)
+    state, windows = walk.state[0], walk.windows
+    if words.size == 0:
+        return _settle_visit(walk, visit, relative, tick, period, flags)
+    _enter(visit, number, state, windows)
+    count, first = np.int64(words.size) // width, visit * state.visit_exposures + relative
+    times, unknown = tick + relative * period, np.int64(_UNKNOWN)
+    block = Block(count, _U(width), _U(0), first, relative, times, period, number, unknown, _top_mask(windows))
+    _decide_frames(words, block, state, windows, walk.tables, walk.rows, walk.counts)
+    return True
+
+
+@inner
+def _settle_visit(walk, visit, relative, tick, period, flags):  # type: ignore[no-untyped-def]
+    """Settle the windows of the visit under way, before `relative` if it is `visit`; False when more are left, or rows are full."""
+    state, windows, zero = walk.state[0], walk.windows, np.int64(0)
+    end, first = relative if state.visit >= visit else state.visit_exposures, state.visit * state.visit_exposures
+    block = Block(end, _U(0), _U(0), first, zero, tick, period, state.object_index, np.int64(_UNKNOWN), zero)
+    _settle(block, state, windows, walk.tables, walk.rows, walk.counts, flags)
+    if state.visit >= visit:
+        return state.n_rows < walk.rows.size
+    if state.n_rows < walk.rows.size:
+        _enter(state.visit + 1, np.int64(_NO_OBJECT), state, windows)
+    return False
+
+
+# -- the windows of a block ------------------------------------------------------------------------------------------------
+
+
+@inner
+def _decide_frames(buffer, block, state, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Count the frames of `block` and decide on the windows that they complete."""
+    if tables.word_rows.shape[0]:
+        _take_words(buffer, block, state, windows, tables, rows)
+    else:
+        _take_windows(buffer, block, state, windows, tables, rows, counts_out)
 
 
 @inner
@@ -321,7 +400,7 @@ def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no
     """K = 1 with a table: every frame with light is a window, every word a row of the table."""
     window_at, tallies, n_features = windows.window_at, windows.tallies, windows.counts.shape[1]
     word_rows, word_crc, last = tables.word_rows, tables.word_crc, _U(tables.word_rows.shape[0] - 1)
-    at, n = block.at, state[N_ROWS]
+    at, n = block.at, state.n_rows
     for i in range(block.frames):
         top = _U(buffer[at + last]) & _U(block.top_mask)
         clicks, index, crc = ONES[top], word_rows[last, top], tables.crc_zero[0] ^ word_crc[last, top]
@@ -339,8 +418,8 @@ def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no
         label, probability, flags = _look_up(tables.labels, tables.probabilities, index)
         _put_row(rows[n], state, block, i, here, (clicks, label, flags, probability, crc))
         n += 1
-        state[NEXT_WINDOW] = here + 1
-    state[N_ROWS] = n
+        state.next_window = here + 1
+    state.n_rows = n
 
 
 @inner
@@ -349,8 +428,8 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
     window_at, last, counts, seen = windows.window_at, windows.last, windows.counts, windows.seen
     lanes, whole, tallies = windows.lanes, windows.whole, windows.tallies
     labels, probabilities, radix, crc_table = tables.labels, tables.probabilities, tables.radix, tables.crc
-    n_features, n_lanes, crc_zero, shots = counts.shape[1], lanes.size, tables.crc_zero[0], state[SHOTS]
-    n_rows, at = state[N_ROWS], block.at
+    n_features, n_lanes, crc_zero, shots = counts.shape[1], lanes.size, tables.crc_zero[0], state.shots
+    n_rows, at = state.n_rows, block.at
     window, held = np.int64(-1), np.int64(0)  # `held` frames of `window` are in the lanes
     for i in range(block.frames):
         here = np.int64(window_at[block.relative + i])
@@ -384,10 +463,10 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
             _keep_counts(counts_out, np.int64(n_rows), whole)
         _put_row(rows[n_rows], state, block, i, here * shots, (clicks, label, flags, probability, crc))
         n_rows += 1
-        state[NEXT_WINDOW] = here + 1
+        state.next_window = here + 1
     if held:
         spill(lanes, counts, seen, window, held)
-    state[N_ROWS] = n_rows
+    state.n_rows = n_rows
 
 
 @inner
@@ -398,29 +477,33 @@ def _keep_counts(counts_out, row, counts):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _settle(block, state, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
-    """Rows of the windows that CLICKS `block`, whose exposures are counted, settles."""
+def _settle(block, state, windows, tables, rows, counts_out, given):  # type: ignore[no-untyped-def]
+    """Write a row, with the `given` flags, for each window that is complete or ends before CLICKS `block`, which is counted.
+
+    Windows stay in order: one that is complete waits for none, since shots end in the order of their last exposure.
+    """
     need, last, counts, seen = windows.walks.need, windows.last, windows.counts, windows.seen
     end, n_states = block.relative + block.frames, windows.walks.successors.shape[0]
-    while state[NEXT_WINDOW] < counts.shape[0]:
-        index = state[NEXT_WINDOW]
+    while state.next_window < counts.shape[0] and state.n_rows < rows.size:
+        index = state.next_window
         right, wrong = seen[index, 0], seen[index, 1]
         if right < need[index] and last[index] >= end:
             return
-        clicks, row, crc = sum_up(counts[index], tables.radix, tables.crc, tables.crc_zero[0])
+        decided_on = clicks_of(counts[index], windows.whole)
+        clicks, row, crc = sum_up(decided_on, tables.radix, tables.crc, tables.crc_zero[0])
         label, probability = np.int64(_NO_LABEL), np.float32(0.0)
-        flags = (_WRONG if wrong else 0) | (_GAP if right + wrong < need[index] else 0)
+        flags = given | (_WRONG if wrong else 0) | (_GAP if right + wrong < need[index] else 0)
         if flags == 0 and tables.labels.size:
             row = windows.walks.nodes[index] - n_states if n_states else row
             label, probability, flags = _look_up(tables.labels, tables.probabilities, row)
         elif flags == 0:
-            _keep_counts(counts_out, state[N_ROWS], counts[index])
+            _keep_counts(counts_out, state.n_rows, decided_on)
         decided = (clicks, label, flags, probability, crc)
-        here = rows[state[N_ROWS]]
-        _put_row(here, state, block, last[index] - block.relative, index * state[SHOTS], decided)
+        here = rows[state.n_rows]
+        _put_row(here, state, block, last[index] - block.relative, index * state.shots, decided)
         here["exposures"] = right if n_states else 0
-        state[N_ROWS] += 1
-        state[NEXT_WINDOW] += 1
+        state.n_rows += 1
+        state.next_window += 1
 
 
 @inner
@@ -435,7 +518,7 @@ def _look_up(labels, probabilities, index):  # type: ignore[no-untyped-def]
 @inner
 def _put_row(row, state, block, i, shot, decided):  # type: ignore[no-untyped-def]
     """Write the decision `decided` (clicks, label, flags, probability, checksum) on a window that frame `i` ends, and count it."""
-    row["index"] = state[N_DECISIONS]
+    row["index"] = state.n_decisions
     row["tick"] = block.end_tick + i * block.period_ticks
     row["exposure_index"] = block.first + i
     row["object"] = block.object
@@ -448,5 +531,5 @@ def _put_row(row, state, block, i, shot, decided):  # type: ignore[no-untyped-de
     row["probability"] = probability
     row["counts_crc"] = crc
     row["exposures"] = 0
-    state[N_DECISIONS] += 1
-    state[N_ABSTAINED] += flags != 0
+    state.n_decisions += 1
+    state.n_abstained += flags != 0

@@ -1,7 +1,8 @@
 """Exposures -> windows: the K-shot click counts of each object, complete or reported incomplete, in a fixed order.
 
-`DecisionWindows.push` returns the windows that a block completes or
-that can no longer become complete; each exposure is counted once, and dark slots are tallied apart.
+`DecisionWindows.push` returns a row for each window that a block completes, `skip_to` one for each that can no longer become complete.
+Each exposure is counted once, and dark slots are tallied apart. Both are for the irregular message: the kernel of a call (kernels.py)
+goes on from the same `walk` with all others.
 
 A *visit* is the time one object stands before the detector (`cycles_per_object` cycles); its shots are grouped by K into windows. With an
 automaton a window is one walk, and a cycle holds one: its clicks so far say which state each exposure must have shown.
@@ -9,239 +10,60 @@ automaton a window is one walk, and a cycle holds one: its clicks so far say whi
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pans.base.errors import PlanError
-from pans.base.machine import inner, outer
+from pans.decide.core_state import CORE_DTYPE
+from pans.decide.decision import DECISION_DTYPE
 from pans.decide.plan.plan import Plan
+from pans.protocol.tracker import StateField
 from pans.protocol.wire import ADAPTIVE_PATTERN, DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock, read_only
 
-DARK_EXPOSURES, DARK_CLICKS, WRONG_PATTERNS, LATE_SLOTS, N_TALLIES = 0, 1, 2, 3, 4
-_U = np.uint64
-_LANE = _U(0xFF)
-SPREAD = np.array([sum((byte >> bit & 1) << 8 * bit for bit in range(8)) for byte in range(256)], np.uint64)
-ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
-BROKEN = -1  # where a walk stands whose exposure was lost or showed the wrong state: nobody knows
+from . import kernels
+from .kernels import DecisionTables, FrameWalkArrays, WalkArrays, make_marks
+from .tables import no_tables
+from .window_kernels import N_TALLIES, Walks, WindowArrays
 
-
-class Walks(NamedTuple):
-    """The walks of the visit under way, one per window; arrays of length 0 where the patterns are fixed.
-
-    `successors` uint32 (states, outcomes). `nodes` int64 (windows,) is where each walk stands: a state, `states` + a leaf, or BROKEN.
-    `need` int64 (windows,) is how many right exposures make it whole, `last` int64 (windows,) the last exposure of the visit that belongs
-    to it. `shown` and `clicked` int64 (states,) count the exposures of each state in the whole run, and those with a click.
-    """
-
-    successors: npt.NDArray[np.uint32]
-    nodes: npt.NDArray[np.int64]
-    need: npt.NDArray[np.int64]
-    last: npt.NDArray[np.int64]
-    shown: npt.NDArray[np.int64]
-    clicked: npt.NDArray[np.int64]
-
-
-class WindowArrays(NamedTuple):
-    """The open windows of one visit (arrays of window.DecisionWindows) and the kernel's scratch.
-
-    `offsets` int64 (slots of a cycle,) are the ticks at which exposures begin, as decide/follower.py's rules have them.
-    `lanes` uint64 (ceil(d_f / 8),) counts eight channels each, a byte per channel; `whole` int64 (d_f,) is one window's counts.
-    `stamps` uint16 and `bits` uint8 (65535,) are the patterns shown and the clicks of the latest CLICKS block.
-    """
-
-    feature_at: npt.NDArray[np.int32]
-    window_at: npt.NDArray[np.int32]
-    last: npt.NDArray[np.int64]
-    counts: npt.NDArray[np.int64]
-    seen: npt.NDArray[np.int64]
-    tallies: npt.NDArray[np.int64]
-    walks: Walks
-    longest: npt.NDArray[np.int64]
-    lanes: npt.NDArray[np.uint64]
-    whole: npt.NDArray[np.int64]
-    offsets: npt.NDArray[np.int64]
-    stamps: npt.NDArray[np.uint16]
-    bits: npt.NDArray[np.uint8]
-
-
-@outer
-def add_exposures(relative, patterns, bits, feature_at, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
-    """Add exposures `relative`... of a visit to its windows; see tests/oracles/naive_window.py for the meaning in plain loops.
-
-    patterns uint16 (n,), bits uint8 (n,) clicks or photon numbers, feature_at int32 and window_at int32 (visit,), counts int64
-    (windows, d_f), seen int64 (windows, 2) right and wrong exposures, tallies int64 (3,).
-    """
-    for i in range(patterns.shape[0]):
-        feature = feature_at[relative + i]
-        shown = patterns[i]
-        if feature < 0:
-            if shown == DARK_PATTERN:
-                tallies[DARK_EXPOSURES] += 1
-                tallies[DARK_CLICKS] += bits[i] != 0
-            else:
-                tallies[WRONG_PATTERNS] += 1
-            continue
-        window = window_at[relative + i]
-        if shown == feature:
-            counts[window, feature] += bits[i]
-            seen[window, 0] += 1
-        else:
-            tallies[WRONG_PATTERNS] += 1
-            seen[window, 1] += 1
-
-
-@outer
-def add_frames(relative, words, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
-    """Add frames of all channels `relative`... of a visit: words uint8 (n, bytes), bit c of a word is channel c.
-
-    window_at int32 (visit,), -1 for a dark frame; counts int64 (windows, d_f), seen int64 (windows, 2), tallies int64 (3,).
-    """
-    n_features = counts.shape[1]
-    for i in range(words.shape[0]):
-        window = window_at[relative + i]
-        for feature in range(n_features):
-            bit = (words[i, feature >> 3] >> (feature & 7)) & 1
-            if window < 0:
-                tallies[DARK_EXPOSURES] += 1
-                tallies[DARK_CLICKS] += bit
-            else:
-                counts[window, feature] += bit
-        if window >= 0:
-            seen[window, 0] += n_features
-
-
-@outer
-def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # type: ignore[no-untyped-def]
-    """Follow the walks of a visit through exposures `relative`...; tests/oracles/naive_window.py has the meaning in plain loops.
-
-    patterns uint16 (n,) are the states that the device says it showed, bits uint8 (n,) clicks, or photon numbers below `outcomes`; maps is
-    int32 (visit,) slots of the walk (-1: dark) and int32 (visit,) windows; walks Walks, counts int64 (windows, slots) the clicks, seen
-    int64 (windows, 2) right and wrong exposures, tallies int64 (N_TALLIES,). What stands in a walk behind its leaf must be dark, and so
-    counts for the dark counts. Behind a lost or a wrong exposure nothing is known of a walk: there, what says that it was dark counts as
-    dark, and all else for nothing.
-    """
-    slot_at, window_at = maps
-    successors, nodes, need, last, shown, clicked = walks
-    n_states = successors.shape[0]
-    for i in range(patterns.shape[0]):
-        slot, window, stamp = slot_at[relative + i], window_at[relative + i], patterns[i]
-        node = nodes[window] if slot >= 0 else n_states
-        if 0 <= node < n_states and seen[window, 0] != slot:
-            node = nodes[window] = BROKEN
-        if 0 <= node < n_states and stamp == node:
-            counts[window, slot] = bits[i]
-            seen[window, 0] += 1
-            shown[node] += 1
-            clicked[node] += bits[i] != 0
-            nodes[window] = np.int64(successors[node, bits[i]])
-            if nodes[window] >= n_states:
-                need[window], last[window] = seen[window, 0], relative + i
-        elif 0 <= node < n_states:
-            nodes[window] = BROKEN
-            seen[window, 1] += 1
-            need[window] = seen[window, 0] + seen[window, 1]
-            tallies[WRONG_PATTERNS] += 1
-            tallies[LATE_SLOTS] += stamp == DARK_PATTERN
-        elif stamp == DARK_PATTERN:
-            tallies[DARK_EXPOSURES] += 1
-            tallies[DARK_CLICKS] += bits[i] != 0
-        elif node != BROKEN:
-            tallies[WRONG_PATTERNS] += 1
-
-
-@inner
-def begin_visit(windows):  # type: ignore[no-untyped-def]
-    """No window has anything yet; element by element: numba takes seconds to compile the assignment of a slice."""
-    counts, seen, nodes = windows.counts, windows.seen, windows.walks.nodes
-    need, last, longest = windows.walks.need, windows.last, windows.longest
-    for window in range(counts.shape[0]):
-        for feature in range(counts.shape[1]):
-            counts[window, feature] = 0
-        seen[window, 0], seen[window, 1] = 0, 0
-        need[window], last[window] = longest[0, window], longest[1, window]
-    for walk in range(nodes.size):
-        nodes[walk] = 0
-
-
-@inner
-def complete(lanes, counts, seen, window, held, whole):  # type: ignore[no-untyped-def]
-    """The counts of a window whose last exposure has come, into `whole`."""
-    if seen[window, 0] != 0:  # it began in an earlier block
-        spill(lanes, counts, seen, window, held)
-        for feature in range(whole.size):
-            whole[feature] = counts[window, feature]
-    else:
-        unpack(lanes, whole)
-        seen[window, 0] = held * whole.size
-
-
-@inner
-def spill(lanes, counts, seen, window, held):  # type: ignore[no-untyped-def]
-    """Add the byte lanes to the counts of their window."""
-    n_features = counts.shape[1]
-    for p in range(lanes.size):
-        lane = lanes[p]
-        for feature in range(8 * p, min(8 * p + 8, n_features)):
-            counts[window, feature] += np.int64(lane & _LANE)
-            lane >>= _U(8)
-    seen[window, 0] += held * n_features
-
-
-@inner
-def unpack(lanes, whole):  # type: ignore[no-untyped-def]
-    """The byte lanes as counts: all of a window that one block holds."""
-    for p in range(lanes.size):
-        lane = lanes[p]
-        for feature in range(8 * p, min(8 * p + 8, whole.size)):
-            whole[feature] = np.int64(lane & _LANE)
-            lane >>= _U(8)
-
-
-@inner
-def sum_up(whole, radix, crc_table, crc):  # type: ignore[no-untyped-def]
-    """Clicks, row of the table and checksum of a window's counts."""
-    clicks, index = np.int64(0), np.int64(0)
-    for feature in range(whole.size):
-        count = whole[feature]
-        clicks += count
-        index += count * radix[feature]
-        crc ^= crc_table[0, feature, count & 0xFF]
-    for byte in range(1, crc_table.shape[0]):
-        for feature in range(whole.size):
-            crc ^= crc_table[byte, feature, (whole[feature] >> (8 * byte)) & 0xFF]
-    return clicks, index, crc
-
-
+_NO_WORDS = np.zeros(0, np.uint8)
+CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
 MAX_VISIT_EXPOSURES = 1 << 24
 WINDOWS_SEEN = 64
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
+Rows = npt.NDArray[np.void]
 
 
-class Window(NamedTuple):
-    """One object's K shots: `counts` int64 (d_f,) clicks per pattern, a view that is valid until the next `push`.
-
-    `first_shot` counts within the visit. `missing` exposures never came, `wrong` ones showed another pattern than planned: with
-    either above 0 no decision may be made from it. Of a walk: `counts` are the clicks per slot and channel, `exposures` how many it
-    took (0 where the patterns are fixed), and of the exposures that may be `missing` nobody knows how many the walk would have had.
-    """
-
-    object_index: int
-    first_shot: int
-    last_exposure: int
-    counts: I64
-    missing: int
-    wrong: int
-    exposures: int = 0
+def signed(number: int) -> int:
+    """Return the int64 with the low 64 bits of `number`: rows hold ticks and exposures as uint64, in which sums come out right."""
+    return number if number < 1 << 63 else number - (1 << 64)
 
 
 class DecisionWindows:
-    """Follows the visits of a run; all memory is allocated here, before arming."""
+    """Follows the visits of a run by the compiled steps of kernels.py; all memory is allocated here, before arming.
 
-    def __init__(self, plan: Plan, n_features: int, shots: int) -> None:
+    `walk` is what these steps go on from. `state` is the record of the core, CORE_DTYPE (1,), `heard` its tracker's; without them it
+    has its own. Without `tables` no window is decided, and `counts` are for a back end.
+    """
+
+    visit = StateField(CORE_DTYPE)  # under way
+    next_window = StateField(CORE_DTYPE)  # of the visit, to be settled
+    object_index = StateField(CORE_DTYPE)  # before the detector
+    n_rows = StateField(CORE_DTYPE)
+
+    def __init__(
+        self,
+        plan: Plan,
+        n_features: int,
+        shots: int,
+        tables: DecisionTables | None = None,
+        state: npt.NDArray[np.void] | None = None,
+        heard: I64 | None = None,
+    ) -> None:
         shots_per_object = plan.shots_per_cycle * plan.cycles_per_object
         if shots < 1 or shots_per_object % shots:
             raise PlanError(
@@ -257,20 +79,44 @@ class DecisionWindows:
             raise PlanError(f"an object takes {self.visit_exposures} exposures, allowed {MAX_VISIT_EXPOSURES}")
         self.tallies: I64 = np.zeros(N_TALLIES, np.int64)
         self._channels = plan.channels_at_once  # of several, a slot's clicks are one number until its window is settled
-        n_features //= self._channels
-        self._counts: I64 = np.zeros((self.n_windows, n_features), np.int64)
-        self._out: I64 = np.zeros((self.n_windows, n_features * self._channels), np.int64)
+        slots = n_features // self._channels
+        self._counts: I64 = np.zeros((self.n_windows, slots), np.int64)
         self._seen: I64 = np.zeros((self.n_windows, 2), np.int64)
         self._feature_at, self._window_at = visit_maps(plan, shots)
         self._last = _last_exposures(self._window_at, self.n_windows, self.visit_exposures)
-        self.walks = _make_walks(plan, n_features, shots, self._last)
-        self._need, self._last = self.walks.need, self.walks.last
-        self._adaptive = bool(len(self.walks.nodes))
-        self._longest: I64 = np.stack([self._need, self._last])  # at the beginning of a visit
+        self.walks = _make_walks(plan, slots, shots, self._last)
+        longest: I64 = np.stack([self.walks.need, self._last])  # at the beginning of a visit
         self.lit: npt.NDArray[np.bool_] = self._window_at >= 0  # by exposure of a visit
-        self._visit = 0
-        self._next_window = 0
-        self._object = NO_OBJECT
+        facts = np.zeros(1, CORE_DTYPE) if state is None else state
+        facts[0].visit_exposures, facts[0].shots, facts[0].object_index = self.visit_exposures, shots, NO_OBJECT
+        self.cells = facts.view(np.int64)
+        self._pushed = -1  # the exposure behind the latest block of `push`
+        one_by_one = 0 if self.parallel else CLICKS_MAX
+        arrays = WindowArrays(
+            *(
+                self._feature_at,
+                self._window_at,
+                self._last,
+                self._counts,
+                self._seen,
+                self.tallies,
+                self.walks,
+                longest,
+            ),
+            np.zeros(-(-n_features // 8), np.uint64),
+            np.zeros(n_features, np.int64),
+            plan.slot_offset_ticks.astype(np.int64),
+            np.full(one_by_one, 0, np.uint16),
+            np.full(one_by_one, 0, np.uint8),
+        )
+        if tables is None:
+            tables = no_tables(n_features, shots * plan.largest)
+        self.decides = bool(tables.labels.size)
+        rows = np.zeros(self.block_rows + 1, DECISION_DTYPE)  # more than one visit fills
+        self.counts: I64 = np.zeros((0 if self.decides else len(rows), n_features), np.int64)  # of the latest rows
+        marks, heard = make_marks(), np.full((1, 2), -1, np.int64) if heard is None else heard
+        kind = FrameWalkArrays if self.parallel else WalkArrays
+        self.walk = kind(facts, marks, arrays, tables, rows, self.counts, heard)
 
     def fits(self, block: ClickBlock | FrameBlock) -> bool:
         """Whether `block` is of the plan's kind, lies within one visit and has a bit for every channel: what `push` relies on.
@@ -287,50 +133,71 @@ class DecisionWindows:
                 return False
         return block.exposure_index % self.visit_exposures + n_exposures <= self.visit_exposures
 
-    def push(self, block: ClickBlock | FrameBlock) -> list[Window]:
-        """Count a block and return the windows that are settled by it, oldest first."""
+    @property
+    def block_rows(self) -> int:
+        """Most decisions of one block."""
+        return min(self.n_windows, CLICKS_MAX)
+
+    def push(self, block: ClickBlock | FrameBlock, end_tick: int = 0) -> Rows:
+        """Count a block that fits, and before which no window waits: after `skip_to`, or where it `follows` the latest block.
+
+        Its first exposure ends at `end_tick`. Returns the decisions on the windows that it completes, oldest first; they are valid until
+        the next call.
+        """
         visit, relative = divmod(block.exposure_index, self.visit_exposures)
-        settled = self._advance_to(visit)
-        self._object = block.object_index
+        times = signed(end_tick - relative * block.period_ticks), block.period_ticks, 0
         if isinstance(block, FrameBlock):
-            n_exposures = len(block.words)
-            add_frames(relative, block.words, self._window_at, self._counts, self._seen, self.tallies)
+            n, width = block.words.shape
+            words = np.array(block.words, np.uint8).reshape(-1)  # one type to the compiler, whatever the message is
+            rows, _ = self._run(kernels.step_frames, words, width, visit, relative, block.object_index, *times)
         else:
-            n_exposures = len(block.patterns)
-            self._add_clicks(relative, block.patterns, block.bits)
-        settled += self._settle(relative + n_exposures)
-        return settled
+            n, arrays = len(block.patterns), self.walk.windows
+            arrays.stamps[:n], arrays.bits[:n] = block.patterns, block.bits
+            rows, _ = self._run(kernels.step_clicks, visit, relative, n, block.object_index, *times)
+        self._pushed = block.exposure_index + n
+        return rows
 
-    def _add_clicks(self, relative: int, patterns: npt.NDArray[np.uint16], bits: npt.NDArray[np.uint8]) -> None:
-        maps = (self._feature_at, self._window_at)
-        if self._adaptive:
-            add_walks(relative, patterns, bits, maps, self.walks, self._counts, self._seen, self.tallies)
-        else:
-            add_exposures(relative, patterns, bits, *maps, self._counts, self._seen, self.tallies)
+    def follows(self, exposure_index: int) -> bool:
+        """Whether `exposure_index` follows the latest `push`, so that no window before it waits."""
+        return exposure_index == self._pushed
 
-    def skip_to(self, exposure_index: int) -> list[Window]:
-        """Report every window before `exposure_index` that will never be complete (a gap, or the end of the stream)."""
+    def skip_to(self, exposure_index: int, tick: int = 0, flags: int = 0) -> Iterator[Rows]:
+        """Settle every window before `exposure_index` that will never be complete (a gap, or the end of the stream).
+
+        Yields decisions at `tick`, with `flags`, which are valid until the next ones.
+        """
         visit, relative = divmod(exposure_index, self.visit_exposures)
-        return self._advance_to(visit) + self._settle(relative)
+        done = False
+        while not done:
+            rows, done = self._settled(visit, relative, signed(tick), flags)
+            yield rows
+
+    def _settled(self, visit: int, relative: int, tick: int, flags: int) -> tuple[Rows, bool]:
+        if self.parallel:
+            return self._run(kernels.step_frames, _NO_WORDS, 1, visit, relative, NO_OBJECT, tick, 0, flags)
+        return self._run(kernels.step_clicks, visit, relative, 0, NO_OBJECT, tick, 0, flags)
+
+    def _run(self, kernel: Any, *arguments: Any) -> tuple[Rows, Any]:
+        """Return the rows of `walk` that a compiled step writes, and what it returns; the rows of a call, and their number, stay."""
+        kept, self.n_rows = self.n_rows, 0
+        result = kernel(self.walk, *arguments)
+        rows, self.n_rows = self.walk.rows[: self.n_rows], kept
+        return rows, result
 
     @property
     def position(self) -> tuple[int, int, int]:
         """The visit under way, its next window to be settled, and the object before the detector; the kernel continues from here."""
-        return self._visit, self._next_window, self._object
+        return self.visit, self.next_window, self.object_index
 
     @position.setter
     def position(self, value: tuple[int, int, int]) -> None:
-        self.advance(value)
+        self.visit, self.next_window, self.object_index = value
         # at a leaf: what is left of the cycle is dark
-        self.walks.nodes[: self._next_window] = len(self.walks.successors)
-
-    def advance(self, position: tuple[int, int, int]) -> None:
-        """Take over a `position` to which a kernel has brought the same arrays."""
-        self._visit, self._next_window, self._object = position
+        self.walks.nodes[: self.next_window] = len(self.walks.successors)
 
     def walk_state(self, visit: int, window: int, step: int) -> int:
         """Return the state that a walk must show in its exposure number `step`; -1 when it is over, or what came before is not known."""
-        if visit != self._visit:
+        if visit != self.visit:
             return 0 if step == 0 else -1
         state = int(self.walks.nodes[window])
         known = 0 <= state < len(self.walks.successors) and self._seen[window, 0] == step
@@ -351,62 +218,21 @@ class DecisionWindows:
     @property
     def half_seen(self) -> bool:
         """Whether a window that is not settled holds exposures already."""
-        return bool(self._seen[self._next_window :].any())
-
-    def arrays(self) -> tuple[I32, I32, I64, I64, I64, I64, Walks, I64]:
-        """Return the arrays that hold the visit under way, the first eight of kernel_state.py."""
-        visit = self._counts, self._seen, self.tallies
-        return self._feature_at, self._window_at, self._last, *visit, self.walks, self._longest
+        return bool(self._seen[self.next_window :].any())
 
     @property
     def visits_begun(self) -> int:
         """Visits of which something has been seen or settled."""
-        return self._visit + (self._next_window > 0 or bool(self._seen.any()))
+        return self.visit + (self.next_window > 0 or bool(self._seen.any()))
 
-    def restart(self) -> list[Window]:
-        """Give up the visit under way and count from exposure 0 again; return its windows that were still open."""
-        open_windows = self._advance_to(self.visits_begun)
-        self._visit = 0
-        return open_windows
+    def restart(self, tick: int, flags: int) -> Iterator[Rows]:
+        """Give up the visit under way and count from exposure 0 again; yield its windows that were still open, as `skip_to` does."""
+        yield from self.skip_to(self.visits_begun * self.visit_exposures, tick, flags)
+        self.visit, self._pushed = 0, -1
 
     def warm_up(self) -> None:
-        """Compile or load the kernel that `push` will use, without counting anything."""
-        if self.parallel:
-            # a block's words are a read-only view of its message, which is a type of its own to the compiler
-            no_words = np.frombuffer(b"", np.uint8).reshape(0, 1)
-            add_frames(0, no_words, self._window_at, self._counts, self._seen, self.tallies)
-        else:
-            self._add_clicks(0, np.zeros(0, np.uint16), np.zeros(0, np.uint8))
-
-    def _advance_to(self, visit: int) -> list[Window]:
-        settled: list[Window] = []
-        while self._visit < visit:
-            settled += [window._replace(counts=window.counts.copy()) for window in self._settle(self.visit_exposures)]
-            self._visit += 1
-            self._next_window = 0
-            self._object = NO_OBJECT
-            self._counts[:] = 0
-            self._seen[:] = 0
-            self.walks.nodes[:] = 0
-            self._need[:], self._last[:] = self._longest
-        return settled
-
-    def _settle(self, relative_end: int) -> list[Window]:
-        """Windows stay in order: one that is complete waits for none, since shots end in the order of their last exposure."""
-        settled: list[Window] = []
-        while self._next_window < self.n_windows:
-            index = self._next_window
-            right, wrong = int(self._seen[index, 0]), int(self._seen[index, 1])
-            need = int(self._need[index])
-            if right < need and self._last[index] >= relative_end:
-                break
-            self._out[index] = self._clicks(index)
-            last = self._visit * self.visit_exposures + int(self._last[index])
-            exposures = right if self._adaptive else 0
-            missing, shot = need - right - wrong, index * self.shots
-            settled.append(Window(self._object, shot, last, self._out[index], missing, wrong, exposures))
-            self._next_window += 1
-        return settled
+        """Compile or load the kernel of `push` and `skip_to`, without counting anything."""
+        self._settled(self.visit, 0, 0, 0)
 
 
 def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:

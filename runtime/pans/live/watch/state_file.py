@@ -22,7 +22,6 @@ from pans.decide.still import DARK_CLICKS, DARK_EXPOSURES
 from pans.live.journal import words_of
 
 if TYPE_CHECKING:
-    from pans.decide.dark import DarkGuard
     from pans.live.run import LiveRun
     from pans.record.recorder import Recorder
 
@@ -61,7 +60,7 @@ def alarms_of(run: LiveRun) -> dict[str, dict[str, Any]]:
 
     A change of the light lasts to the end of the run. A rate is that at the finding, of several channels the highest.
     """
-    guard: DarkGuard | None = getattr(run.core, "guard", None)
+    guard = run.core.guard
     found = [] if guard is None else guard.serious
     alarms = dict.fromkeys(ALARMS, 0) | {one.kind: 1 for one in found}
     times = sorted((one.rate / one.expected, one.kind) for one in found if one.expected > 0)

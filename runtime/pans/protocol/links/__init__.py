@@ -11,7 +11,8 @@ pans.base.errors.UsageError: 'nothing' is no device URL
   remedy: write scheme:target, for example sim:ideal or serial:/dev/ttyACM0
 """
 
-from .base import LINKS, Link, TracedLink, checked_scheme, descriptor_of, link_facts, open_link
+from .base import LINKS, TracedLink, checked_scheme, descriptor_of, link_facts, open_link, opened_again
+from .link import Link
 from .reader import Chunk, LinkReader, count_delimiters
 from .serial import FTDI_SLOW_MS, latency_timer_ms
 from .usb import UsbLink
@@ -30,4 +31,5 @@ __all__ = [
     "latency_timer_ms",
     "link_facts",
     "open_link",
+    "opened_again",
 ]

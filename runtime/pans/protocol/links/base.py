@@ -8,46 +8,18 @@ from __future__ import annotations
 
 import re
 import threading
-import time
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pans.base.console import load_offered, package_of
 from pans.base.errors import LinkError, UsageError, refusing
 from pans.base.files import refuse_existing
 
+from .link import MEMBERS, Link, whole_link
 from .serial import SerialLink
 from .usb import UsbLink
-
-MEMBERS = ("name", "simulated", "virtual", "read", "write", "now_ns", "close")
-
-
-class Link(Protocol):
-    """An open connection to an instrument; a lab's own driver implements these and an opener (`pans.devices`).
-
-    `read` is called by two threads, never at once, and `write` by one of them, maybe while the other reads.
-    A link may also have `reopen() -> Link` (come back after an outage) and `pause(seconds)`; without them its URL is opened again. With
-    `fileno() -> int | None`, a non-blocking POSIX descriptor that carries the bytes as they are, the kernel reads and writes it.
-    A virtual one may have `read_ahead(timeout_s, frames, size, until_ns)`: many reads in one call, see reader.LinkReader.ahead.
-    """
-
-    name: str
-    simulated: bool
-    virtual: bool  # True: time passes only inside `read`, in one thread (the in-process simulator)
-
-    def read(self, timeout_s: float) -> bytes:
-        """Return what has arrived, b"" after `timeout_s` without data; LinkError when the link is gone."""
-
-    def write(self, data: bytes) -> None:
-        """Send all of `data`; LinkError when the link is gone."""
-
-    def now_ns(self) -> int:
-        """Return this link's host clock in nanoseconds (monotonic; its zero means nothing)."""
-
-    def close(self) -> None:
-        """Release the port; idempotent."""
 
 
 def open_link(url: str) -> Link:
@@ -107,13 +79,12 @@ def _checked_link(point: EntryPoint, url: str) -> Link:
             f"{package_of(point)} opens {url!r} as {type(link).__name__}, which has no {', '.join(missing)}",
             remedy="see docs/how-to/own-device.md for the members of a link",
         )
-    return link
+    return whole_link(link)
 
 
 def descriptor_of(link: Link) -> int | None:
     """Return the descriptor behind `link` that compiled code may read and write; None where there is none."""
-    own = getattr(link, "fileno", None)
-    found = None if own is None else own()
+    found = link.fileno()
     return found if isinstance(found, int) and found >= 0 else None
 
 
@@ -122,7 +93,16 @@ def link_facts(link: Link) -> dict[str, Any]:
     return {"name": link.name, "simulated": link.simulated, "virtual_time": link.virtual}
 
 
-class TracedLink:
+def opened_again(lost: Link, url: str) -> Link:
+    """Return the way back to a lost link: its own, else a new one to its URL; LinkError while there is none."""
+    found = lost.reopen()
+    if found is None:
+        lost.close()
+        found = open_link(url)
+    return found
+
+
+class TracedLink(Link):
     """A link around `link` that writes every byte of both directions to a text file; at most the last line of it is lost.
 
     One line per read or write: seconds since the link was opened, `>` to the device or `<` from it, then the bytes in hex.
@@ -134,8 +114,6 @@ class TracedLink:
         self._lock = threading.Lock()  # the reader's thread and the loop both write
         self._started_ns = link.now_ns()
         self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
-        self.now_ns = link.now_ns
-        self.pause: Any = getattr(link, "pause", time.sleep)
         with refusing(f"{path}: the trace cannot be written"):
             try:
                 if force:
@@ -161,15 +139,18 @@ class TracedLink:
         self._note(">", data.hex(" "))
         self._link.write(data)
 
+    def now_ns(self) -> int:
+        """See `Link.now_ns`."""
+        return self._link.now_ns()
+
+    def pause(self, seconds: float) -> None:
+        """See `Link.pause`."""
+        self._link.pause(seconds)
+
     def reopen(self) -> TracedLink:
         """Open the link again and go on with the same trace."""
         self._note("#", "opened again")
-        reopen = getattr(self._link, "reopen", None)
-        if reopen is not None:
-            self._link = reopen()
-        else:
-            self._link.close()
-            self._link = open_link(self._url)
+        self._link = opened_again(self._link, self._url)
         return self
 
     def close(self) -> None:

@@ -13,12 +13,12 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple
 
 from pans.base.errors import PansError
 
 if TYPE_CHECKING:
-    from .base import Link
+    from .link import Link
 
 LOOK_EVERY_S = 0.002  # how often the helper looks whether the loop is busy
 HELPER_POLL_S = 0.005  # and how long it may keep a loop that has come back waiting, if nothing arrives
@@ -102,9 +102,8 @@ class LinkReader:
         No more is read once `frames` delimiters or `size` bytes have come, the link's clock has passed `until_ns`, or a read brings nothing
         or fails: the next `wait` meets that again.
         """
-        many = getattr(self._link, "read_ahead", None)
-        if many is not None:
-            return cast(Sequence[tuple[int, bytes]], many(timeout_s, frames, size, until_ns))
+        if self._link.reads_ahead:
+            return self._link.read_ahead(timeout_s, frames, size, until_ns)
         chunks: list[Chunk] = []
         with suppress(PansError):  # kept
             while frames > 0 and size > 0 and self._link.now_ns() < until_ns and (more := self.wait(timeout_s)):

@@ -17,6 +17,8 @@ from typing import Any
 
 from pans.base.errors import LinkError, UsageError
 
+from .link import Link
+
 READ_BYTES = 1 << 16
 READ_POLL_S = 0.05
 WRITE_TIMEOUT_S = 2.0
@@ -24,7 +26,7 @@ TCP_ESTABLISHED = "01"  # in Linux's /proc/net/tcp
 FTDI_SLOW_MS = 2  # above it an adapter keeps bytes longer than a decision may take
 
 
-class SerialLink:
+class SerialLink(Link):
     """One open serial port; with a file descriptor the wait is select's, and one read returns all that is there."""
 
     simulated = False

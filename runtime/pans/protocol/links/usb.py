@@ -12,13 +12,14 @@ from typing import Any
 from pans.base.console import install
 from pans.base.errors import LinkError
 
+from .link import Link
 from .serial import not_opened, usb_target
 
 READ_BYTES = 1 << 16
 WRITE_TIMEOUT_MS = 2000
 
 
-class UsbLink:
+class UsbLink(Link):
     """An open USB device; `backend` is a usb.backend.IBackend (None: pyusb's choice, libusb)."""
 
     simulated = False

@@ -75,6 +75,7 @@ from .messages import (
     encode_mark,
 )
 from .schema import (
+    ACK_DTYPE,
     ADAPTIVE_PATTERN,
     AUTOMATON_SCHEMA,
     BLOCK_DTYPE,
@@ -105,10 +106,12 @@ from .schema import (
     MessageType,
     Opcode,
     StateReason,
+    payload_offsets,
     wrong_facts,
 )
 
 __all__ = [
+    "ACK_DTYPE",
     "ADAPTIVE_PATTERN",
     "AUTOMATON_SCHEMA",
     "BLOCK_DTYPE",
@@ -194,6 +197,7 @@ __all__ = [
     "messages",
     "pack_body",
     "pack_command",
+    "payload_offsets",
     "read_only",
     "state_dtype",
     "unpack_body",

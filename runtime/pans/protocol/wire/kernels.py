@@ -2,7 +2,8 @@
 
 Kernels take arrays and allocate nothing. `unstuff_frames` gives the frames and counts that the protocol document asks for
 (tests/runtime/protocol/wire/test_framing.py has a plain decoder). The kernel of the live loop takes messages that are in order and
-without loss, with the account of the stream's place in an array, and leaves all others to `StreamTracker`.
+without loss, and leaves all others to `StreamTracker`. Both go on from one record: `place` is its row, `place.next_seq` and so on
+(protocol/tracker.py, decide/core_state.py).
 """
 
 from __future__ import annotations
@@ -10,15 +11,31 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from pans.base.machine import as_float32, copy_span, inner, load4, load8, outer
+from pans.base.machine import as_float32, copy_span, inner, load2, load4, load8, outer
 
-from .schema import BLOCK_HEADER_BYTES, HEADER, MAX_GAP_EXPOSURES, RECEIVE_WINDOW, SCHEMA, STRUCTS, MessageType
+from .schema import (
+    BLOCK_DTYPE,
+    BLOCK_HEADER_BYTES,
+    HEADER,
+    MARK_DTYPE,
+    MAX_GAP_EXPOSURES,
+    RECEIVE_WINDOW,
+    SCHEMA,
+    STRUCTS,
+    MessageType,
+    payload_offsets,
+)
 
-# Where the stream stands, the first columns of a walk's state, int64: as StreamTracker knows it, the exposure at which the plan ends,
-# and what the walk has taken.
-NEXT_SEQ, NEXT_EXPOSURE, DROPS, END_EXPOSURE, MESSAGES, EXPOSURES, N_PLACE = range(7)
 CLICKS, FRAMES, MARK = int(MessageType.CLICKS), int(MessageType.FRAMES), int(MessageType.MARK)
 BODY_HEADER, BLOCK_HEADER, MARK_BYTES = HEADER.size, BLOCK_HEADER_BYTES, STRUCTS["MARK"].size
+# Where the fields stand in a payload. CLICKS, FRAMES and MARK begin with the sequence number.
+SEQ_AT, DROPS_AT, TICK_AT, FIRST_AT, PERIOD_AT, COUNT_AT, WIDTH_AT, OBJECT_AT = payload_offsets(
+    BLOCK_DTYPE, "seq", "drops", "tick", "exposure_index", "period_ticks", "count", "width", "object_index"
+)
+MARK_OBJECT_AT, TRUTH_AT, HALF_AT, MARK_FIRST_AT, MARK_TICK_AT, PHOTONS_AT = payload_offsets(
+    MARK_DTYPE, "object_index", "truth", "half_exposures", "exposure_index", "tick", "photons"
+)
+(SESSION_AT,) = payload_offsets(BLOCK_DTYPE, "session", begin=0)  # in the body
 LARGEST = np.uint64(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
 _INFINITE = np.uint64(0x7F800000)  # float32's bits: numbers from 0 on lie below, NaN above once the sign is taken away
 _MAGNITUDE = np.uint64(0x7FFFFFFF)
@@ -217,8 +234,7 @@ def next_block(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
     """
     if stop - payload <= _U(BLOCK_HEADER):
         return 0, 0
-    shape = load4(buffer, payload + _U(28))
-    count, width = np.int64(shape & _U(0xFFFF)), np.int64(shape >> _U(16))
+    count, width = block_count(buffer, payload), np.int64(load2(buffer, payload + WIDTH_AT))
     if np.int64(stop - payload) != BLOCK_HEADER + count * width or not _follows(buffer, payload, count, place):
         return 0, 0
     return count, width
@@ -229,11 +245,17 @@ def next_clicks(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
     """Exposures of the CLICKS payload from `payload` to `stop`; 0 where `next_block` would say so."""
     if stop - payload <= _U(BLOCK_HEADER):
         return 0
-    count = np.int64(load4(buffer, payload + _U(28)) & _U(0xFFFF))
+    count = block_count(buffer, payload)
     length = BLOCK_HEADER + 2 * count + (count + 7) // 8
     if np.int64(stop - payload) != length or not _follows(buffer, payload, count, place):
         return 0
     return count
+
+
+@inner
+def block_count(buffer, payload):  # type: ignore[no-untyped-def]
+    """Exposures of a block, int64."""
+    return np.int64(load2(buffer, payload + COUNT_AT))
 
 
 @inner
@@ -250,12 +272,12 @@ def unpack_clicks(buffer, payload, count, stamps, bits):  # type: ignore[no-unty
 def _follows(buffer, payload, count, place):  # type: ignore[no-untyped-def]
     """Whether a block of `count` exposures is the next one, without loss, within the plan and the range of its fields."""
     return not (
-        load4(buffer, payload) != _U(place[NEXT_SEQ])
-        or load4(buffer, payload + _U(4)) != _U(place[DROPS])
-        or load8(buffer, payload + _U(8)) >= LARGEST
-        or load8(buffer, payload + _U(16)) != _U(place[NEXT_EXPOSURE])
-        or load4(buffer, payload + _U(24)) == _U(0)
-        or place[NEXT_EXPOSURE] + count > place[END_EXPOSURE]
+        load4(buffer, payload + SEQ_AT) != _U(place.next_seq)
+        or load4(buffer, payload + DROPS_AT) != _U(place.drops)
+        or load8(buffer, payload + TICK_AT) >= LARGEST
+        or load8(buffer, payload + FIRST_AT) != _U(place.next_exposure)
+        or load4(buffer, payload + PERIOD_AT) == _U(0)
+        or place.next_exposure > place.end_exposure - count
     )
 
 
@@ -265,21 +287,21 @@ def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
 
     Its truth is compared with -1 alone here: how many classes there are, the caller knows.
     """
-    if stop - payload != _U(MARK_BYTES) or load4(buffer, payload) != _U(place[NEXT_SEQ]):
+    if stop - payload != _U(MARK_BYTES) or load4(buffer, payload + SEQ_AT) != _U(place.next_seq):
         return False
-    photons = load4(buffer, payload + _U(28))
+    photons = load4(buffer, payload + PHOTONS_AT)
     return (
         (photons < _INFINITE or photons & _MAGNITUDE > _INFINITE)
         and mark_truth(buffer, payload) >= -1
-        and load8(buffer, payload + _U(12)) < LARGEST
-        and load8(buffer, payload + _U(20)) < LARGEST
+        and load8(buffer, payload + MARK_FIRST_AT) < LARGEST
+        and load8(buffer, payload + MARK_TICK_AT) < LARGEST
     )
 
 
 @inner
 def mark_fits(buffer, payload, place, n_classes):  # type: ignore[no-untyped-def]
     """Whether a MARK's truth is one of `n_classes` or unknown, and its exposure near the stream's place, as decide/follower.py asks."""
-    away = np.int64(load8(buffer, payload + _U(12))) - place[NEXT_EXPOSURE]
+    away = np.int64(load8(buffer, payload + MARK_FIRST_AT)) - place.next_exposure
     near = -MAX_GAP_EXPOSURES <= away <= MAX_GAP_EXPOSURES
     return near and -1 <= mark_truth(buffer, payload) < n_classes
 
@@ -287,10 +309,12 @@ def mark_fits(buffer, payload, place, n_classes):  # type: ignore[no-untyped-def
 @inner
 def go_on(place, count):  # type: ignore[no-untyped-def]
     """Account for the next message, with `count` exposures."""
-    place[NEXT_SEQ] = (place[NEXT_SEQ] + 1) & 0xFFFFFFFF
-    place[MESSAGES] += 1
-    place[NEXT_EXPOSURE] += count
-    place[EXPOSURES] += count
+    place.next_seq = (place.next_seq + 1) & 0xFFFFFFFF
+    place.messages += 1
+    place.next_exposure += count
+    place.exposures += count
+    if count:
+        place.lost_before = 0  # what was lost before these exposures held none
 
 
 @inner
@@ -305,7 +329,7 @@ def hear(buffer, start, stop, heard, place):  # type: ignore[no-untyped-def]
 
     The CRC need not stand behind the body: it does not in a recording.
     """
-    number = (place[NEXT_SEQ] - 1) & 0xFFFFFFFF
+    number = (place.next_seq - 1) & 0xFFFFFFFF
     row = heard[number % _WINDOW]
     row[0], row[1] = number, np.int64(crc32_span(buffer, start, stop, _SCHEMA))
 
@@ -313,16 +337,16 @@ def hear(buffer, start, stop, heard, place):  # type: ignore[no-untyped-def]
 @inner
 def block_times(buffer, payload):  # type: ignore[no-untyped-def]
     """The tick at which a block's first exposure began, and the ticks from one to the next; int64."""
-    return np.int64(load8(buffer, payload + _U(8))), np.int64(load4(buffer, payload + _U(24)))
+    return np.int64(load8(buffer, payload + TICK_AT)), np.int64(load4(buffer, payload + PERIOD_AT))
 
 
 @inner
 def mark_photons(buffer, payload, photons, place):  # type: ignore[no-untyped-def]
     """Put a MARK's photons into `photons` float32 at `place`, bit for bit."""
-    photons[place] = as_float32(load4(buffer, payload + _U(28)))
+    photons[place] = as_float32(load4(buffer, payload + PHOTONS_AT))
 
 
 @inner
 def mark_truth(buffer, payload):  # type: ignore[no-untyped-def]
     """A MARK's truth, int64; -1: unknown."""
-    return np.int64(np.int16(np.uint16(load4(buffer, payload + _U(8)) & _U(0xFFFF))))
+    return np.int64(np.int16(np.uint16(load2(buffer, payload + TRUTH_AT))))

@@ -411,10 +411,24 @@ STRUCTS = {name: _struct(fields) for name, fields in _WHOLE.items()}
 HEADER = STRUCTS["HEADER"]
 UNSEEDED = (MessageType.HELLO, MessageType.WELCOME)  # readable across versions, so that a mismatch can be named
 SLOT_DTYPE = np.dtype([("offset_ticks", "<u8"), ("pattern", "<u2"), ("shot", "<u2")])
-# What CLICKS, FRAMES and COUNTS begin with, and MARK, behind the header of their frame; `width` is word_bytes, largest or nothing.
-BLOCK_DTYPE, MARK_DTYPE = (
+# The fixed part of CLICKS, FRAMES and COUNTS, of MARK and of ACK, with the header; `width` is word_bytes, largest or nothing.
+BLOCK_DTYPE, MARK_DTYPE, ACK_DTYPE = (
     np.dtype([(one.name.replace("word_bytes", "width"), f"<{one.code}") for one in (*_WHOLE["HEADER"], *_WHOLE[name])])
-    for name in ("FRAMES", "MARK")
+    for name in ("FRAMES", "MARK", "ACK")
 )
 BLOCK_HEADER_BYTES = STRUCTS["CLICKS"].size
+
+
+def payload_offsets(dtype: np.dtype[np.void], *names: str, begin: int = HEADER.size) -> tuple[np.uint64, ...]:
+    """Return the offsets of fields of BLOCK_DTYPE, MARK_DTYPE or ACK_DTYPE in the payload, uint64 as kernels add them.
+
+    With `begin` 0 they are those in the body.
+
+    >>> [int(offset) for offset in payload_offsets(BLOCK_DTYPE, "seq", "count")]
+    [0, 28]
+    """
+    assert dtype.fields is not None
+    return tuple(np.uint64(dtype.fields[name][1] - begin) for name in names)
+
+
 MAX_FRAME_BYTES = HEADER.size + MAX_PAYLOAD_BYTES + 4 + (MAX_PAYLOAD_BYTES + 12) // 254 + 2

@@ -144,7 +144,7 @@ class Snapshots:
         return {"shape": list(grey.shape), "grey": base64.b64encode(grey.tobytes()).decode()}
 
     def _dark(self) -> dict[str, Any]:
-        guard = getattr(self._run.core, "guard", None)
+        guard = self._run.core.guard
         if guard is None:
             return {}
         watch, facts = guard.watch, dict[str, Any]()

@@ -14,7 +14,7 @@ from heads import affine_head
 
 from pans.base.errors import DamagedFileError, UsageError
 from pans.bundle.backends.choose import make_decider
-from pans.bundle.backends.verdict import choice_of, softmax_winner
+from pans.bundle.backends.verdict import softmax_winner
 from pans.bundle.sensor import Bundle
 from pans.bundle.sensor.bundle import word_means
 
@@ -104,8 +104,8 @@ def test_the_choice_of_the_back_end() -> None:
     assert make_decider(both).name == "table"
     measured = make_decider(both, shots=2)
     assert measured.name in ("count-table", "sparse", "onnx")
-    assert choice_of(measured)["chosen"] == measured.name
-    assert set(choice_of(measured)["p50_us"]) == {"count-table", "sparse", "onnx"}
+    assert measured.choice["chosen"] == measured.name
+    assert set(measured.choice["p50_us"]) == {"count-table", "sparse", "onnx"}
     assert make_decider(both, backend="onnx").name == "onnx"
     only_table = made_bundle(3, 2, table=np.zeros((8, 2)))
     for wrong in ({"backend": "onnx"}, {"shots": 2}, {"backend": "gpu"}, {"shots": 0}):

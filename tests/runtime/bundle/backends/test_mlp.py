@@ -11,7 +11,7 @@ from pans.base.errors import UsageError
 from pans.bundle.backends.choose import make_decider
 from pans.bundle.backends.int8 import Int8Decider, SparseDecider, golden_counts
 from pans.bundle.backends.table import count_table, fits_count_table
-from pans.bundle.backends.verdict import softmax_winner, verdicts_of
+from pans.bundle.backends.verdict import softmax_winner
 from pans.bundle.heads.layers import Int8Head, Layer, quantise_head, read_layers, reference_scores
 from pans.bundle.making.cost import quantisation_cost
 from pans.bundle.sensor import Bundle, bundle_bytes, parse_bundle
@@ -58,7 +58,7 @@ def test_one_alone_and_many_give_the_same_bits(backend: str) -> None:
     decider = make_decider(head_bundle(layers, int8_head=quantise_head(layers)), backend=backend)
     for shots in (1, 5):
         counts = counts_of(10, shots)
-        labels, probabilities = verdicts_of(decider, counts, shots)
+        labels, probabilities = decider.verdicts(counts, shots)
         scores = decider.scores_batch(counts, shots)
         assert decider.decide_batch(counts, shots).tolist() == labels.tolist() == scores.argmax(axis=1).tolist()
         for row, label, probability, score in zip(counts, labels, probabilities, scores):

@@ -11,7 +11,7 @@ import pans
 from pans.base.errors import UsageError
 from pans.bundle.backends import Decider, make_decider
 from pans.bundle.backends import choose as backends
-from pans.bundle.backends.verdict import softmax_winner, verdicts_of
+from pans.bundle.backends.verdict import softmax_winner
 
 BUNDLE = pans.load_bundle("fashion10")
 LAB = """
@@ -51,7 +51,7 @@ def test_it_is_found_by_its_entry_point_and_need_not_know_of_many_objects(offer:
         make_decider(BUNDLE, backend="none")
     counts = np.array([[0] * 10, [1] + [0] * 9])
     assert lab().decide_batch(counts, 1).tolist() == [9, 1]
-    found = verdicts_of(lab(), counts, 1)
+    found = lab().verdicts(counts, 1)
     assert (found.labels.tolist(), found.probabilities.tolist()) == ([9, 1], [0.75, 0.5])
     for scores, (label, probability) in zip(lab().scores_batch(counts, 1), [(9, 0.75), (1, 0.5)]):
         assert softmax_winner(scores) == (label, pytest.approx(probability, abs=1e-6))

@@ -15,7 +15,6 @@ from pans import decide
 from pans.base.errors import UsageError
 from pans.bundle.backends import choose as backends
 from pans.bundle.backends import make_decider
-from pans.bundle.backends.verdict import choice_of
 from pans.bundle.heads.layers import quantise_head
 from pans.bundle.sensor import Bundle
 from pans.decide.dark.guard import make_adapter
@@ -70,7 +69,7 @@ def test_sums_of_several_shots_are_means(backend: str, shots: int, error: float,
 
 def test_one_shot_is_looked_up_and_its_choice_told(counted: Bundle) -> None:
     decider = make_decider(counted)
-    assert (decider.name, choice_of(decider)["why"]) == ("table", "one look-up per decision")
+    assert (decider.name, decider.choice["why"]) == ("table", "one look-up per decision")
     for wrong in ([0, 0, 3], [-1, 0, 0]):
         with pytest.raises(UsageError, match="numbers of 0 to 2"):
             decider.decide(np.array(wrong), 1)

@@ -33,7 +33,7 @@ def test_scan_finds_what_plain_loops_find_however_the_frames_are_cut(data: st.Da
     counts = [level for level, n in runs for _ in range(n)]
     background = Fraction(data.draw(st.integers(0, 1 << 12)), 1 << 16)
     limits = np.array([width, on, off, longest, hold, int(background * (1 << 16)), 2, 16, 0], np.int64)
-    state, words, ring = np.zeros(kernels.N_STATE, np.int64), np.zeros(256, np.uint64), np.zeros(256, np.int16)
+    state, words, ring = np.zeros(1, kernels.RING_DTYPE), np.zeros(256, np.uint64), np.zeros(256, np.int16)
     out, found, at = np.zeros((2, kernels.N_COLUMNS), np.int64), [], 0
     empty, dark = np.zeros(64, np.int64), np.zeros(64, np.int64)
     while at < len(counts):
@@ -46,7 +46,7 @@ def test_scan_finds_what_plain_loops_find_however_the_frames_are_cut(data: st.Da
             n = next((i for i, c in enumerate(part) if c is None), len(part))
             rows = np.array([[(1 << (c or 0)) - 1] for c in part[:n]], np.uint8)
             kernels.put_frames(rows, at, words, ring, 0, state, dark, np.uint64(2**64 - 1))
-            while state[kernels.NEXT] < at + n:
+            while state[0].next_exposure < at + n:
                 m = kernels.scan(at + n, words, ring, limits, state, empty, out)
                 found += out[:m].tolist()
         at += n

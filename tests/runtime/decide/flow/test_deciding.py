@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pans.bundle.backends.table import TableDecider
+from pans.decide.core_state import CORE_FIELDS
 from pans.decide.dark.cusum import ChannelWatch
 from pans.decide.dark.guard import DarkGuard
 from pans.decide.dark.health import DeadChannelTest
 from pans.decide.decision import DecisionFlag, Output, joined
-from pans.decide.flow import kernels
 from pans.decide.flow.core import FlowCore
 from pans.decide.kernel import arrays as ring
 from pans.decide.kernel.calls import Kernel
@@ -88,7 +88,8 @@ def test_each_decision_is_the_core_s(data: st.DataObject) -> None:
     wanted, found = by_one(one, wire_bytes), by_turn(other, wire_bytes, cuts)
     assert found._replace(block_end_tick=None) == wanted._replace(block_end_tick=None)
     assert state_of(other) == state_of(one)
-    assert other.walk.state[kernels.MIDDLE :].tolist() == one.walk.state[kernels.MIDDLE :].tolist()
+    tape = list(CORE_FIELDS[CORE_FIELDS.index("middle") :])
+    assert other.state[tape].tolist() == one.state[tape].tolist()
 
 
 @pytest.mark.parametrize("dark", [False, True])

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plans import parallel, shot_major
 
-from pans.bundle.backends import NO_LABEL
+from pans.bundle.backends import NO_LABEL, Decider
 from pans.bundle.backends.verdict import Verdict, softmax_winner
 from pans.decide.dark.cusum import ChannelWatch
 from pans.decide.dark.guard import DarkGuard
@@ -15,7 +15,6 @@ from pans.decide.decision import DECISION_DTYPE, DecisionFlag
 from pans.decide.plan import marks
 from pans.decide.plan.marks import Marks
 from pans.decide.still.core import Core
-from pans.decide.still.windows import DecisionWindows
 from pans.protocol.wire import DeviceState, Frame, FrameDecoder, StateReason
 from pans.protocol.wire import messages as wire
 from pans.protocol.wire.messages import ClickBlock, Mark, Status
@@ -25,7 +24,7 @@ N_FEATURES = 3
 PLAN = shot_major(N_FEATURES, 2)  # 4 slots per cycle, 2 cycles per object
 
 
-class CountingDecider:
+class CountingDecider(Decider):
     """Decides the number of clicks; remembers what it was asked."""
 
     name, n_features, n_classes = "counting", N_FEATURES, N_FEATURES + 1
@@ -182,8 +181,9 @@ def test_scores_that_are_not_finite_give_no_label(score: float) -> None:
 
 def test_blocks_that_do_not_fit_the_plan_are_counted_not_read() -> None:
     plan = parallel(N_FEATURES + 8, 4)
-    core = Core(plan, CountingDecider(), 1, 0)  # type: ignore[arg-type]
-    core.windows = DecisionWindows(plan, N_FEATURES + 8, 1)
+    decider = CountingDecider()
+    decider.n_features = N_FEATURES + 8
+    core = Core(plan, decider, 1, 0)  # type: ignore[arg-type]
     too_narrow = wire.FrameBlock(0, 0, 0, 0, 100, 0, np.ones((5, 1), np.uint8))
     two_visits = wire.FrameBlock(1, 0, 0, 5, 100, 0, np.ones((6, 2), np.uint8))
     other_kind = ClickBlock(2, 0, 0, 11, 100, 0, np.zeros(2, np.uint16), np.ones(2, np.uint8))

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from plans import parallel, pattern_major, shot_major, walk_plan, walked
 from streams import SESSION, click_frames, compare, spoilt
 
-from pans.bundle.backends import NO_LABEL
+from pans.bundle.backends import NO_LABEL, Decider
 from pans.bundle.backends.choose import make_decider
 from pans.bundle.backends.verdict import Verdict, Verdicts
 from pans.decide.decision import DecisionFlag
 from pans.decide.kernel.calls import StreamCore
 from pans.decide.plan.plan import Plan
 from pans.decide.still import kernel_state
-from pans.decide.still.kernel_state import count_crc_tables
+from pans.decide.still.tables import count_crc_tables
 from pans.protocol.wire import DeviceState, MessageType, StateReason
 from pans.protocol.wire import messages as wire
 from pans.protocol.wire.messages import ClickBlock, FrameBlock, Mark, Status
@@ -28,7 +28,7 @@ N_CYCLES = 24
 _DECIDERS: dict[Any, Any] = {}
 
 
-class Foreign:
+class Foreign(Decider):
     """A back end of another's: it decides on click words of a walk, and has no table that could be looked into."""
 
     name = "foreign"
@@ -221,7 +221,7 @@ def test_blocks_beyond_the_plan_and_photons() -> None:
 
 
 def test_scores_that_are_not_finite_abstain_in_bulk() -> None:
-    class Lost:
+    class Lost(Decider):
         name, n_features, n_classes = "lost", 3, 4
 
         def verdicts(self, counts: np.ndarray, shots: int) -> Verdicts:

@@ -1,6 +1,8 @@
 """Windows and walks against the plain-loop oracle: any plan, any losses and wrong stamps, any block cutting; compiled and not."""
 
-from typing import Any
+import zlib
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,37 +13,61 @@ from naive_window import count_visits, follow_walk
 from plans import parallel, pattern_major, shot_major, walk_plan, walked
 
 from pans.base.errors import PlanError
+from pans.decide.decision import Decision, DecisionFlag
 from pans.decide.plan.plan import Plan
-from pans.decide.still.windows import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS, DecisionWindows
+from pans.decide.still.window_kernels import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
+from pans.decide.still.windows import DecisionWindows
 from pans.protocol.wire import DARK_PATTERN
 from pans.protocol.wire.messages import ClickBlock, FrameBlock
 
 N_VISITS = 3
+MISSING, WRONG = DecisionFlag.GAP | DecisionFlag.ABSTAINED, DecisionFlag.WRONG_PATTERN | DecisionFlag.ABSTAINED
+
+
+class Settled(NamedTuple):
+    """A row, in the order of DECISION_DTYPE, and the counts that a back end is asked about; none where it is not asked."""
+
+    row: Decision
+    counts: list[int]
+
+
+def settled_in(windows: DecisionWindows, parts: Iterable[np.ndarray]) -> list[Settled]:
+    rows = [Decision(*row) for rows in parts for row in rows.tolist()]
+    return [Settled(row, [] if row.flags else counts.tolist()) for row, counts in zip(rows, windows.counts)]
+
+
+def skipped(windows: DecisionWindows, exposure: int) -> list[Settled]:
+    return [one for rows in windows.skip_to(exposure) for one in settled_in(windows, [rows])]
+
+
+def facts(counts: list[int], missing: bool, wrong: bool) -> tuple[int, int, int, list[int]]:
+    """The clicks, flags and checksum of a window, and what a back end is asked about."""
+    flags = MISSING * missing | WRONG * wrong
+    return sum(counts), flags, zlib.crc32(np.array(counts, np.int64).tobytes()), [] if flags else counts
+
+
+def found(one: Settled) -> tuple[int, int, int, list[int]]:
+    return one.row.clicks, one.row.flags, one.row.counts_crc, one.counts
 
 
 def run(
     plan: Plan, n_features: int, shots: int, exposures: dict[int, tuple[int, int]], cuts: set[int]
-) -> tuple[Any, DecisionWindows]:
+) -> tuple[list[Settled], DecisionWindows]:
     """Push `exposures` as blocks that end at `cuts`, at losses and at cycle ends, as a device would send them."""
     windows = DecisionWindows(plan, n_features, shots)
     end = N_VISITS * windows.visit_exposures
-    settled: list[Any] = []
-
-    def keep(found: list[Any]) -> None:
-        settled.extend(window._replace(counts=window.counts.tolist()) for window in found)
-
+    settled: list[Settled] = []
     block: list[int] = []
     for exposure in range(end + 1):
         if block and (exposure in cuts or exposure not in exposures or exposure % plan.slots_per_cycle == 0):
-            keep(windows.skip_to(block[0]))
+            settled += skipped(windows, block[0])
             sent = one_block(windows, block[0], [exposures[i] for i in block])
             assert windows.fits(sent)
-            keep(windows.push(sent))
+            settled += settled_in(windows, [windows.push(sent, block[0])])
             block = []
         if exposure in exposures:
             block.append(exposure)
-    keep(windows.skip_to(end))
-    return settled, windows
+    return [*settled, *skipped(windows, end)], windows
 
 
 def one_block(windows: DecisionWindows, first: int, exposures: list[tuple[int, int]]) -> ClickBlock:
@@ -71,14 +97,14 @@ def test_windows_match_the_oracle(data: st.DataObject) -> None:
 
     expected = count_visits(plan, n_features, shots, exposures)
     assert len(settled) == N_VISITS * n_windows  # every window is reported exactly once, in order
-    assert [w.last_exposure for w in settled] == sorted(w.last_exposure for w in settled)
+    assert [w.row.exposure_index for w in settled] == sorted(w.row.exposure_index for w in settled)
     for number, window in enumerate(settled):
         visit, index = divmod(number, n_windows)
-        assert window.first_shot == index * shots
+        assert (window.row.number, window.row.shot) == (number, index * shots)
         want = expected.get((visit, index), ([0] * n_features, shots * n_features, 0))
-        assert (window.counts, window.missing, window.wrong) == want
-        if window.missing == 0:
-            assert window.object_index == visit
+        assert found(window) == facts(want[0], want[1] > 0, want[2] > 0)
+        if want[1] == 0:
+            assert window.row.object == visit
     dark = [i for i in exposures if planned[i] == DARK_PATTERN]
     assert windows.tallies[DARK_EXPOSURES] == sum(1 for i in dark if not wrong[i])
     assert windows.tallies[DARK_CLICKS] == sum(exposures[i][1] for i in dark if not wrong[i])
@@ -89,11 +115,13 @@ def test_a_window_is_settled_with_its_last_exposure_not_later() -> None:
     plan = pattern_major(2, 3)
     windows = DecisionWindows(plan, 2, 1)
     shown, ones = plan.slot_pattern, np.ones(9, np.uint8)
-    assert windows.push(ClickBlock(0, 0, 0, 0, 1, 5, shown[:6], ones[:6])) == []
-    first = windows.push(ClickBlock(1, 0, 0, 6, 1, 5, shown[6:7], ones[:1]))
-    assert [(w.object_index, w.first_shot, w.last_exposure, w.counts.tolist()) for w in first] == [(5, 0, 6, [1, 1])]
-    rest = windows.push(ClickBlock(2, 0, 0, 7, 1, 5, shown[7:], ones[:2]))
-    assert [w.first_shot for w in rest] == [1, 2]
+    assert not len(windows.push(ClickBlock(0, 0, 0, 0, 1, 5, shown[:6], ones[:6])))
+    first = settled_in(windows, [windows.push(ClickBlock(1, 0, 0, 6, 1, 5, shown[6:7], ones[:1]), 700)])
+    assert [(w.row.object, w.row.shot, w.row.exposure_index, w.row.tick, w.counts) for w in first] == [
+        (5, 0, 6, 700, [1, 1])
+    ]
+    rest = windows.push(ClickBlock(2, 0, 0, 7, 1, 5, shown[7:], ones[:2]), 800)
+    assert (rest["shot"].tolist(), rest["tick"].tolist()) == ([1, 2], [800, 801])
 
 
 @pytest.mark.uncompiled
@@ -105,10 +133,50 @@ def test_parallel_frames(n_features: int) -> None:
     bits = rng.integers(0, 2, (7, n_features), np.uint8)
     words = np.packbits(bits, axis=1, bitorder="little")
     words.setflags(write=False)
-    settled = windows.push(FrameBlock(0, 0, 0, 0, 1, 4, words))
-    assert [w.counts.tolist() for w in settled] == [bits[1:4].sum(0).tolist(), bits[4:7].sum(0).tolist()]
+    settled = settled_in(windows, [windows.push(FrameBlock(0, 0, 0, 0, 1, 4, words))])
+    assert [w.counts for w in settled] == [bits[1:4].sum(0).tolist(), bits[4:7].sum(0).tolist()]
     assert windows.tallies[DARK_EXPOSURES] == n_features
     assert windows.tallies[DARK_CLICKS] == bits[0].sum()
+
+
+@pytest.mark.uncompiled
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_frames_match_the_oracle(data: st.DataObject) -> None:
+    """Frames in any blocks, with any losses: clicks of each window, whether one is whole, and what the dark frames gave."""
+    n_features, shots, n_windows = (
+        data.draw(st.integers(1, 12)),
+        data.draw(st.integers(1, 3)),
+        data.draw(st.integers(1, 3)),
+    )
+    plan = parallel(n_features, shots * n_windows)
+    per_visit = plan.slots_per_cycle * plan.cycles_per_object
+    end = N_VISITS * per_visit
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    bits = rng.integers(0, 2, (end, n_features), np.uint8)
+    came = rng.random(end) >= data.draw(st.sampled_from([0.0, 0.05, 0.5]))
+    cuts = set(rng.integers(0, end, 10).tolist())
+    windows, settled, block = DecisionWindows(plan, n_features, shots), list[Settled](), list[int]()
+    for exposure in range(end + 1):
+        if block and (exposure in cuts or exposure == end or not came[exposure] or exposure % per_visit == 0):
+            words = np.packbits(bits[block], axis=1, bitorder="little")
+            settled += skipped(windows, block[0])
+            settled += settled_in(
+                windows, [windows.push(FrameBlock(0, 0, 0, block[0], 1, block[0] // per_visit, words))]
+            )
+            block = []
+        if exposure < end and came[exposure]:
+            block.append(exposure)
+    settled += skipped(windows, end)
+    dark = np.tile(plan.slot_pattern == DARK_PATTERN, end // plan.slots_per_cycle)
+    of_window = np.flatnonzero(~dark).reshape(-1, shots)
+    assert len(settled) == len(of_window)
+    for window, exposures in zip(settled, of_window):
+        here = exposures[came[exposures]]
+        assert found(window) == facts(bits[here].sum(0).tolist(), len(here) < shots, False)
+        assert window.row.exposure_index == exposures[-1]
+    assert windows.tallies[DARK_EXPOSURES] == n_features * (dark & came).sum()
+    assert windows.tallies[DARK_CLICKS] == bits[dark & came].sum()
 
 
 def test_shots_that_do_not_divide_are_refused_with_the_numbers() -> None:
@@ -150,16 +218,16 @@ def test_walks_match_the_oracle(case: tuple[Plan, dict[int, tuple[int, int]], se
     assert len(settled) == len(walks)  # every walk is reported exactly once, in order
     slots = int(np.flatnonzero(plan.slot_pattern != DARK_PATTERN)[-1])
     for cycle, (window, walk) in enumerate(zip(settled, walks)):
-        assert window.counts == walk["clicks"]
-        assert window.exposures == len(walk["states"])
-        assert (window.missing > 0, window.wrong) == {"whole": (False, 0), "wrong": (False, 1), "lost": (True, 0)}[
+        missing, wrong = {"whole": (False, False), "wrong": (False, True), "lost": (True, False)}[
             walk["fate"] or "lost"
         ]
-        assert window.first_shot == cycle % plan.cycles_per_object
+        assert found(window) == facts(walk["clicks"], missing, wrong)
+        assert window.row.exposures == len(walk["states"])
+        assert window.row.shot == cycle % plan.cycles_per_object
         whole = walk["fate"] == "whole"
-        assert window.last_exposure == (walk["last"] if whole else cycle * plan.slots_per_cycle + slots)
+        assert window.row.exposure_index == (walk["last"] if whole else cycle * plan.slots_per_cycle + slots)
         if whole:
-            assert window.object_index == cycle // plan.cycles_per_object
+            assert window.row.object == cycle // plan.cycles_per_object
     tallies = windows.tallies
     assert tallies[DARK_EXPOSURES] == sum(len(walk["dark"]) for walk in walks)
     assert tallies[DARK_CLICKS] == sum(number > 0 for walk in walks for number in walk["dark"])
@@ -196,15 +264,16 @@ def test_another_core_goes_on_from_a_place_between_two_walks(
     n_slots = plan.automaton.n_slots
     first, settled = DecisionWindows(plan, n_slots, 1), []
     for exposure in sorted(exposures):
-        for found in (first.skip_to(exposure), first.push(one_block(first, exposure, [exposures[exposure]]))):
-            settled += [window._replace(counts=window.counts.tolist()) for window in found]
+        settled += skipped(first, exposure)
+        settled += settled_in(first, [first.push(one_block(first, exposure, [exposures[exposure]]), exposure)])
         if not first.half_seen:
             other = DecisionWindows(plan, n_slots, 1)
             other.position, other.tallies[:] = first.position, first.tallies
+            other.walk.state["n_decisions"] = len(settled)
             first = other
-    last = first.skip_to(N_VISITS * first.visit_exposures)
+    last = skipped(first, N_VISITS * first.visit_exposures)
     expected, windows = run(plan, n_slots, 1, exposures, set())
-    assert [*settled, *(window._replace(counts=window.counts.tolist()) for window in last)] == expected
+    assert [*settled, *last] == expected
     assert first.tallies.tolist()[:2] == windows.tallies.tolist()[:2]
 
 

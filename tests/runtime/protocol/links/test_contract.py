@@ -271,7 +271,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
         threading.Event().wait(0.001)
 
 
-class Flood:
+class Flood(Link):
     """A link that never runs dry."""
 
     name, simulated, virtual = "flood", True, False

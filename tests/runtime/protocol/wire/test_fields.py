@@ -11,6 +11,7 @@ import pytest
 from inner_kernels import called
 from tree import ROOT
 
+from pans.decide.core_state import CORE_DTYPE
 from pans.protocol.wire import MalformedMessage
 from pans.protocol.wire import kernels as walk
 from pans.protocol.wire import messages as wire
@@ -107,8 +108,8 @@ def test_the_kernels_take_nothing_that_the_decoders_refuse(case: tuple[str, int,
         values = with_field(name, place, value)
         body = bytes(walk.BODY_HEADER) + STRUCTS[name].pack(*values) + TAILS.get(name, b"")
         at, stop = np.uint64(walk.BODY_HEADER), np.uint64(len(body))
-        state = np.zeros(walk.N_PLACE, np.int64)
-        state[walk.NEXT_EXPOSURE], state[walk.END_EXPOSURE] = GOOD["FRAMES"][3], 1 << 62
+        state = np.zeros(1, CORE_DTYPE)[0]
+        state.next_exposure, state.end_exposure = GOOD["FRAMES"][3], 1 << 62
         buffer = np.frombuffer(body + bytes(8), np.uint8).copy()
         if name == "MARK":
             taken = bool(is_next_mark(buffer, at, stop, state))
