@@ -86,7 +86,7 @@ def by_thread(
 
     thread, sender, ended = DecidingThread(), threading.Thread(target=send), ring.ALL_TAKEN
     with ours, theirs:
-        turn.allow(0, 0, gather_ns)
+        turn.allow(0, 0, gather_ns, tells_exposed=True)
         thread.start(turn, ours.fileno())
         sender.start()
         while ended != ring.GONE:
@@ -98,12 +98,14 @@ def by_thread(
             pause("received")
             rows.append(turn.rows.copy())
             core.remember_rows(turn.marks())
+            for _, frame, standing in turn.passed():
+                events += core.step(frame, standing).events
             if parked and ended == ring.ODD:
                 for batch in streamed._take_one(turn.take_odd()):
                     rows.append(batch.rows.copy())
                     events += batch.events
                 core.steps(SESSION)
-                turn.allow(0, 0, gather_ns)
+                turn.allow(0, 0, gather_ns, tells_exposed=True)
                 pause("taken")
                 thread.go_on()
             pause("accounted for")

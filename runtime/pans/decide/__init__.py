@@ -27,7 +27,7 @@ from .decision import (
     is_judged,
     rows_of,
 )
-from .follower import Follower, Place, exposure_timing
+from .follower import Follower, Place, Standing, exposure_timing
 
 __all__ = [
     "DECISION_DTYPE",
@@ -43,6 +43,7 @@ __all__ = [
     "Passage",
     "Place",
     "RowDecisions",
+    "Standing",
     "exposure_timing",
     "is_decided",
     "is_judged",

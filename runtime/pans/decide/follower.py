@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -146,6 +146,15 @@ def exposure_timing(
     facts = dict(zip(keys, values if told.exposures else [None] * len(keys)))
     counts = {"exposures": told.exposures, "untold": untold if announced else 0}
     return {"announced": announced, **counts, "tolerance_us": tolerance_us, **facts}
+
+
+class Standing(NamedTuple):
+    """Where a stream stood when a message came: the exposure that came next, the drop counter, the last end, the largest jitter."""
+
+    next_exposure: int
+    drops: int
+    last_tick: int
+    jitter_ticks: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,12 +354,15 @@ class Follower:
     def _exposures_of(self, n_cycles: int) -> int:
         return n_cycles * self._slots_per_cycle if n_cycles else 1 << 63
 
-    def step(self, frame: Frame) -> Output:
-        """Take one frame (CLICKS, FRAMES, MARK, STATUS or EXPOSED) in the order of arrival."""
+    def step(self, frame: Frame, standing: Standing | None = None) -> Output:
+        """Take one frame (CLICKS, FRAMES, MARK, STATUS or EXPOSED) in the order of arrival.
+
+        `standing` is where the stream stood when a STATUS or EXPOSED came that a kernel has passed; None: as it stands now.
+        """
         if frame.type == MessageType.STATUS:
-            return self._on_status(frame)
+            return self._on_status(frame, standing or self._standing())
         if frame.type == MessageType.EXPOSED:
-            return self._on_exposed(frame)
+            return self._on_exposed(frame, standing or self._standing())
         unexplained = self.tracker.counters.unexplained_drops
         message, gap = self.tracker.accept(frame)
         if message is None:
@@ -392,7 +404,11 @@ class Follower:
         self.contradictions[wrong.what] += 1
         return wrong
 
-    def _on_exposed(self, frame: Frame) -> Output:
+    def _standing(self) -> Standing:
+        _, came, drops = self.tracker.position
+        return Standing(came, drops, self.last_tick, self.jitter_ticks)
+
+    def _on_exposed(self, frame: Frame, standing: Standing) -> Output:
         """Note when exposures happened. No two are equal, as each is of other exposures: an equal one is a repetition."""
         with suppress(MalformedMessage):
             told = decode_exposed(frame.payload)
@@ -406,26 +422,26 @@ class Follower:
                 self._n_told += told.exposures
             self._worst_told = max(self._worst_told, abs(told.start_error))
             self.exposed = self.exposed.joined(told)
-            if (wrong := self._late_blocks()) is not None:
+            if (wrong := self._late_blocks(standing)) is not None:
                 return Output([], [self._contradicts(wrong)], None)
         return Output([], [], None)
 
-    def _late_blocks(self) -> Contradiction | None:
+    def _late_blocks(self, standing: Standing) -> Contradiction | None:
         """Compare the ticks of blocks with EXPOSED, once it has told of all that came: none may be farther from the plan than that."""
-        if not self._n_told or self._n_told < self.tracker.next_exposure:
+        if not self._n_told or self._n_told < standing.next_exposure:
             return None
         told = max(self._worst_told + 1, self._jitter_known)  # a device may round the tick of a block by itself
-        if min(self.jitter_ticks, I32_MAX) <= told:
+        if min(standing.jitter_ticks, I32_MAX) <= told:
             return None
-        self._jitter_known = self.jitter_ticks
-        return Contradiction("exposed", self.tracker.next_exposure - 1, self.jitter_ticks, self._worst_told)
+        self._jitter_known = standing.jitter_ticks
+        return Contradiction("exposed", standing.next_exposure - 1, standing.jitter_ticks, self._worst_told)
 
     def _count_untold(self, due: int) -> None:
         """Account for what EXPOSED has not told of: of the stream's first `due` exposures, those that came or were lost."""
         if self._n_told is not None:
             self.untold += max(0, min(due, self.tracker.next_exposure) - self._n_told)
 
-    def _on_status(self, frame: Frame) -> Output:
+    def _on_status(self, frame: Frame, standing: Standing) -> Output:
         """When the device says that the plan is done, settle what will never be complete.
 
         STATUS may overtake stream messages, so that with exposures missing only a second one settles them.
@@ -439,7 +455,7 @@ class Follower:
         if self.completed:
             wrong = self._rules.of_status(status, self.start_tick, self.end_exposure)
             return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
-        wrong, self._status = self._takes_back(status), status
+        wrong, self._status = self._takes_back(status, standing), status
         events: list[CoreEvent] = [] if wrong is None else [self._contradicts(wrong)]
         return joined(Output([], events, None), self._settle_status(status))
 
@@ -457,7 +473,7 @@ class Follower:
             return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
         return self._finish(status)
 
-    def _takes_back(self, status: Status) -> Contradiction | None:
+    def _takes_back(self, status: Status, standing: Standing) -> Contradiction | None:
         """What `status` takes back of an earlier STATUS, of EXPOSED, or of blocks that had ended by its tick.
 
         A run that is stopped has one exposure less than had begun, as the one under way is not counted.
@@ -469,9 +485,8 @@ class Follower:
         if known is not None:
             least, dropped = max(least, known.next_exposure - 1), known.drops
             most = claimed if known.state in (DeviceState.ARMED, DeviceState.RUNNING) else known.next_exposure
-        if status.tick >= self.last_tick:
-            _, came, drops = self.tracker.position
-            least, dropped = max(least, came), max(dropped, drops)
+        if status.tick >= standing.last_tick:
+            least, dropped = max(least, standing.next_exposure), max(dropped, standing.drops)
         if not min(least, self.end_exposure) <= claimed <= most:
             return Contradiction("claimed_exposures", claimed, claimed, most if claimed > most else least)
         if status.drops < dropped and claimed < 1 << 32:
@@ -483,7 +498,7 @@ class Follower:
         self.completed = True
         wrong = None if self._told_wrong else self._rules.of_status(status, self.start_tick, self.end_exposure)
         end = min(status.next_exposure, self.end_exposure)
-        late = self._late_blocks()
+        late = self._late_blocks(self._standing())
         unexplained = self.tracker.counters.unexplained_drops
         gap = self.tracker.finish(end, status.drops)
         self._count_untold(end)

@@ -196,7 +196,8 @@ class Receiver:
         """Before the kernel begins to serve, or goes on: tell it how things stand."""
         self._load(kernel)
         lateness = self._run.lateness
-        kernel.allow(lateness.longest_ns, lateness.evidence.floor_ns, self._gather_ns)
+        tells = self._run.connection.session.tells_exposed
+        kernel.allow(lateness.longest_ns, lateness.evidence.floor_ns, self._gather_ns, tells_exposed=tells)
 
     def _receive_batch(self, kernel: Kernel, outputs: list[Output]) -> None:
         """Wait until a batch is handed over, and account for it; answer what only Python can answer."""
@@ -425,6 +426,9 @@ class Receiver:
             if end.messages - begin.messages > end.steps - begin.steps:
                 self._settle_marks(kernel)
             self._record(kernel)
+            for arrival_ns, frame, standing in kernel.passed() if self.serves else ():
+                if connection.digest(frame, arrival_ns):
+                    run.book_frame(run.stepped(arrival_ns, frame, standing), outputs)
         if self.serves and end.ended == ring.ODD and self._rows_stay:
             taken = self._taken(kernel)
             self._go_on(kernel)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.base.errors import DeviceError, LinkError, RecordingError
-from pans.decide import DECISION_DTYPE, Action, Follower, Output
+from pans.decide import DECISION_DTYPE, Action, Follower, Output, Standing
 from pans.decide.plan import Plan
 from pans.decide.still import Core
 from pans.live.timing.causes import INFERENCE, LateWork, Stamped
@@ -366,14 +366,20 @@ class LiveRun:
         """Let the core take one message, record it, and return what `book_frame` accounts for; None of a connection that was not armed."""
         if self.connection is not self.armed:
             return None
-        decoded_ns = self.now_ns()
-        output = self.core.step(frame)
+        taken = self.stepped(arrival_ns, frame)
         self._drive(arrival_ns)
         self.taken_here += 1
-        self.lateness.evidence.worked(INFERENCE, decoded_ns, self.now_ns())
         if self.recorder is not None:
             self.recorder.add_message(arrival_ns, pack_body(frame))
-        return Taken(frame, output, (arrival_ns, decoded_ns, self.now_ns()))
+        return taken
+
+    def stepped(self, arrival_ns: int, frame: Frame, standing: Standing | None = None) -> Taken:
+        """Let the core take one message, as the stream stood then; return what came of it."""
+        decoded_ns = self.now_ns()
+        output = self.core.step(frame, standing)
+        decided_ns = self.now_ns()
+        self.lateness.evidence.worked(INFERENCE, decoded_ns, decided_ns)
+        return Taken(frame, output, (arrival_ns, decoded_ns, decided_ns))
 
     def book_frame(self, taken: Taken, outputs: list[Output]) -> None:
         """Account for what came of a message that the core has taken."""

@@ -30,7 +30,7 @@ def bare_run(step: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[LiveRun, list[
 def test_a_link_that_breaks_under_a_pulse_loses_nothing_that_has_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Frame] = []
 
-    def step(frame: Frame) -> Output:
+    def step(frame: Frame, standing: object) -> Output:
         seen.append(frame)
         return Output([], [], None, (), (Action(1, 4, 5, 1, 0),))
 
@@ -55,7 +55,7 @@ def test_a_status_that_waited_is_held_against_its_own_arrival(monkeypatch: pytes
     waited = [Status(DeviceState.RUNNING, StateReason.NONE, 1000, 0, tick, 0) for tick in (100, 200, 300)]
     checked: list[tuple[int, int]] = []
     frames = FrameDecoder().feed(b"".join(encode_status(status, 7) for status in waited))
-    run, came = bare_run(lambda frame: Output([], [], None), monkeypatch)
+    run, came = bare_run(lambda frame, standing: Output([], [], None), monkeypatch)
     monkeypatch.setattr(LiveRun, "check_tick", lambda self, tick, at_ns: checked.append((tick, at_ns)))
     for at_ns, frame in zip((1, 2, 3), frames):
         taken = run.take_frame(at_ns, frame)

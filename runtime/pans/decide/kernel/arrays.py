@@ -14,8 +14,8 @@ I64 = npt.NDArray[np.int64]
 
 # control, int64 (N_CONTROL,). Set by the caller before a call: the descriptor, and whether it is read (0: only what is decoded already);
 # until when; how long after a block the next one is overdue (0: do not watch); how long to poll awake at first; how many messages may
-# come; whether a stream is open, whether SHOW is sent, whether commands wait in the session; most rows of one block; waits that lie
-# closer together are one
+# come; whether a stream is open (2: and EXPOSED is expected), whether SHOW is sent, whether commands wait in the session; most rows of
+# one block; waits that lie closer together are one
 FD, READS, DUE_NS, PATIENCE_NS, EAGER_NS, BUDGET, OPEN, DRIVES, WAITING, BLOCK_ROWS, FLOOR_NS = range(11)
 STOP = 11  # set by anybody, at any time: the call ends
 # kept by both sides: the next decoded body and how many there are, when they were read, when a block came last; the session's
@@ -63,6 +63,7 @@ class Rings(NamedTuple):
     shows: I64
     notes: I64  # (n, 4): waits for bytes: began, asked until, ended
     arrivals: I64
+    standings: I64  # (n, 4): of a STATUS or EXPOSED among `messages`, where the stream stood then (follower.Standing)
     handed: I64  # (N_CONTROL,): `control` as it was when a batch was handed over
     spare: U8  # what is read from and written to the pipes
 
@@ -95,7 +96,8 @@ def make_rings() -> Rings:
     messages, answers, shows, notes = (np.full((MANY, 4), 1, np.int64) for _ in range(4))
     steps, arrivals = np.full((MANY, N_STEP), 1, np.int64), np.full(MANY, 1, np.int64)
     handed, spare = np.full(N_CONTROL, 0, np.int64), np.full(64, 1, np.uint8)
-    return Rings(kept, steps, messages, answers, shows, notes, arrivals, handed, spare)
+    standings = np.full((MANY, 4), 1, np.int64)
+    return Rings(kept, steps, messages, answers, shows, notes, arrivals, standings, handed, spare)
 
 
 def no_drive() -> Drive:

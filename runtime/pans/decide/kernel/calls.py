@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from pans.bundle.backends import Decider
 from pans.decide.decision import DECISION_DTYPE, CoreEvent, Output
+from pans.decide.follower import Standing
 from pans.decide.plan.plan import Plan
 from pans.decide.still.core import Core
 from pans.decide.still.kernel_state import CoreState
@@ -156,10 +157,11 @@ class Kernel:
         finally:
             control[ring.HALVES], control[ring.HALF], control[ring.SERVES] = 1, 0, 0
 
-    def allow(self, patience_ns: int, floor_ns: int, batch_ns: int) -> None:
-        """Say what a serving kernel may do from here on; it is parked, or has not begun."""
-        control = self.control
-        control[ring.PATIENCE_NS], control[ring.FLOOR_NS], control[ring.OPEN] = patience_ns, floor_ns, self.steps.takes
+    def allow(self, patience_ns: int, floor_ns: int, batch_ns: int, *, tells_exposed: bool = False) -> None:
+        """Say what a serving kernel may do from here on; it is parked, or has not begun. The device may tell of its exposures."""
+        control, is_open = self.control, self.steps.takes
+        control[ring.PATIENCE_NS], control[ring.FLOOR_NS] = patience_ns, floor_ns
+        control[ring.OPEN] = is_open + (is_open and tells_exposed)
         control[ring.BATCH_NS], control[ring.BATCH_MESSAGES] = batch_ns, BATCH_MESSAGES
 
     def receive_batch(self) -> bool:
@@ -278,6 +280,13 @@ class Kernel:
         spans = self.messages[self.messages[:, ring.WHAT] == int(kind)]
         kept, size = self.rings.kept.data, np.dtype(dtype).itemsize
         return spans, np.frombuffer(b"".join([kept[at : at + size] for at in spans[:, ring.BEGIN].tolist()]), dtype)
+
+    def passed(self) -> Iterator[tuple[int, Frame, Standing]]:
+        """Yield each STATUS and EXPOSED that a serving kernel has passed: when it came, and where the stream stood then."""
+        what = self.messages[:, ring.WHAT]
+        for at in np.flatnonzero((what == int(MessageType.STATUS)) | (what == int(MessageType.EXPOSED))).tolist():
+            span, standing = self.messages[at], self.rings.standings[self.begin.messages + at]
+            yield int(span[ring.TIME]), unpack_body(self.bytes_of(span)), Standing._make(standing.tolist())
 
     def marks(self) -> npt.NDArray[np.void]:
         """Return the marks among `messages`, MARK_DTYPE (n,), in order."""

@@ -25,7 +25,7 @@ from numba.extending import intrinsic
 from pans.base.machine import bare, copy_span, fence, inner, load4, outer
 from pans.decide.still import kernels as core
 from pans.decide.still.kernels import WalkArrays
-from pans.protocol.wire import MAX_FRAME_BYTES, SCHEMA, MessageType
+from pans.protocol.wire import MAX_FRAME_BYTES, SCHEMA, DeviceState, MessageType
 from pans.protocol.wire import kernels as stream
 from pans.protocol.wire import kernels as wire
 
@@ -99,6 +99,8 @@ NAP_NS = 200_000_000  # longest wait of a serving kernel: a wake-up that was los
 SILENCE_EVERY_NS = 100_000_000
 HUNGRY_NS = 1_000_000  # how often it looks whether Python has done with the batch before
 _ACK, _PONG = int(MessageType.ACK), int(MessageType.PONG)
+_STATUS, _EXPOSED = int(MessageType.STATUS), int(MessageType.EXPOSED)
+_ARMED, _RUNNING = int(DeviceState.ARMED), int(DeviceState.RUNNING)
 _U = np.uint64
 _LIMIT, _SCHEMA = np.int64(MAX_FRAME_BYTES), np.int64(SCHEMA)  # plain numbers are types of their own to the compiler
 
@@ -410,6 +412,16 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
             continue
         if not control[ring.OPEN]:
             return ring.ODD
+        if control[ring.SERVES] and _passes(buffer, start, stop, control):
+            # the core judges it by where the stream stands now, when Python has time
+            if load_session(buffer, start) != walk.state[0].session:
+                return ring.ODD
+            standing = rings.standings[control[ring.N_MESSAGES]]
+            standing[0], standing[1] = walk.state[0].next_exposure, walk.state[0].drops
+            standing[2], standing[3] = walk.state[0].last_tick, walk.state[0].jitter_ticks
+            _keep(buffer, start, stop, rings.kept, rings.messages, ring.N_MESSAGES, control)
+            control[ring.PLACE] += 1
+            continue
         decoded_ns = now_ns(scratch)
         took = take_message(walk, buffer, _U(start), _U(stop))
         if took >= core.TOOK_MARK:
@@ -429,6 +441,17 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
         else:
             return ring.ODD
     return ring.ALL_TAKEN
+
+
+@inner
+def _passes(buffer, start, stop, control):  # type: ignore[no-untyped-def]
+    """Whether the body is one that changes nothing of how the stream goes on: STATUS while the device measures, EXPOSED."""
+    if buffer[start] == _EXPOSED:
+        return control[ring.OPEN] == 2
+    if buffer[start] != _STATUS or stop - start <= stream.BODY_HEADER:
+        return False
+    state = buffer[start + stream.BODY_HEADER]  # the first field
+    return state in (_ARMED, _RUNNING)
 
 
 @inner
