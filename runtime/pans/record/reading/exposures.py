@@ -127,12 +127,13 @@ class ClickList(NamedTuple):
     first_tick: int
     last_tick: int  # end of the last exposure
     photons: NDArray[np.int64]  # of each click: 1, or the number of a detector that counts
+    lit_streams: NDArray[np.int64]  # the streams with an exposure in the light: each of them began a decision
 
 
 def click_list(recording: Recording, plan: Plan) -> ClickList:
     """Return the clicks of `recording` as arrays."""
     found = [np.zeros((8, 0), np.int64)]
-    exposures, first_tick, last_tick = 0, 0, 0
+    exposures, first_tick, last_tick, lit = 0, 0, 0, set[int]()
     for item in iter_exposures(recording, plan):
         if not len(item.start_tick):
             continue
@@ -144,9 +145,11 @@ def click_list(recording: Recording, plan: Plan) -> ClickList:
         first_tick = first_tick if exposures else int(item.start_tick[0])
         last_tick = int(item.start_tick[-1]) + plan.exposure_ticks
         exposures += len(item.clicks)
+        if not is_dark(plan.slot_pattern[item.number % plan.slots_per_cycle]).all():
+            lit.add(item.stream)
     start, number, thing, channel, pattern, state, stream, photons = np.concatenate(found, axis=1)
     seven = start, number, thing, channel, pattern, state, stream
-    return ClickList(*seven, exposures, first_tick, last_tick, photons)
+    return ClickList(*seven, exposures, first_tick, last_tick, photons, np.array(sorted(lit), np.int64))
 
 
 def first_tick(recording: Recording, plan: Plan) -> int:

@@ -166,7 +166,7 @@ def click_table(recording: Recording, plan: Plan, clicks: ClickList) -> Table:
 def _decisions_of(recording: Recording, plan: Plan, clicks: ClickList) -> NDArray[np.int64]:
     """Return the number of the decision that each click was counted for, masked where there is none.
 
-    A visit and a window in it name a decision within its stream; a later stream has the same names again, later in time.
+    A stream decides on all windows up to its end in order. So visit and window give the number of a decision within its stream.
     """
     config = recording.header["config"]
     if "flow" in config:
@@ -177,17 +177,25 @@ def _decisions_of(recording: Recording, plan: Plan, clicks: ClickList) -> NDArra
         raise DamagedFileError(f"{recording.path}: its header has no config.shots that can be: {error}") from error
     _, window_at = visit_maps(plan, shots)
     per_visit, visit = plan.shots_per_cycle * plan.cycles_per_object // shots, len(window_at)
-    fields, nobody = ("index", "tick", "exposure_index", "shot"), np.full((1, 4), -1)
+    fields, nobody = ("index", "exposure_index", "shot"), np.full((1, 3), -1)
     blocks = together(recording.iter_decisions())
     made = [np.column_stack([rows[name].astype(np.int64) for name in fields]) for rows in blocks]
-    index, tick, last, shot = np.concatenate([*made, nobody]).T
-    names = np.where(index < 0, np.iinfo(np.int64).max, last // visit * per_visit + shot // shots)
-    index, tick, names = np.array((index, tick, names))[:, np.lexsort((tick, names))]
-    wanted = clicks.exposure // visit * per_visit + window_at[clicks.exposure % visit]
-    at = np.searchsorted(names, wanted)
-    while (before := (names[at] == wanted) & (tick[at] <= clicks.start_tick)).any():
-        at += before
-    return np.ma.array(index[at], mask=(names[at] != wanted) | is_dark(clicks.pattern))
+    index, last, shot = np.concatenate([*made, nobody]).T
+    number = last // visit * per_visit + shot // shots
+    # The number that the first decision of the same stream has in the run. It alone tells streams apart: a device that was reset counts
+    # ticks from 0 again.
+    begin = index - number
+    begins, streams = np.unique(begin[:-1]), clicks.lit_streams
+    if number[0] > 0:  # a later part, which may hold decisions of its first stream and no exposure
+        streams = np.union1d(streams, [0])
+    known = min(len(begins), len(streams))  # a file that was cut off may lack decisions
+    begin_of = np.full(max(clicks.stream.max(initial=0), streams.max(initial=0)) + 1, -1)
+    begin_of[streams[:known]] = begins[:known]
+    own = begin_of[clicks.stream]
+    wanted = own + clicks.exposure // visit * per_visit + window_at[clicks.exposure % visit]
+    at = np.searchsorted(index[:-1], wanted)
+    found = (own >= 0) & (index[at] == wanted) & (begin[at] == own)
+    return np.ma.array(index[at], mask=~found | is_dark(clicks.pattern))
 
 
 def to_frame(recording: Recording, table: str = "decisions") -> Any:
