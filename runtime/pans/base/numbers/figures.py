@@ -102,9 +102,7 @@ class Figure:
     key: str  # of the summary's JSON; a dot leads into an object; the name of the attribute too
     meaning: str  # one sentence, Markdown; also the help of the metric
     part: Part | None = Part.RUN  # None: only in the state file
-    allowed: Any = (
-        None  # what a recorded summary may hold: a shape of record.reading.recorded_facts; None is not checked
-    )
+    allowed: Any = None  # shape of the value in a recorded summary (record.reading.recorded_facts); None: not checked
     unit: str = ""
     name: str = ""  # in a table
     word: str = ""  # in the head of a column
@@ -120,7 +118,8 @@ class Figure:
     metric: str = ""  # Prometheus name
     counts: bool = False  # the metric is a counter
     label: str = ""  # of the metric, one sample for each key of the object
-    see: str = ""  # page of the reference that says more
+    more: str = ""  # the keys of an object and limits, for the reference page
+    see: str = ""  # link from there
 
     def text(self, value: Any) -> str:
         """Return `value` in words, as in a table."""
@@ -235,7 +234,7 @@ _ROWS = (
         counts=True),
     Figure("late_blame", "Late decisions by the stage in which the time was spent", R),
     Figure("late_cause", "Late decisions by cause", R, _COUNTS, live="late_cause", metric="pans_late_decisions_by_cause", counts=True,
-        label="cause", see="../explanation/timing.md"),
+        label="cause", more="`link`, `device`, `host`, `gc`, `disk`, `inference`, `decode`", see="../explanation/timing.md"),
     Figure("lost_cause", "Lost exposures by cause", R, live="lost_cause", metric="pans_lost_exposures_by_cause", counts=True,
         label="cause", see="../explanation/timing.md"),
     Figure("blame", "The first causes that the evidence names, each with its evidence", R),
@@ -244,21 +243,24 @@ _ROWS = (
         counts=True),
     Figure("latency_us",
         "Quantiles of the time from the end of the last exposure to the decision; quantile q of fewer than 1/(1 - q) decisions is null",
-        R, _QUANTILES, unit="us"),
+        R, _QUANTILES, unit="us", more="`p50`, `p99` (null below 100 decisions), `p999` (null below 1000), `max`"),
     Figure("stage_latency_us", "The same for the stages `link`, `decode`, `decide` and `record`", R, Each(dict, _QUANTILES), unit="us"),
     Figure("deadline_us", "The deadline of a decision", R, AMOUNT, unit="us", form="{:,.0f} us"),
     Figure("clock", "`drift_ppm`, `uncertainty_us` and `worst_uncertainty_us` of the device's clock", R, _CLOCK),
     Figure("slot_jitter_us", "How far exposures were off their slots, at most", R, AMOUNT, unit="us", form="{:.1f} us"),
     Figure("exposure_timing",
-        "When exposures happened, as the device told; `untold` ended, and EXPOSED did not report them; null where nothing was told", R,
-        _EXPOSURE_TIMING, see="protocol.md#15-when-exposures-happened"),
+        "When exposures happened, as the device told; null where it told nothing", R, _EXPOSURE_TIMING,
+        more="`announced`, `exposures`, `untold` (ended, but EXPOSED did not report them), `worst_start_us`, `worst_length_us`, "
+        "`worst_start_exposure` and `worst_length_exposure` (number since ARM), `tolerance_us`, `within`",
+        see="protocol.md#15-when-exposures-happened"),
     Figure("wrong_patterns", "Exposures that showed another pattern, late slots among them", R, COUNT),
     Figure("dark", "Clicks without light: `policy`, `clicks`, `exposures`, `expected`, `findings`, `present`, `channels`", R,
         {**_DARK, "alarm": str, "findings": list, "channels": Each(list, _DARK)}, see="../how-to/dark-counts.md"),
-    Figure("stream", "Counters of messages and exposures: gaps, drops, repeats", R, _COUNTS),
+    Figure("stream", "Counters of messages and exposures", R, _COUNTS,
+        more="`repeated` messages; of these `repeats_differing` are contradictions, `repeats_unchecked` had nothing to compare with"),
     Figure("stream.gaps", "Gaps in the stream", R, live="gaps", metric="pans_gaps", counts=True),
     Figure("stream.exposures", "Exposures received", R, word="exposures", live="exposures", metric="pans_exposures", counts=True),
-    Figure("link", "Counters of bytes and frames: damaged, discarded, unknown", R),
+    Figure("link", "Counters of bytes and frames", R, more="damaged, discarded, of unknown type, of another session"),
     Figure("contradictions", "Messages that make no sense or cannot be true, by what is wrong in them; each fails the run", R,
         see="protocol.md#10-what-the-host-believes"),
     Figure("realtime", "Real-time privileges that were granted", R, dict),
@@ -268,22 +270,27 @@ _ROWS = (
     Figure("device", "What the device says of itself", R, {"objects": OBJECTS}),
     Figure("armed_after_s", "From the start to ARM", R, AMOUNT, unit="s", form="{:.2f} s"),
     Figure("seconds", "Length of the measurement", R, AMOUNT, unit="s", form="{:.1f} s"),
-    Figure("ended", "Why the run ended: `completed`, `stopped by SIGTERM`, an error", R, _TEXT, shown=Shown.CARD, live="ended"),
+    Figure("ended", "Why the run ended", R, _TEXT, shown=Shown.CARD, live="ended",
+        more="`completed`, `stopped by SIGTERM`, an error; where the loop was stuck, if the watchdog ended the run"),
     Figure("link_lost", "Whether the device was lost for good", R, bool),
     Figure("reconnects", "Times the device was lost and found again", R, COUNT, live="reconnects", metric="pans_reconnects", counts=True),
     Figure("decisions_sha256", "SHA-256 of the decision log", R, _TEXT),
     Figure("simulated", "Whether the clicks were simulated", R, bool),
     Figure("verdict", "`PASS` or `FAIL`", R, shown=Shown.CARD, live="verdict"),
     Figure("faults", "Why the run failed, one sentence each", R, _TEXTS, shown=Shown.CARD, live="faults"),
-    Figure("warnings", "What may have spoilt decisions and is no fault: light or detector changed", R, _TEXTS),
+    Figure("warnings", "What may have spoilt decisions and is no fault", R, _TEXTS,
+        more="a change of the light, a detector that always or never clicks in light"),
     Figure("calibration", "The calibration in use", R),
     Figure("calibration_warnings", "What is wrong with the calibration", R, _TEXTS),
     Figure("light",
-        "The watch on the light: `found`, `found_after_decisions`, `change_of_clicks`, `clicks_stated`, `states`, and how often it errs",
-        R),
-    Figure("registration", "The registration in use: file, SHA-256, light kept, relative errors before and after", R),
+        "The watch on the light", R, more="`found`, `found_after_decisions`, `change_of_clicks`, `clicks_stated` by an automaton's "
+        "bundle; `states` of an automaton with `first_state_clicked` and `first_state_stated` (least, largest); false alarms: "
+        "`false_alarm_every_decisions`, `false_alarm_per_run` at the beginning"),
+    Figure("registration", "The registration in use", R,
+        more="file, SHA-256, light kept, relative error of the patterns' light before and after the correction"),
     Figure("late_allowed", "Share of the decisions that might be late (`--late-allowed`)", R, _PART, form="{:.3%}"),
-    Figure("busy", "Why few late decisions of `pans demo` are no fault: other programs kept the host waiting; else empty", R, _TEXT),
+    Figure("busy", "Why few late decisions of `pans demo` are no fault: other programs kept the host waiting; else empty", R, _TEXT,
+        more="up to 5 % of the decisions, and nothing else is wrong; the exit code is then 0"),
     # ---- within objects of the run ----
     Figure("dark.exposures", "Exposures without light", R, word="dark exposures", live="dark_exposures", metric="pans_dark_exposures",
         counts=True),
@@ -310,7 +317,8 @@ _ROWS = (
     Figure("shots", "Shots of a decision", C),
     Figure("seed", "Seed of the simulated scene", C),
     # ---- the state file alone ----
-    Figure("", "`setting up`, `running`, `device lost`, `stalled`, `stopped`", None, live="state"),
+    Figure("", "What the run does", None, live="state",
+        more="`setting up`, `running`, `device lost`, `stopped`; `stalled`: `loop_age_s` is above 0.75, or above 15 without the device"),
     Figure("", "When the file was written, UTC", None, live="utc"),
     Figure("", "Number of the process", None, live="pid"),
     Figure("", "Verdict of the latest run that ended, as the file before had it; `cut`: none", None, live="last_verdict"),
@@ -323,15 +331,15 @@ _ROWS = (
     Figure("", "Since the start of the command", None, unit="s", live="uptime_s", metric="pans_uptime_seconds"),
     Figure("", "Free bytes on the disk of the recording", None, unit="bytes", live="disk_free_bytes", metric="pans_disk_free_bytes"),
     Figure("", "Until that is full at the present rate; +Inf: not known, or never", None, unit="s", live="disk_left_s",
-        metric="pans_disk_left_seconds"),
+        metric="pans_disk_left_seconds", more="left out of the file while it is not known"),
     Figure("", "Size of the recording, or of its open part", None, unit="bytes", live="recording_bytes", metric="pans_recording_bytes"),
     Figure("", "Times the computer's clock was set during the run", None, live="host_clock_steps", metric="pans_host_clock_steps",
         counts=True),
     Figure("", "Whether the computer's clock is synchronised", None, live="host_clock_synchronised",
-        metric="pans_host_clock_synchronised"),
+        metric="pans_host_clock_synchronised", more="as the kernel says (Linux)"),
     Figure("", "Parts of the recording that were begun", None, live="parts", metric="pans_recording_parts", counts=True),
     Figure("", "1 while the detector in the dark, or the light, is not as it should be", None, live="alarms", metric="pans_alarm",
-        label="kind", see="../how-to/dark-counts.md"),
+        label="kind", more="`hot`, `burst`, `drift`, `quiet`, `dead`, and `light`", see="../how-to/dark-counts.md"),
     Figure("", "Dark rate over the expected one at the finding", None, live="times_expected", metric="pans_alarm_times_expected",
         label="kind"),
 )  # fmt: skip

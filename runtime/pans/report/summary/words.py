@@ -30,10 +30,8 @@ if TYPE_CHECKING:
 UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host takes
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 _SHARES = tuple(one.key for one in FIGURES.values() if one.interval)
-_SHOWN = {
-    "figures": Shown.RESULTS,
-    "timed": Shown.TIMED,
-}  # tables of words.toml whose rows are those of the table of figures
+# tables of words.toml whose rows are those of the table of figures
+_SHOWN = {"figures": Shown.RESULTS, "timed": Shown.TIMED}
 Facts = Mapping[str, Any]
 Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 
