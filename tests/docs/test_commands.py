@@ -11,6 +11,7 @@ import doctest
 import json
 import os
 import re
+import runpy
 import shutil
 import signal
 import subprocess
@@ -76,6 +77,14 @@ def test_every_key_of_a_summary_is_explained(tmp_path: Path, capsys: pytest.Capt
     text = (ROOT / "docs/reference/exit-codes.md").read_text(encoding="utf-8")
     assert main(["demo", "--pace", "fast", "--seconds", "1", "--out", str(tmp_path / "demo"), "--json"]) == 0
     assert [key for key in json.loads(capsys.readouterr().out) if f"`{key}`" not in text] == []
+
+
+def test_the_tables_of_figures_are_those_of_today() -> None:
+    """`python docs/assets/figures.py` writes them."""
+    made = runpy.run_path(str(ROOT / "docs/assets/figures.py"))
+    text = made["PAGE"].read_text(encoding="utf-8")
+    assert text.count("<!-- figures: ") == 4
+    assert made["filled"](text) == text
 
 
 def test_every_face_has_a_place_in_the_interface() -> None:

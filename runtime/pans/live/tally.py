@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pans.base.numbers import GROUPS, group_of
+from pans.base.numbers import GROUPS, LIGHT, DecisionFigures, decision_figures
 from pans.decide import DecisionFlag, is_decided
 from pans.decide.dark import DarkReport
 from pans.live.timing.ledger import TimingLedger
@@ -35,23 +35,14 @@ def _some(values: I64, where: npt.NDArray[np.bool_]) -> I64:
     return values if where.all() else values[where]
 
 
-@dataclass(frozen=True, slots=True)
-class TallyFigures:
-    """What decisions add up to; None where it is not known. Accuracy, clicks and photons are per decision of one group."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TallyFigures(DecisionFigures):
+    """What the decisions of a run add up to, with the spread of the accuracy."""
 
-    accuracy: float | None
     accuracy_std_trials: float | None
     accuracy_stderr_objects: float | None
     objects: int
     trials: int
-    decisions: int
-    decided: int  # not abstained
-    judged: int  # of these with a known true class
-    abstained: int
-    clicks_mean: float | None
-    photons_mean: float | None
-    photons_known: int  # decisions of the group whose photons are known: `photons_mean` is of these
-    figures_of: dict[str, str]  # key -> its group (denominators.GROUPS)
 
 
 @dataclass(slots=True)
@@ -179,29 +170,20 @@ class RunTally:
         """Decisions with a label and a known true class."""
         return self.of["judged"].n
 
-    @property
-    def accuracy(self) -> float | None:
-        """Right decisions over those that are judged; None without any."""
-        return self.right / self.judged if self.judged else None
+    def sums(self) -> dict[str, Any]:
+        """Return what `decision_figures` needs; cheap enough for each look at a run in progress."""
+        found: dict[str, Any] = {"right": self.right} | {name: sums.n for name, sums in self.of.items()}
+        return found | {f"{name}_{what}": getattr(sums, what) for name, sums in self.of.items() for what in LIGHT}
 
     def figures(self) -> TallyFigures:
         """Return accuracy, its spread over trials and over objects, clicks and photons per decision."""
         per_trial = [right / n for n, right in self._trials.tolist() if n]
-        counts = {name: sums.n for name, sums in self.of.items()}
-        group = group_of(counts)
-        light = self.of[group]
         return TallyFigures(
-            accuracy=self.accuracy,
+            **asdict(decision_figures(self.sums())),
             accuracy_std_trials=float(np.std(per_trial, ddof=1)) if len(per_trial) > 1 else None,
             accuracy_stderr_objects=self._spread_over_objects(),
             objects=self.objects,
             trials=len(per_trial),
-            **counts,
-            abstained=self.abstained,
-            clicks_mean=light.clicks / light.n if light.n else None,
-            photons_mean=light.photons / light.photons_known if light.photons_known else None,
-            photons_known=light.photons_known,
-            figures_of={"accuracy": "judged", **dict.fromkeys(("clicks_mean", "photons_mean", "illumination"), group)},
         )
 
 

@@ -128,4 +128,4 @@ def test_an_ambiguous_decision_counts_as_abstained_and_as_unsure() -> None:
     tally = RunTally(2, 1)
     add(tally, decision(0, 0, NO_LABEL, 1, flags=int(DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED)), 1.0)
     add(tally, decision(0, 1, NO_LABEL, 1, flags=int(DecisionFlag.GAP | DecisionFlag.ABSTAINED)), 1.0)
-    assert (tally.figures().abstained, tally.unsure, tally.accuracy) == (2, 1, None)
+    assert (tally.figures().abstained, tally.unsure, tally.figures().accuracy) == (2, 1, None)

@@ -30,6 +30,7 @@ from pans.base.errors import (
 )
 from pans.base.files import RUNS
 from pans.base.machine import check_core, lacking
+from pans.base.numbers import Shown, shown
 from pans.decide.flow import FlowSettings, read_flow, with_gate
 from pans.instrument.calibration_file import MAX_AGE_H
 from pans.instrument.profile import Profile, load_profile
@@ -73,15 +74,10 @@ class Outcome:
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the figures of the summary, and the files."""
         found = self.summary.as_json()
-        counts, means = ("decisions", "abstained", "judged"), ("clicks_mean", "photons_mean", "illumination")
-        latency = found.get("latency_us") or {}
         rows = {
             "clicks are": "SIMULATED" if found.get("simulated") else "",
-            **{
-                name: found.get(name)
-                for name in ("verdict", "faults", "ended", *counts, "accuracy", *means, "late", "lost")
-            },
-            "latency p99 (us)": latency.get("p99"),
+            "verdict": self.summary.verdict,
+            **{one.key: one.value(found) for one in shown(Shown.CARD)},
             "recording": self.recording,
         }
         return html_card("Run", rows)

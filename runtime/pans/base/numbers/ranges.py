@@ -53,8 +53,23 @@ class Range:
         return value
 
 
+@dataclass(frozen=True, slots=True)
+class Each:
+    """An object whose values, or a list whose items, all are of one shape; `size` items, None: any number."""
+
+    kind: type[dict[str, Any]] | type[list[Any]]
+    shape: Any
+    size: int | None = None
+
+
 WHOLE = Range(-(1 << 63), (1 << 63) - 1, whole=True)
 FINITE = Range(-1e300, 1e300)
+COUNT = Range(0, 1 << 53, whole=True)
+AMOUNT = Range(0, 1e26)  # photons, microseconds, seconds; 2^64 ticks of a clock of 1 Hz are 2e25 us
+SIGNED = Range(-1e26, 1e26)
+SHARE = Range(0, 1)
+END_OF_INTERVAL = Range(-1e-9, 1 + 1e-9)  # rounding may lead a little beyond a share
+OBJECTS = Range(0, (1 << 32) - 1, whole=True)  # a decision has its object as u32
 
 
 def demand(holds: bool, message: str) -> None:

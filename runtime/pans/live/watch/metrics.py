@@ -15,45 +15,10 @@ from wsgiref.simple_server import WSGIRequestHandler
 
 from pans.base.console import missing_extra
 from pans.base.errors import UsageError, refusing
+from pans.base.numbers import live_figures
 
 LOOPBACK = "127.0.0.1"
 REQUEST_S = 2.0  # without a byte from a client
-# picture key -> (metric, counts up, help); keys in us become seconds
-FIGURES = {
-    "decisions": ("pans_decisions", True, "Decisions made"),
-    "late": ("pans_late_decisions", True, "Decisions later than the deadline"),
-    "lost_exposures": ("pans_lost_exposures", True, "Exposures that never came"),
-    "gaps": ("pans_gaps", True, "Gaps in the stream"),
-    "exposures": ("pans_exposures", True, "Exposures received"),
-    "reconnects": ("pans_reconnects", True, "Times the device was lost and found again"),
-    "dark_exposures": ("pans_dark_exposures", True, "Exposures without light"),
-    "dark_clicks": ("pans_dark_clicks", True, "Clicks in exposures without light"),
-    "latency_p99_us": ("pans_latency_p99_seconds", False, "Exposure end to decision, 99 % quantile of the run"),
-    "latency_max_us": ("pans_latency_max_seconds", False, "Exposure end to decision, longest of the run"),
-    "exposure_start_us": ("pans_exposure_start_error_seconds", False, "Farthest start of an exposure off its tick"),
-    "exposure_length_us": ("pans_exposure_length_error_seconds", False, "Farthest length of an exposure off the plan"),
-    "rss_bytes": ("pans_resident_memory_bytes", False, "Resident memory"),
-    "handles": ("pans_open_handles", False, "Open file handles"),
-    "threads": ("pans_threads", False, "Threads"),
-    "loop_age_s": ("pans_loop_age_seconds", False, "Since the loop turned last"),
-    "uptime_s": ("pans_uptime_seconds", False, "Since the start of the command"),
-    "disk_free_bytes": ("pans_disk_free_bytes", False, "Free bytes on the disk of the recording"),
-    "disk_left_s": (
-        "pans_disk_left_seconds",
-        False,
-        "Until that is full at the present rate; +Inf: not known, or never",
-    ),
-    "recording_bytes": ("pans_recording_bytes", False, "Size of the recording, or of its open part"),
-    "host_clock_steps": ("pans_host_clock_steps", True, "Times the computer's clock was set during the run"),
-    "host_clock_synchronised": ("pans_host_clock_synchronised", False, "Whether the computer's clock is synchronised"),
-    "parts": ("pans_recording_parts", True, "Parts of the recording that were begun"),
-}
-LABELLED = {  # picture key -> (metric, counts up, label, help)
-    "late_cause": ("pans_late_decisions_by_cause", True, "cause", "Late decisions by cause"),
-    "lost_cause": ("pans_lost_exposures_by_cause", True, "cause", "Lost exposures by cause"),
-    "alarms": ("pans_alarm", False, "kind", "1 while the detector in the dark, or the light, is not as it should be"),
-    "times_expected": ("pans_alarm_times_expected", False, "kind", "Dark rate over the expected one at the finding"),
-}
 
 
 def parse_address(text: str, option: str = "--metrics") -> tuple[str, int]:
@@ -101,15 +66,19 @@ class Collector:
         picture = self._look()
         if "disk_free_bytes" in picture:  # a recording is written: an alert needs the figure to be there at all times
             picture = {"disk_left_s": math.inf} | picture
-        for key, (name, counts, words) in FIGURES.items():
-            if picture.get(key) is not None:
-                value = picture[key] * (1e-6 if key.endswith("_us") else 1)
-                yield (CounterMetricFamily if counts else GaugeMetricFamily)(name, words, value=value)
-        for key, (name, counts, label, words) in LABELLED.items():
-            family = (CounterMetricFamily if counts else GaugeMetricFamily)(name, words, labels=[label])
-            for which, value in picture.get(key, {}).items():
-                family.add_metric([which], value)
-            yield family
+        served = [
+            (one, CounterMetricFamily if one.counts else GaugeMetricFamily) for one in live_figures() if one.metric
+        ]
+        for one, kind in served:
+            if not one.label and picture.get(one.live) is not None:
+                value = picture[one.live] * (1e-6 if one.unit == "us" else 1)  # Prometheus takes base units
+                yield kind(one.metric, one.meaning, value=value)
+        for one, kind in served:
+            if one.label:  # also without a sample: a dashboard asks for the name
+                family = kind(one.metric, one.meaning, labels=[one.label])
+                for which, value in picture.get(one.live, {}).items():
+                    family.add_metric([which], value)
+                yield family
         words, running = "1 while the device measures and the loop turns", picture.get("state") == "running"
         yield GaugeMetricFamily("pans_running", words, value=float(running))
         if "last_verdict" in picture:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from pans.base.errors import DamagedFileError, UsageError
 from pans.base.files import canonical_json, parse_json_object, replace_file
+from pans.base.numbers import Part, decision_figures, live_figures
 from pans.decide.still import DARK_CLICKS, DARK_EXPOSURES
 from pans.live.journal import words_of
 
@@ -105,9 +106,18 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         "dark_clicks": int(tallies[DARK_CLICKS]),
         **{key: ticks * run.plan.tick_us for key, ticks in exposed.items()},
         "reconnects": run.reconnects,
+        **_of_decisions(run),
         **alarms_of(run),
         "last_error": f"{trouble['kind']}: {words_of(trouble)}" if trouble else "",
     }
+
+
+def _of_decisions(run: LiveRun) -> dict[str, Any]:
+    """Return those figures of the state file that follow from the decisions alone, as in the summary."""
+    # not `decisions`: of a recording those that are in the file count
+    wanted = [one for one in live_figures() if one.part is Part.DECISIONS and one.key != "decisions"]
+    found = decision_figures(run.tally.sums()) if wanted else None
+    return {one.live: getattr(found, one.key) for one in wanted}
 
 
 def state_of(run: LiveRun) -> str:

@@ -7,81 +7,22 @@ those of a run that ended with a verdict have to be there: recordings of earlier
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 from pans.base.errors import DamagedFileError
-from pans.base.numbers import Range, number_text
+from pans.base.numbers import AMOUNT, COUNT, END_OF_INTERVAL, FIGURES, SHARE, Each, Range, number_text
 
-COUNT = Range(0, 1 << 53, whole=True)
-FIGURE = Range(0, 1e26)  # photons, microseconds, seconds; 2^64 ticks of a clock of 1 Hz are 2e25 us
-SIGNED = Range(-1e26, 1e26)
-SHARE = Range(0, 1)
-END_OF_INTERVAL = Range(-1e-9, 1 + 1e-9)  # rounding may lead a little beyond a share
-OBJECTS = Range(0, (1 << 32) - 1, whole=True)  # a decision has its object as u32
 # used as they are; the others are left out where they are not there
 NEEDED = ("decisions", "abstained", "objects", "trials", "latency_us", "clock", "device")
 
-
-@dataclass(frozen=True, slots=True)
-class Each:
-    """An object whose values, or a list whose items, all are of one shape; `size` items, None: any number."""
-
-    kind: type[dict[str, Any]] | type[list[Any]]
-    shape: Any
-    size: int | None = None
-
-
 # A shape is a Range, a type, None, Each, an object's shapes by key (`+` ends one that must be there), or a tuple of shapes of which one
 # must fit.
-_SHARES = ("accuracy", "accuracy_labelled", "missed", "doubled", "yield", "purity")
-_COUNTS = (
-    "decisions",
-    "decided",
-    "judged",
-    "abstained",
-    "abstained_below_confidence",
-    "objects",
-    "trials",
-    "photons_known",
-)
-_MEANS = ("clicks_mean", "photons_mean", "exposures_mean", "passage_clicks_mean", "passage_photons_mean")
-_LIGHT = ("illumination", "illumination_mean", "turn_budget_us")
-_TEXTS = ("ended", "drive", "busy", "decisions_sha256", "next")
-_QUANTILES = {f"{name}+": (None, FIGURE) for name in ("p50", "p99", "p999", "max")}
-_DARK = {
-    **{"exposures+": COUNT, "clicks+": COUNT, "per_exposure+": SHARE, "expected+": (None, FIGURE)},
-    **{"low+": END_OF_INTERVAL, "high+": END_OF_INTERVAL},
-}
+_SHARES = tuple(one.key for one in FIGURES.values() if one.interval)
 _SHAPES: dict[str, Any] = {
-    **dict.fromkeys((*_COUNTS, "late", "lost", "late_slots", "reconnects", "wrong_patterns"), COUNT),
-    **dict.fromkeys((*_SHARES, "accuracy_std_trials", "confidence", "late_allowed"), (None, SHARE)),
+    **{key: one.allowed for key, one in FIGURES.items() if one.allowed is not None},
     **{f"{name}_ci": (None, Each(list, END_OF_INTERVAL, 2)) for name in _SHARES},
-    "accuracy_stderr_objects": (None, Range(0, 0), Range(1e-70, 1)),  # its square divides
-    **dict.fromkeys((*_MEANS, *_LIGHT), (None, FIGURE)),
-    **dict.fromkeys(("deadline_us", "slot_jitter_us", "armed_after_s", "seconds"), FIGURE),
-    "expected_off_stderr": (None, SIGNED),
-    **dict.fromkeys(_TEXTS, str),
-    **dict.fromkeys(("simulated", "link_lost"), bool),
-    **dict.fromkeys(("faults", "warnings", "calibration_warnings"), Each(list, str)),
-    "figures_of": Each(dict, str),
-    **dict.fromkeys(("late_cause", "stream", "aborted", "gates"), Each(dict, COUNT)),
-    "page_faults": Each(dict, FIGURE),
-    "realtime": dict,
-    "passages": {"alone+": COUNT, "missed+": COUNT},
-    "device": {"objects": OBJECTS},
-    "clock": {"worst_uncertainty_us+": FIGURE, "drift_ppm": (None, SIGNED)},
-    "latency_us": _QUANTILES,
-    "stage_latency_us": Each(dict, _QUANTILES),
-    "turn_us": (None, _QUANTILES),
-    "exposure_timing": {
-        **dict.fromkeys(("exposures", "untold"), COUNT),
-        **dict.fromkeys(("worst_start_us", "worst_length_us", "tolerance_us"), (None, SIGNED)),
-    },
-    "expected": (None, {"accuracy": (None, SHARE), "clicks": (None, FIGURE), "photons": (None, FIGURE)}),
-    "dark": {**_DARK, "alarm": str, "findings": list, "channels": Each(list, _DARK)},
+    "next": str,  # of a part that was full: the file of the next one
 }
-
 _HEADER = {
     **dict.fromkeys(("created_utc", "command", "device_url"), str),
     **dict.fromkeys(("simulated", "virtual_time"), bool),
@@ -100,7 +41,7 @@ _EVENT = {
 _OF_A_KIND = {  # what events of a kind must be besides
     "dark_state": {
         **{"state+": str, "channels+": Each(list, NUMBER), "dark_exposure+": NUMBER},
-        **{"rate": FIGURE, "expected": FIGURE, "words": str, "level": str},
+        **{"rate": AMOUNT, "expected": AMOUNT, "words": str, "level": str},
     },
     "part": {
         **{"number+": Range(1, 1 << 53, whole=True), "first_decision+": NUMBER},

@@ -28,6 +28,7 @@ from pans.base.files import (
     parse_json_object,
     read_block,
 )
+from pans.base.numbers import Shown, shown
 from pans.bundle.sensor import Bundle, read_bundle
 from pans.decide import DECISION_DTYPE
 from pans.protocol.clock import CLOCK_DTYPE
@@ -91,7 +92,6 @@ class Recording:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: what was run, and how it ended."""
-        names = ("verdict", "accuracy", "clicks_mean", "photons_mean", "judged", "abstained", "late", "lost")
         rows = {
             "clicks are": "SIMULATED" if self.simulated else "",
             "recorded": str(self.header.get("created_utc", ""))[:19],
@@ -99,7 +99,8 @@ class Recording:
             "device": self.header.get("device_url"),
             "decisions": self.n_decisions,
             "complete": "yes" if self.complete else "no: cut off",
-            **{name: self.summary.get(name) for name in names},
+            "verdict": self.summary.get("verdict"),
+            **{one.key: one.value(self.summary) for one in shown(Shown.CARD) if one.key != "decisions"},
             "bytes": self.size,
             "damage": self.damage,
         }

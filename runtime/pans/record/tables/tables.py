@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pans.base.console import needed
 from pans.base.errors import DamagedFileError, UsageError
+from pans.base.numbers import Shown, shown
 from pans.bundle.backends import NO_LABEL
 from pans.decide import DecisionFlag
 from pans.decide.plan import Plan
@@ -91,7 +92,10 @@ def tick_us(recording: Recording) -> float:
 
 
 def facts_of(recording: Recording) -> dict[str, Any]:
-    """Return what stands beside a table: where it is from, and whether its clicks are simulated."""
+    """Return what stands beside a table: where it is from, whether its clicks are simulated, and figures of the run.
+
+    A figure is None where the recording was cut, or does not know it.
+    """
     return {
         "recording": recording.path.name,
         "simulated": recording.simulated,
@@ -102,6 +106,7 @@ def facts_of(recording: Recording) -> dict[str, Any]:
         "classes": list(recording.bundle().classes if recording.bundle_place else ()),
         "decisions_sha256": recording.decisions_sha256,
         "bundle_sha256": recording.header.get("bundle_sha256"),
+        "figures": {one.key: one.value(recording.summary) for one in shown(Shown.EXPORT)},
     }
 
 
@@ -238,7 +243,9 @@ def to_xarray(recording: Recording, table: str = "decisions") -> Any:
         said = {"long_name": meaning, "units": unit, "missing": f"{empty!r}: {missing}" if missing else ""}
         filled = filled.astype(str) if column.dtype == "str" else filled
         found[name] = ("time", filled, {key: value for key, value in said.items() if value})
-    about = {key: int(value) if isinstance(value, bool) else value or "" for key, value in facts_of(recording).items()}
+    facts = facts_of(recording)
+    facts |= {key: np.nan if value is None else value for key, value in facts.pop("figures").items()}
+    about = {key: int(value) if isinstance(value, bool) else value or "" for key, value in facts.items()}
     return xarray.Dataset(found, {"time": ("time", times, {"long_name": "UTC"})}, about)
 
 

@@ -10,7 +10,6 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs
@@ -21,17 +20,17 @@ from numpy.typing import NDArray
 from pans.base.console import one_line
 from pans.base.errors import DamagedFileError, UsageError
 from pans.base.files import parse_json_object, read_file
-from pans.base.numbers import group_of, number
+from pans.base.numbers import FIGURES, Figure, Shown, group_of, number, shown
 from pans.decide import is_decided, is_judged
 from pans.protocol.wire import NO_OBJECT
 from pans.record.reading import TICK_HZ, checked_summary, open_recording
-from pans.report.pages.page import flat, render, words
+from pans.report.pages.page import flat, render
 from pans.report.pages.run import Decisions, is_virtual, latency_curves, ledger_of
 
 from . import statistics
 
 ALPHA = 0.05
-QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 LEAST_BEYOND = 10  # decisions slower than a quantile, or nothing is said about it
 SUMMARY_MAX_BYTES = 1 << 24
 # Facts that differ between any two runs, or that follow from others.
@@ -226,23 +225,32 @@ def _findings(first: Side, second: Side, paired: bool) -> Iterator[Finding]:
         yield accuracy
     yield from _abstained(sides)
     yield _clicks(sides, paired)
-    yield _untested("photons_mean", "photons per decision", _told(sides, "photons_mean"))
-    shown, light = _told(sides, "illumination_mean"), _told(sides, "illumination")  # of an automaton the states shown
-    yield _untested("illumination", "illumination per decision", [a if b is None else b for a, b in zip(light, shown)])
-    for row in words()["counts"]:
-        counts, totals = ([int(one or 0) for one in _told(sides, *row[keys])] for keys in ("count", "total"))
-        if all(totals) and (any(counts) or row["always"]):
-            four = counts[0], totals[0], counts[1], totals[1]
-            rates, how = (four[0] / four[1], four[2] / four[3]), "{} of {} and {} of {} ".format(*four) + row["method"]
-            ratio, p = statistics.rate_ratio(*four), statistics.poisson_rates(*four)
-            yield Finding(row["name"], row["unit"], *rates, *ratio, True, p, how)
+    compared = [one for one in shown(Shown.COMPARE) if one.key != "clicks_mean"]
+    yield from (_untested(one.key, one.unit, _values(sides, one)) for one in compared if not one.total)
+    yield from (rate for one in compared if one.total for rate in _rates(sides, one))
     yield from _latencies(sides)
 
 
-def _told(sides: Sides, *keys: str) -> list[Any]:
-    """What the summaries say below nested keys; None where one says nothing."""
-    start: list[Any] = [side.summary for side in sides]
-    return [reduce(lambda one, key: (one or {}).get(key), keys, one) for one in start]
+def _rates(sides: Sides, figure: Figure) -> Iterator[Finding]:
+    """A count as a rate of its total: two Poisson counts, each of so many."""
+    counts, totals = ([int(one or 0) for one in _values(sides, FIGURES[key])] for key in (figure.key, figure.total))
+    is_dark = figure.key == "dark.clicks"  # rare and independent: also where both are 0
+    if all(totals) and (any(counts) or is_dark):
+        four = counts[0], totals[0], counts[1], totals[1]
+        rates, of = (four[0] / four[1], four[2] / four[3]), FIGURES[figure.total].word
+        method = "as two Poisson counts, exact" if is_dark else "as two Poisson counts; bursts look surer than they are"
+        ratio, p = statistics.rate_ratio(*four), statistics.poisson_rates(*four)
+        how = "{} of {} and {} of {} ".format(*four) + f"{of} {method}"
+        yield Finding(figure.compared or figure.key, figure.rate_unit, *rates, *ratio, True, p, how)
+
+
+def _values(sides: Sides, figure: Figure) -> list[Any]:
+    """What the summaries say of a figure of the table; None where one says nothing."""
+    found = [figure.value(side.summary) for side in sides]
+    if figure.key != "illumination":
+        return found
+    # of an automaton that of the states shown, as recordings of earlier versions tell them apart
+    return [FIGURES["illumination_mean"].value(side.summary, light) for side, light in zip(sides, found)]
 
 
 def _untested(name: str, unit: str, values: list[Any], why: str = "not tested", *, is_ratio: bool = False) -> Finding:
@@ -275,7 +283,8 @@ def _figures_are_of(rows: NDArray[np.void]) -> NDArray[np.bool_]:
 
 
 def _accuracy(sides: Sides, paired: bool) -> Finding | None:
-    values, sizes = _told(sides, "accuracy"), [int(one or 0) for one in _told(sides, "objects")]
+    values, sizes = (_values(sides, FIGURES[key]) for key in ("accuracy", "objects"))
+    sizes = [int(one or 0) for one in sizes]
     if both := _both(sides, is_judged):
         right = [rows["label"] == rows["truth"] for rows in both]
         values = [float(one.mean()) if len(one) else None for one in right]
@@ -315,8 +324,8 @@ def _paired_accuracy(
 
 
 def _abstained(sides: Sides) -> Iterator[Finding]:
-    names = "abstained", "decisions", "trials"
-    abstained, decisions, trials = ([int(n or 0) for n in _told(sides, name)] for name in names)
+    figures = [FIGURES[key] for key in ("abstained", "decisions", "trials")]
+    abstained, decisions, trials = ([int(n or 0) for n in _values(sides, one)] for one in figures)
     if all(decisions) and any(abstained):
         sizes = [max(1, n // max(1, times)) for n, times in zip(decisions, trials)]
         shares = [some / n for some, n in zip(abstained, decisions)]
@@ -324,12 +333,12 @@ def _abstained(sides: Sides) -> Iterator[Finding]:
 
 
 def _clicks(sides: Sides, paired: bool) -> Finding:
-    unit, both = "clicks per decision", _both(sides, _figures_are_of)
+    figure, both = FIGURES["clicks_mean"], _both(sides, _figures_are_of)
     shares = [_of_objects(rows, lambda rows: rows["clicks"]) for rows in both]
     paired = paired and len(shares) == 2
     means = _pairs(*shares) if paired else [np.array([*one.values()]) for one in shares]
     if min(map(len, means), default=0) < 2:
-        return _untested("clicks_mean", unit, _told(sides, "clicks_mean"))
+        return _untested(figure.key, figure.unit, _values(sides, figure))
     one, two = means
     values = [float(rows["clicks"].mean()) for rows in both]
     if paired:
@@ -339,22 +348,23 @@ def _clicks(sides: Sides, paired: bool) -> Finding:
         between = statistics.mean_difference(one, two)
         method = f"{len(one)} and {len(two)} objects, each counts once (A {one.mean():.4g}, B {two.mean():.4g})"
     method += "; interval by the spread of their differences" if paired else "; interval by their spread"
-    return Finding("clicks_mean", unit, values[0], values[1], *between, False, None, method)
+    return Finding(figure.key, figure.unit, values[0], values[1], *between, False, None, method)
 
 
 def _latencies(sides: Sides) -> Iterator[Finding]:
     rows = [side.timings for side in sides]
     one, two = (None if t is None else (t["decided_ns"] - t["device_end_ns"]) / 1000.0 for t in rows)
-    for name, q in QUANTILES.items():
+    for key, q in QUANTILES.items():
+        figure = FIGURES[f"latency_us.{key}"]
         if one is None or two is None:
-            values = _told(sides, "latency_us", name.replace(".", ""))
+            values = _values(sides, figure)
             if None not in values and min(map(float, values)) >= statistics.LEAST_US:
-                yield _untested(f"latency_{name}", "us", values, "not tested: no single latencies", is_ratio=True)
+                yield _untested(figure.compared, figure.unit, values, "not tested: no single latencies", is_ratio=True)
         elif min(len(one), len(two)) * (1 - q) >= LEAST_BEYOND:
             found = statistics.quantile_ratio(one, two, q)
             method = "interval by a bootstrap of stretches of consecutive decisions"
             if min(found.first, found.second) >= statistics.LEAST_US:  # not in virtual time
-                yield Finding(f"latency_{name}", "us", found.first, found.second, *found.ratio, True, None, method)
+                yield Finding(figure.compared, figure.unit, found.first, found.second, *found.ratio, True, None, method)
 
 
 # ---- in words ----
@@ -411,7 +421,8 @@ def conclusion(comparison: Comparison) -> str:
 
 
 def _title(finding: Finding) -> str:
-    return str(words()["figures"].get(finding.name, finding.name))
+    found = (one.name for one in FIGURES.values() if finding.name in (one.compared, one.key))
+    return next(filter(None, found), finding.name)
 
 
 def _row(one: Finding) -> tuple[str, str, str, str, str]:

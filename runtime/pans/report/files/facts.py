@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pans.base.numbers import group_of
+from pans.base.numbers import decision_figures
 from pans.bundle.automaton import Automaton, shortest_walk
 from pans.bundle.backends import NO_LABEL
 from pans.bundle.sensor import Analyser, Bundle, amplification, load_bundle
@@ -103,14 +103,14 @@ def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
 def _recording_facts(recording: Recording) -> dict[str, Any]:
     bundle = recording.bundle() if recording.bundle_place else None
     n_classes = NO_LABEL if bundle is None else len(bundle.classes)
-    counts, clicks, right = Counter[str](), Counter[str](), 0
+    sums = Counter[str]()  # photons stay 0: a recording does not have them
     for rows in together(recording.iter_decisions()):
         judged, every = is_judged(rows, n_classes), np.ones(len(rows), np.bool_)
-        right += int(np.count_nonzero(judged & (rows["label"] == rows["truth"])))
+        sums["right"] += int(np.count_nonzero(judged & (rows["label"] == rows["truth"])))
         for name, some in {"decisions": every, "decided": is_decided(rows), "judged": judged}.items():
-            counts[name] += int(np.count_nonzero(some))
-            clicks[name] += int(rows["clicks"][some].sum(dtype=np.int64))
-    group = group_of(counts)
+            sums[name] += int(np.count_nonzero(some))
+            sums[f"{name}_clicks"] += int(rows["clicks"][some].sum(dtype=np.int64))
+    figures = decision_figures(sums)
     header = dict(recording.header)
     if isinstance(profile := header.pop("profile", None), dict):
         header["profile"] = {key: value for key, value in profile.items() if key != "toml"}
@@ -124,13 +124,13 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "blocks": {kind.name.lower(): count for kind, count in recording.kinds.items()},
         "first_decision": first_decision(recording),
         "decisions": recording.n_decisions,
-        "decided": counts["decided"],
-        "judged": counts["judged"],
-        "abstained": counts["decisions"] - counts["decided"],
+        "decided": figures.decided,
+        "judged": figures.judged,
+        "abstained": figures.abstained,
         "decisions_sha256": recording.decisions_sha256,
-        "clicks_mean": clicks[group] / counts[group] if counts[group] else None,
-        "accuracy": right / counts["judged"] if counts["judged"] else None,
-        "figures_of": {"accuracy": "judged", "clicks_mean": group},
+        "clicks_mean": figures.clicks_mean,
+        "accuracy": figures.accuracy,
+        "figures_of": {name: figures.figures_of[name] for name in ("accuracy", "clicks_mean")},
         "messages": sum(1 for _ in recording.messages()),
         "answers": sum(1 for _ in recording.answers()),
         "handshakes": handshakes(recording),

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from pans.base.console import one_line
-from pans.base.numbers import group_of, group_words, number, wilson_interval
+from pans.base.numbers import FIGURES, Shown, decision_figures, group_words, number, shown, wilson_interval
 
 from .history import History, quantile_us
 
@@ -61,23 +61,28 @@ def _results(history: History) -> Iterator[Row]:
 
 def _light(picture: dict[str, Any], begin: dict[str, Any], history: History) -> Iterator[Row]:
     """Accuracy and light per decision, of one group of decisions."""
-    done, abstained = picture["decisions"], picture["abstained"]
-    group, of = group_of(picture), group_words(picture)
-    if picture["judged"]:
-        share, low, high = history.accuracy(picture, picture["objects"])
-        between = f"95 % interval {low:.1%} to {high:.1%} ({picture['objects']:,} objects)"
-        yield Row("accuracy", f"{share:.1%}{f' {of}' if of else ''}, {between}")
+    found, of = decision_figures(picture), group_words(picture)
+    done, abstained = found.decisions, found.abstained
+    if found.judged:
+        accuracy, ends = FIGURES["accuracy"].brief, history.accuracy(picture, picture["objects"])
+        share, low, high = map(accuracy, ends)
+        between = f"95 % interval {low} to {high} ({picture['objects']:,} objects)"
+        yield Row("accuracy", f"{share}{f' {of}' if of else ''}, {between}")
     if done:
         yield Row("abstained", f"{abstained:,} ({abstained / done:.2%})", "note" if abstained else "")
-        known, walked = picture[f"{group}_photons_known"], picture.get("walk_light")
-        photons = f"{picture[f'{group}_photons'] / known:.2f} photons" if known else "photons unknown"
+        walked, clicks = picture.get("walk_light"), FIGURES["clicks_mean"].brief(found.clicks_mean)
+        photons = FIGURES["photons_mean"].brief(found.photons_mean)
         light = begin.get("illumination") if walked is None else walked / done
         apart = walked is not None and bool(abstained)  # which states belong to decisions that abstained is not counted
-        text = f"{picture[f'{group}_clicks'] / picture[group]:.2f} clicks, {photons}"
-        text += "" if light is None or apart else f", illumination {light:.1f}"
+        text = f"{clicks} clicks, {photons} photons" if found.photons_known else f"{clicks} clicks, photons unknown"
+        shone = FIGURES["illumination"].brief(light)
+        text += "" if light is None or apart else f", illumination {shone}"
         yield Row("light per decision", f"{text}{f'; {of}' if of else ''}")
         if apart and light is not None:
-            yield Row("illumination", f"{light:.1f} per decision, of all {done:,}")
+            yield Row("illumination", f"{shone} per decision, of all {done:,}")
+    for one in shown(Shown.LIVE):
+        if one.live in picture:
+            yield Row(one.name, one.brief(picture[one.live]))
 
 
 def _latency(picture: dict[str, Any], counts: Counter[int], deadline: float) -> Iterator[Row]:
@@ -143,15 +148,15 @@ def title_of(history: History) -> str:
 def headline(history: History) -> str:
     """Return the most important figures as one line."""
     picture, expected = history.picture, history.begin.get("expected", 0)
-    decisions, abstained, group = picture["decisions"], picture["abstained"], group_of(picture)
-    accuracy = f" · accuracy {picture['right'] / picture['judged']:.1%}" if picture["judged"] else ""
+    found = decision_figures(picture)
+    accuracy = f" · accuracy {FIGURES['accuracy'].brief(found.accuracy)}" if found.judged else ""
     p99 = None if picture.get("virtual_time") else quantile_us(history.latency, 0.99)
     dark, _, level = dark_state(picture)
     of = group_words(picture)
     return (
-        f"{decisions}{f' of {expected}' if expected else ''} decisions"
-        + (f", {abstained} abstained" if abstained else "")
-        + f"{accuracy} · {picture[f'{group}_clicks'] / max(picture[group], 1):.2f} clicks each{f' ({of})' if of else ''}"
+        f"{found.decisions}{f' of {expected}' if expected else ''} decisions"
+        + (f", {found.abstained} abstained" if found.abstained else "")
+        + f"{accuracy} · {FIGURES['clicks_mean'].brief(found.clicks_mean or 0.0)} clicks each{f' ({of})' if of else ''}"
         + ("" if p99 is None else f" · p99 {min(p99, picture['latency_max_us']) / 1000:.2f} ms")
         + f" · late {picture['late']} · lost {picture['lost_exposures']}"
         + (f" · dark counts: {dark}" if level not in ("", "good") else "")

@@ -13,11 +13,10 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from pans.base.numbers import GROUPS, has_quantile, wilson_interval
+from pans.base.numbers import GROUPS, LIGHT, has_quantile, wilson_interval
 
 LEVELS = (1.0, 5.0, 30.0, 180.0, 1200.0, 7200.0)  # seconds of a bin
 BINS = 512  # of a level: 8 minutes, 42 minutes, 4 hours, 1 day, 1 week, 6 weeks
-LIGHT = ("clicks", "photons", "photons_known")  # of each group of decisions
 SUMS: tuple[str, ...] = (*GROUPS, *(f"{of}_{what}" for of in GROUPS for what in LIGHT), "right", "late")
 SUMS += ("lost_exposures", "dark_exposures", "dark_clicks")
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.base.numbers import GROUPS
 from pans.bundle.automaton import walk_nodes
 from pans.bundle.backends import log_evidence
 from pans.decide import DecisionFlag
@@ -26,7 +25,6 @@ from pans.live.loop import words_of
 from pans.live.timing import upper_edge
 
 from .alarms import INSTANT
-from .history import LIGHT
 
 if TYPE_CHECKING:
     from pans.bundle.sensor import Bundle
@@ -39,7 +37,6 @@ SAME = 1e-3  # of two probabilities
 EVENTS_MAX = 50  # of one picture; what is left comes with the next
 PIXELS_MAX = 64  # of a side, as it is shown
 PATTERNS_MAX = 2048  # whose pixels are told in one run
-TALLIED = ("decisions", "abstained", "judged", "right", "objects")
 BREATH_S = 0.0002  # between two readings, for the loop
 
 
@@ -80,9 +77,8 @@ class Snapshots:
         run, core = self._run, cast(Any, self._run.core)  # of any kind
         wrong = sum((run.contradictions + core.contradictions).values()) + core.tracker.counters.repeats_differing
         light = None if self._light is None else float(core.windows.walks.shown @ self._light)
-        figures = {name: getattr(run.tally, name) for name in TALLIED} | {"walk_light": light, "contradictions": wrong}
-        figures["decided"] = figures["decisions"] - figures["abstained"]
-        return figures | {f"{of}_{what}": getattr(run.tally.of[of], what) for of in GROUPS for what in LIGHT}
+        figures: dict[str, Any] = run.tally.sums() | {"objects": run.tally.objects}
+        return figures | {"walk_light": light, "contradictions": wrong}
 
     def _latency(self) -> dict[str, Any]:
         """The histogram of latencies as it has grown since the last picture: [duration in ns, how many more]."""

@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from pans.base.numbers import FIGURES, Figure, Shown, shown
 from pans.decide import is_judged
 from pans.record.reading import skim_decisions
 from pans.report.summary.words import accuracy_interval
@@ -28,8 +29,9 @@ Run = Any  # of app/commands/runs.py, a package that comes later
 def index_page(root: Path, runs: Sequence[Run], beside: Path) -> bytes:
     """Return the page of the runs in `root`, the newest first, with links from the folder `beside`."""
     rows = [(run, run.summary, accuracy_interval(run.summary), _link(run, beside), _spark(run)) for run in runs]
-    trends = {name: _trend(runs, name) for name in ("accuracy", "dark", "clicks_mean", "late")}
-    return render("index.html", root=root, rows=rows, trends=trends, simulated=any(run.simulated for run in runs))
+    trends = [(one, _trend(runs, one)) for one in shown(Shown.TREND)]
+    simulated = any(run.simulated for run in runs)
+    return render("index.html", root=root, rows=rows, trends=trends, columns=[*shown(Shown.INDEX)], simulated=simulated)
 
 
 def _link(run: Run, beside: Path) -> str:
@@ -55,30 +57,33 @@ def accuracy_over(recordings: Sequence[Path]) -> list[float]:
 # ---- trends ----
 
 
-def _figures(one: Mapping[str, Any]) -> dict[str, tuple[float, float, float]]:
-    """The figures that a summary has, with the ends of their intervals."""
-    found, dark, ends = {}, one.get("dark") or {}, accuracy_interval(one)
-    if ends is not None and one.get("accuracy") is not None:
-        found["accuracy"] = (one["accuracy"], *ends)
-    if dark.get("exposures"):
-        found["dark"] = (dark["clicks"] / dark["exposures"], dark["low"], dark["high"])
-    for name in ("clicks_mean", "late"):
-        if one.get(name) is not None and one.get("decisions"):
-            found[name] = (one[name] / (one["decisions"] if name == "late" else 1),) * 3
-    return found
+def _ends(figure: Figure, one: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    """A figure of a summary, a count as a share of its total, with the ends of its interval; None where it is not known."""
+    value, dark = figure.value(one), one.get("dark") or {}
+    if figure.key == "dark.per_exposure":
+        return (value, dark["low"], dark["high"]) if dark.get("exposures") else None
+    if figure.key == "accuracy":
+        ends = accuracy_interval(one)
+        return None if value is None or ends is None else (value, *ends)
+    if value is None or not one.get("decisions"):
+        return None
+    return (value / FIGURES[figure.total].value(one) if figure.total else value,) * 3
 
 
-def _trend(runs: Sequence[Run], name: str) -> dict[str, Any] | None:
+def _trend(runs: Sequence[Run], figure: Figure) -> dict[str, Any] | None:
     """One figure of all runs over time, as arrays (runs,); None where fewer than two know it.
 
     `expected` is that of the dark rate; `top` is the largest figure, `least` the least one above 0.
     """
-    some = sorted((run for run in runs if name in _figures(run.summary)), key=lambda run: run.started)
-    if len(some) < 2:
+    known = ((run, _ends(figure, run.summary)) for run in sorted(runs, key=lambda run: run.started))
+    found = [(run, ends) for run, ends in known if ends is not None]
+    if len(found) < 2:
         return None
-    when, *figures = np.array([(run.started.timestamp(), *_figures(run.summary)[name]) for run in some]).T
+    some = [run for run, _ in found]
+    when, *figures = np.array([(run.started.timestamp(), *ends) for run, ends in found]).T
     unit, unit_s = next(one for one in UNITS if when[-1] - when[0] >= 2 * one[1] or one is UNITS[-1])
-    dark = ((run.summary.get("dark") or {}).get("expected") if name == "dark" else None for run in some)
+    is_dark = figure.key == "dark.per_exposure"
+    dark = ((run.summary.get("dark") or {}).get("expected") if is_dark else None for run in some)
     expected, failed = np.array([one or np.nan for one in dark]), np.array([run.verdict == "FAIL" for run in some])
     every = np.array([*figures, expected])
     ends = {"top": float(np.nanmax(every)), "least": float(np.nanmin(every[every > 0], initial=1.0))}

@@ -6,10 +6,11 @@ import os
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from pans.base.machine import load_average
+from pans.base.numbers import Part, keys_of
 from pans.bundle.sensor import Bundle
 from pans.decide.dark import DarkReport
 from pans.decide.plan import Plan
@@ -28,7 +29,7 @@ _ONE = r"(?<![\d.,])1 (attempt|click|decision|exposure|gap|message|object|part|p
 
 @dataclass(frozen=True, slots=True)
 class WalkFigures:
-    """The keys of the contract that a run with an automaton has besides. None where it is not known."""
+    """Figures of a run with an automaton; None where it is not known."""
 
     drive: str  # device or host
     confidence: float  # at which a walk was to end; 0.0: none
@@ -44,11 +45,11 @@ class WalkFigures:
     expected_off_stderr: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Summary(TallyFigures):
-    """What a run came to. The fields are the contract's keys; as_json() has those of `flow` and `walks` beside the others."""
+    """Results of a run. The fields have the names of the table of figures; as_json() adds those of `flow` and `walks`."""
 
-    flow: FlowFigures | None  # of passing objects: figures of the same name stand in place of those of still ones
+    flow: FlowFigures | None  # of passing objects: its figures of the same name replace those of still ones
     walks: WalkFigures | None  # of an automaton
     illumination: float  # per decision, photoelectrons per unit transmission
     late: int
@@ -95,18 +96,11 @@ class Summary(TallyFigures):
 
     def as_json(self) -> dict[str, Any]:
         """Return the summary under the contract's keys, in their order."""
-        facts = {name: getattr(self, name) for name in OF_DECISIONS} | (
-            {} if self.flow is None else self.flow.as_json()
-        )
-        if self.walks is not None:  # which of the states shown belonged to which decision is not counted
-            all_of = dict.fromkeys(("illumination", "illumination_mean", "exposures_mean"), "decisions")
-            facts |= asdict(self.walks) | {"figures_of": facts["figures_of"] | all_of}
-        facts |= {name: getattr(self, name) for name in OF_RUN}
+        facts = {key: getattr(self, key) for key in keys_of(Part.DECISIONS)}
+        facts |= {} if self.flow is None else self.flow.as_json()
+        facts |= {} if self.walks is None else asdict(self.walks)
+        facts |= {key: getattr(self, key) for key in keys_of(Part.RUN)}
         return facts | {"dark": asdict(self.dark)}
-
-
-OF_DECISIONS = tuple(field.name for field in fields(TallyFigures))
-OF_RUN = tuple(field.name for field in fields(Summary) if field.name not in (*OF_DECISIONS, "flow", "walks"))
 
 
 def summarise(
@@ -160,10 +154,13 @@ def summarise(
         "late_allowed": late_allowed,
         "busy": busy,
     }
-    same = {name: getattr(result, name) for name in OF_RUN if name not in made}
+    same = {name: getattr(result, name) for name in keys_of(Part.RUN) if name not in made}
     decisions = asdict(result.tally.figures())
     passing = {} if flow is None else flow.as_json()
-    decisions |= {name: passing[name] for name in OF_DECISIONS if name in passing}
+    decisions |= {name: passing[name] for name in decisions if name in passing}
+    if walks is not None:  # which of the states shown belonged to which decision is not counted
+        of_states = ("illumination", "illumination_mean", "exposures_mean")
+        decisions["figures_of"] |= dict.fromkeys(of_states, "decisions")
     return Summary(flow=flow, walks=walks, **decisions, **made, **same)
 
 

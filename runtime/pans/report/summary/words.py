@@ -10,8 +10,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from string import Formatter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +18,20 @@ from numpy.typing import NDArray
 from pans.base.console import markdown, one_line
 from pans.base.files import write_file
 from pans.base.machine import fault_words, load_average
-from pans.base.numbers import group_of, group_words, wilson_interval
+from pans.base.numbers import FIGURES, Shown, Words, group_of, group_words, shown, wilson_interval
 from pans.live.timing import STAGES
 from pans.report.live_view.figures import dark_state
 
 from .summary import Summary, singular, was_busy
 
+if TYPE_CHECKING:
+    from pans.base.numbers import Figure
+
 UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host takes
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
-_SHARES = ("accuracy", "accuracy_labelled", "missed", "doubled", "yield", "purity")
+_SHARES = tuple(one.key for one in FIGURES.values() if one.interval)
+# tables of words.toml whose rows are those of the table of figures
+_SHOWN = {"figures": Shown.RESULTS, "timed": Shown.TIMED}
 Facts = Mapping[str, Any]
 Rows = list[tuple[str, str, str]]  # name, figure, what else there is to say
 
@@ -56,18 +60,39 @@ def rows_of(facts: Facts, *tables: str) -> Rows:
     """Return those rows of words.toml's `tables` of which a summary has the facts: `flow` of passing objects, `walks` of an automaton."""
     told, rows = {**facts, **_further(facts)}, []
     words = tomllib.loads(files(__package__).joinpath("words.toml").read_text(encoding="utf-8"))
-    for name, texts in (row for table in tables for row in words[table].items()):
-        figure, *more = (_said(text, told) for text in texts)
-        if figure:
-            rows.append((name, figure, "; ".join(filter(None, more))))
+    for table in tables:
+        if table in _SHOWN:
+            texts_of = {
+                one.name: (_text_of(one, told), *words[table].get(one.key, (one.meaning,)))
+                for one in shown(_SHOWN[table])
+            }
+        else:
+            texts_of = words[table]
+        for name, texts in texts_of.items():
+            figure, *more = (_said(text, told) for text in texts)
+            if figure:
+                rows.append((name, figure, "; ".join(filter(None, more))))
     return rows
 
 
-class _Words(Formatter):
-    """What is None is unknown."""
+def _text_of(figure: Figure, facts: Facts) -> str:
+    """Return a figure of the table in words, "" where a summary does not have it or other rows say it."""
+    value = "" if figure.key in facts["elsewhere"] else figure.value(facts, "")
+    return "" if value == "" else figure.text(value)
 
-    def format_field(self, value: Any, spec: str) -> str:
-        return "unknown" if value is None or value != value else str(super().format_field(value, spec))
+
+class _Words(Words):
+    """Texts in which the name of a figure alone stands for its form in the table, with `:short` for the brief one."""
+
+    def get_field(self, field_name: str, args: Sequence[Any], kwargs: Facts) -> Any:
+        value, first = super().get_field(field_name, args, kwargs)
+        return (FIGURES.get(field_name), value), first
+
+    def format_field(self, value: tuple[Figure | None, Any], spec: str) -> str:
+        figure, found = value
+        if figure is None or spec not in ("", "short"):
+            return super().format_field(found, spec)
+        return figure.brief(found) if spec else figure.text(found)
 
 
 def _said(text: str, facts: Facts) -> str:
@@ -79,16 +104,21 @@ def _said(text: str, facts: Facts) -> str:
 
 
 def _further(facts: Facts) -> dict[str, Any]:
-    """What the words need besides the facts of a summary; a list of one is None where its fact is."""
+    """What the words need besides the facts of a summary; a list of one is None where its fact is. `elsewhere`: figures in other rows."""
     dark, stream = (facts.get(name) or {} for name in ("dark", "stream"))
     known = {"spread": facts.get("accuracy_std_trials"), "off": facts.get("expected_off_stderr")}
-    known |= {"asked": facts.get("confidence") or None, "allowed": facts.get("late_allowed") or None}
+    known |= {"asked": facts.get("confidence") or None}
     found: dict[str, Any] = {name: None if one is None else [one] for name, one in known.items()}
     light, of = facts.get("illumination_mean", facts.get("illumination")), facts.get("figures_of", {})
     # of an automaton's states it is not known which belonged to decisions that abstained
     is_apart = facts.get("abstained") and of.get("illumination") != of.get("clicks_mean")
-    found |= {"ends": accuracy_interval(facts), "apart": [light] if is_apart else None}
-    found["together"] = None if is_apart or light is None else [light]
+    lit, allowed = FIGURES["illumination"], facts.get("late_allowed")
+    found |= {"ends": accuracy_interval(facts), "apart": [lit.brief(light)] if is_apart else None}
+    found |= {} if light is None else {"illumination": light}
+    found["together"] = None if is_apart or light is None else [lit.text(light)]
+    found["allowed"] = [FIGURES["late_allowed"].text(allowed)] if allowed else None
+    other = {"illumination": not is_apart, "dark.per_exposure": not dark.get("exposures")}
+    found["elsewhere"] = {key for key, is_other in other.items() if is_other}
     found["share"] = {name: _share(facts, name) for name in _SHARES if f"{name}_ci" in facts}
     found["text"] = {}
     found["turn"] = [quantile_words(facts["turn_us"])] if facts.get("turn_us") else None
@@ -98,7 +128,7 @@ def _further(facts: Facts) -> dict[str, Any]:
         granted = ", ".join(f"{what}: {answer}" for what, answer in facts.get("realtime", {}).items())
         found["text"] |= {
             "objects": objects_words(facts),
-            "lit": "" if is_apart or light is None else f", illumination {light:.1f}",
+            "lit": "" if is_apart or light is None else f", illumination {lit.brief(light)}",
             "every": f"of all {facts['decisions']:,} decisions" if facts.get("abstained") else "",
             "latency": "not measured in virtual time" if _is_virtual(facts) else latency_words(facts),
             "exposures": exposure_words(facts.get("exposure_timing", {})),
@@ -107,8 +137,6 @@ def _further(facts: Facts) -> dict[str, Any]:
             "dark": dark_words(dark, calibrated=bool(facts.get("calibration"))),
         }
         found["text"]["counted"] = counted_words(facts)
-    if dark.get("exposures"):
-        found["dark_rate"] = dark["clicks"] / dark["exposures"]
     if stream.get("repeated"):
         counts = ((stream.get(f"repeats_{what}"), what) for what in ("differing", "unchecked"))
         unlike = ", ".join(f"{n} {what}" for n, what in counts if n)

@@ -13,8 +13,9 @@ import pytest
 
 from pans.app.main import main
 from pans.base import SHIPPED
+from pans.base.numbers import live_figures
 from pans.bundle.sensor.bundle import write_bundle
-from pans.live.watch.metrics import FIGURES, LABELLED, MetricsServer
+from pans.live.watch.metrics import MetricsServer
 from pans_sim.testing import small_setup
 
 RULES, DASHBOARD = SHIPPED / "prometheus-alerts.yml", SHIPPED / "grafana-dashboard.json"
@@ -45,13 +46,15 @@ def test_every_metric_that_is_named_is_served_by_a_run(tmp_path: Path, monkeypat
     (text,) = answers
     served = {re.split("[{ ]", line)[0] for line in text.splitlines() if line[:1] != "#"}
     # a run without trouble has no causes to tell, and no alarm
-    of_causes = {f"{name}_total" for name, _, label, _ in LABELLED.values() if label == "cause"}
+    metrics = [one for one in live_figures() if one.metric]
+    of_causes = {f"{one.metric}_total" for one in metrics if one.label == "cause"}
     of_causes.add("pans_alarm_times_expected")
     for path in (RULES, DASHBOARD):
         named = set(METRIC.findall(path.read_text()))
         assert named - served - of_causes == set(), path.name
         assert len(named) >= 10
-    assert {f"{name}_total" if counts else name for name, counts, _ in FIGURES.values()} - served == set()
+    of_all = {f"{one.metric}_total" if one.counts else one.metric for one in metrics if not one.label}
+    assert of_all - served == set()
     assert "pans_disk_left_seconds +Inf" in text.splitlines()  # there at all times; no rate is known after a second
     assert promtool("check", "metrics", text=text) == ""
 

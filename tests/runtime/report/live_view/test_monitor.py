@@ -24,7 +24,7 @@ from commands import fixed_run
 from pans.app.main import main
 from pans.app.run import one_run
 from pans.base import SHIPPED
-from pans.base.numbers.intervals import wilson_interval
+from pans.base.numbers import FIGURES, Figure, Shown, wilson_interval
 from pans.bundle.sensor.bundle import load_bundle
 from pans.decide.dark.cusum import ChannelWatch
 from pans.live.timing.ledger import LatencyHistogram, upper_edge
@@ -54,6 +54,16 @@ def picture(elapsed_s: float, **more: Any) -> dict[str, Any]:
         "latest": [],
     }
     return {"kind": "picture", "elapsed_s": elapsed_s, "latency": [], **facts, **texts, **more}
+
+
+def test_a_figure_of_the_table_may_have_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    new = Figure("abstained_share", "", name="abstentions", short="{:.0%}", shown=Shown.LIVE, live="abstained_share")
+    monkeypatch.setitem(FIGURES, new.key, new)
+    history = History()
+    history.take(picture(1.0))
+    assert "abstentions" not in [row.name for row in rows_of(history)]
+    history.take(picture(2.0, abstained_share=0.25))
+    assert ("abstentions", "25%", "") in rows_of(history)
 
 
 def test_a_month_takes_the_memory_of_an_hour_and_sums_are_exact() -> None:
@@ -298,7 +308,7 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
     run, history = watched.run, watched.history
     tally, last = run.tally, history.picture
     assert last["decisions"] == tally.decisions == 120
-    assert last["right"] / last["judged"] == tally.accuracy == tally.confusion.trace() / 120
+    assert last["right"] / last["judged"] == tally.figures().accuracy == tally.confusion.trace() / 120
     assert sum(history.latency.values()) == run.timing.total.total
     assert [row[0] for row in last["latest"]] == list(range(108, 120))
     bundle, _ = load_bundle(SHIPPED / "fashion10.pans")
@@ -310,7 +320,7 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
     assert int(np.argmax(word["posterior"])) == word["decision"][2]
     assert set(history.pixels) == {str(number) for number in range(bundle.n_patterns)}
     text = " ".join(row.text for row in rows_of(history))
-    assert f"{100 * tally.accuracy:.1f}%" in text
+    assert f"{100 * tally.figures().accuracy:.1f}%" in text
     assert "start +0 us, length +0 us at most, allowed 30 us" in text
     light = tally.of["judged"]
     assert f"{light.clicks / 120:.2f} clicks, {light.photons / 120:.2f} photons" in text
@@ -373,7 +383,7 @@ def test_without_a_terminal_there_are_plain_lines(
 
     monkeypatch.setattr(module, "LINE_EVERY_S", 0.0)
     monkeypatch.setattr(module, "EVERY_S", 0.01)
-    shown, pictures = Monitor(panel=False), deque(picture(float(k), decisions=k) for k in range(1, 10_000))
+    shown, pictures = Monitor(panel=False), deque(picture(float(k), decisions=k, decided=k) for k in range(1, 10_000))
     facts = {"kind": "begin", "title": "a bundle on an instrument", "simulated": True, "expected": 500}
     with shown:
         assert shown._child is None
