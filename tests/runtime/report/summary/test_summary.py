@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +15,8 @@ from small_runs import record_small
 
 from pans.app.main import main
 from pans.app.run.one_run import _exit_code
-from pans.report.summary.summary import Summary, late_words, summarise
+from pans.base.numbers import Part, keys_of
+from pans.report.summary.summary import Summary, WalkFigures, late_words, summarise
 from pans.report.summary.words import accuracy_interval, closing_words, dark_words, write_markdown
 
 MEASURED = ("armed_after_s", "realtime", "page_faults", "recording", "report")  # of this machine and this run
@@ -45,6 +46,15 @@ def test_the_summary_has_the_contracts_keys_order_and_values(
             assert found[key] == wanted[key], key
             if isinstance(wanted[key], dict):
                 assert list(found[key]) == list(wanted[key]), key
+
+
+def test_the_table_of_figures_and_the_typed_results_name_the_same() -> None:
+    """A figure without an attribute, or an attribute that the table does not explain, is an error."""
+    of_decisions, of_run, of_walks = (set(keys_of(part)) for part in (Part.DECISIONS, Part.RUN, Part.WALKS))
+    assert {one.name for one in fields(Summary)} == of_decisions | of_run | {"flow", "walks"}
+    assert [one.name for one in fields(WalkFigures)] == [*keys_of(Part.WALKS)]
+    assert not of_decisions & of_run
+    assert not of_walks & (of_decisions | of_run)
 
 
 def test_late_decisions_are_a_fault_beyond_the_share_that_is_allowed(
