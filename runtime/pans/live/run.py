@@ -51,8 +51,7 @@ from .tally import RunTally, unknown_photons
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
 RECEIVE_WINDOW = 4096  # stream messages
-# no divisor of a second: a device says how it stands each second, and Python has to answer then
-FLUSH_EVERY_NS = 467 * NS_PER_MS
+FLUSH_EVERY_NS = 500 * NS_PER_MS
 POLL_S = 0.02
 LONGEST_LEAD_NS = 32 * ARM_LEAD_NS  # five refusals, each twice as far ahead
 STOP_GIVE_UP_NS = 1 * NS_PER_S

@@ -13,7 +13,7 @@ from pans.app.run import one_run
 from pans.base.errors import EXIT_ALERT, EXIT_TIMING, DamagedFileError
 from pans.instrument.calibration_file import find_warnings, load_calibration, now_utc, save_calibration
 from pans.instrument.profile import load_profile
-from pans.live import gates, reconnect
+from pans.live import gates
 from pans.protocol import links
 
 URL = "sim:ideal?scene=uniform&pace=fast&seed=1"
@@ -23,7 +23,7 @@ def test_contradictions_are_a_fault_and_stand_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pans: Pans
 ) -> None:
     opened = links.open_link
-    for module in (one_run, reconnect, gates):  # imported before: else they would keep the false one for good
+    for module in (one_run, gates):  # imported before: else they would keep the false one for good
         assert module.open_link is opened
     lie = Mutation("CLICKS", "object_index", by=17, most=3)
     monkeypatch.setattr(links, "open_link", lambda url: MutatedLink(opened(url), (lie,), Evidence(1 << 40, 2, 10**6)))

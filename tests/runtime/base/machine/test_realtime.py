@@ -159,7 +159,7 @@ def test_the_facts_of_a_machine_are_read(tmp_path: Path) -> None:
 def test_real_time_is_asked_for_with_a_device_and_not_with_a_simulated_one(
     simulated: bool, told: bool, options: dict[str, bool], asked: bool
 ) -> None:
-    link = SimpleNamespace(virtual=False, simulated=simulated, now_ns=time.perf_counter_ns)
+    link = SimpleNamespace(virtual=False, simulated=simulated, now_ns=time.perf_counter_ns, fileno=lambda: None)
     welcome = SimpleNamespace(facts={"simulated": told})
     reader = SimpleNamespace(thread_id=None)
     connection = SimpleNamespace(link=link, reader=reader, session=SimpleNamespace(welcome=welcome))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from plans import shot_major
 
-from pans.bundle.backends import Verdict
+from pans.bundle.backends import Decider, Verdict
 from pans.decide import DECISION_DTYPE
 from pans.decide.still import Core
 from pans.protocol.wire import unpack_body
@@ -30,7 +30,7 @@ STREAMS = [
 ]
 
 
-class Silent:
+class Silent(Decider):
     """A back end that knows one class."""
 
     name, n_features, n_classes = "silent", N, 1
