@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 
 from pans.bundle.backends import make_decider
 from pans.decide.still import Core
-from pans.live.loop import run_live
+from pans.live.loop import Job, run_live
 from pans.live.options import RunOptions
 from pans.live.timing import IDLE, OVERSLEPT, Facts, Verdict, causes
 from pans_sim.ports.serve import open_sim
@@ -43,7 +43,9 @@ def witnessed(faults: str) -> tuple[Facts, Verdict]:
     causes.judge = listen
     try:
         run_live(
-            open_sim(f"sim:ideal?scene=uniform&pace=fast&seed=2&faults={faults}"), profile, bundle, plan, core, config
+            open_sim(f"sim:ideal?scene=uniform&pace=fast&seed=2&faults={faults}"),
+            Job(profile, bundle, plan, config),
+            core,
         )
     finally:
         causes.judge = judge

@@ -18,7 +18,7 @@ from pans.base.console import install
 from pans.base.errors import LinkError, PansError, UsageError
 from pans.bundle.backends import NO_LABEL
 from pans.bundle.sensor import bundle_path, load_bundle
-from pans.live.loop import Connection, LiveRun, Observers
+from pans.live.loop import Observers, Session, Status
 from pans.live.options import RunOptions
 from pans.live.stop import Stop
 
@@ -82,14 +82,14 @@ class PansDetector(StandardReadable, Triggerable):
         self._loop, self._stop = asyncio.get_running_loop(), Stop(continuous=True)
         self._ready, self._ended = self._loop.create_future(), self._loop.create_future()
         self._asked: tuple[int, asyncio.Future[dict[str, Any]]] | None = None
-        self._connection: Connection | None = None
+        self._session: Session | None = None
         self._last_tick = 0  # of the latest decision
         self._thread = threading.Thread(target=self._work, name="pans-run", daemon=True)
         self._thread.start()
-        self._run: LiveRun = await self._first(self._ready)
-        clock, options = self._run.connection.known_clock(), self._options
+        self._run: Status = await self._first(self._ready)
+        clock, options = self._run.session.known_clock(), self._options
         facts = {"bundle": options.bundle.stem, "device": options.device, "tick_hz": clock.tick_hz}
-        self._show(facts | {"simulated": self._run.connection.link.simulated})
+        self._show(facts | {"simulated": self._run.session.link.simulated})
 
     @AsyncStatus.wrap
     async def trigger(self) -> None:
@@ -138,19 +138,19 @@ class PansDetector(StandardReadable, Triggerable):
     def _tell(self, future: asyncio.Future[Any], result: Any) -> None:
         self._loop.call_soon_threadsafe(lambda: None if future.done() else future.set_result(result))
 
-    def _watch(self, run: LiveRun, output: Output) -> None:
+    def _watch(self, run: Status, output: Output) -> None:
         rows = rows_of(output.decisions)
         if not len(rows):
             return
-        if self._connection is not run.connection:  # maybe with another count of ticks
-            self._connection, self._last_tick = run.connection, 0
+        if self._session is not run.session:  # maybe with another count of ticks
+            self._session, self._last_tick = run.session, 0
         # no window begins before the one before has ended
         begins = np.append(np.uint64(self._last_tick), rows["tick"][:-1])
         self._last_tick = int(rows["tick"][-1])
         if self._asked is None:
             return
         asked_ns, answer = self._asked
-        clock = run.connection.known_clock()
+        clock = run.session.known_clock()
         unsure_ns = clock.to_host_ns(clock.to_tick(asked_ns))[1]
         after = np.flatnonzero(begins >= clock.to_tick(asked_ns + unsure_ns))
         if not len(after):
@@ -165,7 +165,7 @@ class PansDetector(StandardReadable, Triggerable):
             "probability": float(row["probability"]),
             "clicks": int(row["clicks"]),
             "photons": float(photons) * self._options.shots,
-            "late": number in run.late,
+            "late": number in run.accounts.late,
             "abstained": abstained,
             "flags": int(row["flags"]),
             "number": number,

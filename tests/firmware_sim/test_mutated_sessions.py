@@ -134,7 +134,7 @@ def test_what_cannot_be_done_or_meant_is_refused_with_the_reason(
 def test_a_device_that_never_ends_its_plan_does_not_keep_the_host(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pans.live.run.SILENCE_NS", 10**8)  # seconds of a fast device are a million exposures
+    monkeypatch.setattr("pans.live.loop.SILENCE_NS", 10**8)  # seconds of a fast device are a million exposures
     summary = ended(stage("sequential").run(tmp_path, 1, Mutation("ARM", "n_cycles", by=1_000_000)))
     assert summary.ended == "the device goes on beyond its plan"
     assert (summary.verdict, _exit_code(summary)) == ("FAIL", 4)

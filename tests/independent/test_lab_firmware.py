@@ -20,10 +20,11 @@ from lab_decisions import decide_again
 from lab_firmware import SAFE, Firmware
 from lab_light import Light
 from lab_recording import read_recording
+from live_status import ask_for_gate
 
 from pans.app.main import main
 from pans.instrument.profile import load_profile
-from pans.live.loop import LiveRun, Observers, RunResult
+from pans.live.loop import Observers, RunResult, Status
 from pans.protocol.wire.commands import Gate
 from pans_sim.conform import conform
 
@@ -93,7 +94,7 @@ def at_decision(number: int, act: Any) -> Observers:
     """Do something once, when so many decisions have been made."""
     left = [act]
 
-    def watch(run: LiveRun, output: Any) -> None:
+    def watch(run: Status, output: Any) -> None:
         if left and run.core.n_decisions >= number:
             left.pop()(run)
 
@@ -125,7 +126,7 @@ def test_a_pause_beyond_the_lease_turns_the_light_off(tmp_path: Path) -> None:
     bench = Bench(tmp_path, deadline_us=1e5)  # a lease of 1 s
     seen: list[int] = []
 
-    def stand_still(run: LiveRun) -> None:
+    def stand_still(run: Status) -> None:
         bench.link.pause(5.0)
         bench.firmware.advance(bench.link.ticks())
         seen.append(bench.firmware.state)
@@ -148,10 +149,10 @@ def test_a_run_without_end_is_stopped(tmp_path: Path) -> None:
 def test_gates_are_done_or_refused_with_a_reason(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
 
-    def ask(run: LiveRun) -> None:
+    def ask(run: Status) -> None:
         now = bench.link.ticks()
         for gate in (Gate(now + 20_000, 50, 0), Gate(now - 1, 60, 0), Gate(now + 30_000, 70, 9)):
-            run.gate(*gate)
+            ask_for_gate(run, *gate)
 
     result = bench.run(at_decision(50, ask), decisions=100)
     assert [(length, output) for _, length, output in bench.books.pulses] == [(50, 0)]

@@ -36,11 +36,11 @@ from pans_sim.testing import small_setup
 # stage -> where the child is met: module, class or "" and name; the call before which it waits
 STAGES = {
     "opening": ("pans.app.run.one_run", "", "open_link", 1),
-    "handshake": ("pans.live.connection", "Connection", "handshake", 1),
-    "upload": ("pans.live.connection", "Connection", "upload", 1),
-    "armed": ("pans.live.run", "LiveRun", "iterate", 1),
-    "running": ("pans.live.run", "LiveRun", "iterate", 60),
-    "stopping": ("pans.live.run", "LiveRun", "stop", 1),
+    "handshake": ("pans.live.session", "Session", "handshake", 1),
+    "upload": ("pans.live.session", "Session", "upload", 1),
+    "armed": ("pans.live.loop", "", "_turn", 1),
+    "running": ("pans.live.loop", "", "_turn", 60),
+    "stopping": ("pans.live.loop", "", "stop", 1),
     "closing": ("pans.record.recorder", "Recorder", "close", 1),
 }
 HANGS = ("python", "native", "file")

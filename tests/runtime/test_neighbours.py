@@ -7,6 +7,7 @@ import math
 import socket
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -22,7 +23,7 @@ from pans.live.watch.osc import PER_DATAGRAM, OscSender
 PARALLEL = "sim:oled-qcmos?scene=fashion200&seed=1&pace="
 STALLS = "faults=stall:20ms/200ms"  # work that is late
 WALKS = "sim:dmd-spad?scene=fashion200&seed=1&pace="
-NO_RUN: Any = type("Run", (), {"late": ()})()
+NO_RUN: Any = type("Run", (), {"accounts": SimpleNamespace(late=())})()
 
 
 def recorded(path: Path) -> tuple[list[tuple[Any, ...]], Recording]:
@@ -138,7 +139,7 @@ def test_a_plan_of_bluesky(bundle: str, device: str, number: int, options: dict[
     numbers = [event["pans-number"] for event in data]
     assert numbers == sorted(set(numbers))
     assert any(event["pans-late"] for event in data) or STALLS not in device
-    assert detector._run.late == []  # told, and forgotten
+    assert detector._run.accounts.late == []  # told, and forgotten
 
 
 def test_a_device_that_is_lost_or_not_there_ends_a_plan(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from live_status import ask_for_gate
 from run_books import DeviceLog, LoggedInstrument, ObservedLink, SlowReads
 from run_judge import Judge
 
@@ -22,7 +23,7 @@ from pans.bundle.backends.choose import make_decider
 from pans.decide.decision import Output
 from pans.decide.plan.plan import Plan
 from pans.decide.still.core import Core
-from pans.live.loop import LiveRun, Observers, Recovery, RunResult, run_live
+from pans.live.loop import Job, Observers, Recovery, RunResult, Status, run_live
 from pans.live.options import RunOptions
 from pans.record.recorder import Recorder
 from pans_sim.device.clock import DeviceClock
@@ -126,14 +127,14 @@ class _Host:
     def __init__(self) -> None:
         self.began, self.decisions = False, 0
 
-    def watch(self, run: LiveRun, output: Output) -> None:
+    def watch(self, run: Status, output: Output) -> None:
         before, self.decisions = self.decisions, self.decisions + len(output.decisions)
         if output.block_end_tick is None:
             return
         for number in range(before // GATE_EVERY + 1, self.decisions // GATE_EVERY + 1):
             # every other gate is so near that it often comes too late; the duration makes each one unique
-            if run.connection.session.has_room:
-                run.gate(output.block_end_tick + (NEAR_TICKS if number % 2 else FAR_TICKS), 1 + number, 0)
+            if run.session.host.has_room:
+                ask_for_gate(run, output.block_end_tick + (NEAR_TICKS if number % 2 else FAR_TICKS), 1 + number, 0)
 
 
 def run_case(
@@ -155,7 +156,7 @@ def run_case(
     slow = 0.0 if one.plan.drive == "host" else SLOW_READS
     link = ObservedLink(SlowReads(device, clock, f"grid:{case}", seed, slow))
 
-    def prepared(run: LiveRun) -> None:
+    def prepared(run: Status) -> None:
         host.began = True
 
     judge = Judge()
@@ -167,7 +168,7 @@ def run_case(
             with Recorder(path, {"config": one.recorded()}) as recorder:
                 observers, recovery = Observers(host.watch, prepared), Recovery.of(link, "", 30.0)
                 result = run_live(
-                    link, one.profile, one.bundle, one.plan, one.core, config, recorder, recovery, observers
+                    link, Job(one.profile, one.bundle, one.plan, config), one.core, recorder, recovery, observers
                 )
                 recorder.close({})
         except LinkError:

@@ -19,7 +19,7 @@ import numpy as np
 from pans.base.errors import PansError
 from pans.bundle.backends.choose import make_decider
 from pans.decide.still.core import Core
-from pans.live.loop import run_live
+from pans.live.loop import Job, run_live
 from pans.live.options import RunOptions
 from pans.protocol.links import Link
 from pans.protocol.wire import messages as wire
@@ -268,7 +268,7 @@ class Stage:
         facts = {"shots": 1, "tick_hz": self.profile.clock.tick_hz, "backend": self.backend}
         header = {"config": {**facts, "drive": self.plan.drive, "confidence": 0.0}}
         with Recorder(path, header, overwrite=True) as recorder:
-            result = run_live(link, self.profile, self.bundle, self.plan, core, config, recorder)
+            result = run_live(link, Job(self.profile, self.bundle, self.plan, config), core, recorder)
             decisions = objects * self.plan.shots_per_object
             summary = summarise(result, illumination=1.0, expected_decisions=decisions)
             recorder.close(summary.as_json())

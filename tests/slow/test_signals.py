@@ -16,13 +16,14 @@ from pathlib import Path
 
 import pytest
 from host_process import STAGES, Host, Lit, lit_instrument, start_host, until
+from live_status import ask_for_gate
 
 from pans.base.errors import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING
 from pans.bundle.backends.choose import make_decider
 from pans.bundle.sensor import bundle_bytes
 from pans.decide.decision import Output
 from pans.decide.still.core import Core
-from pans.live.loop import LiveRun, Observers, run_live
+from pans.live.loop import Job, Observers, Status, run_live
 from pans.live.options import RunOptions
 from pans.protocol.wire import DeviceState, StateReason
 from pans.record.reading import read_recording
@@ -133,17 +134,17 @@ def recording_host(path: Path, acted: int, seed: int) -> None:
     header = {"config": {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": "table"}}
     header["profile"] = {"name": profile.name, "sha256": profile.sha256, "toml": profile.text}
 
-    def act(run: LiveRun, output: Output) -> None:
+    def act(run: Status, output: Output) -> None:
         for decision in output.decisions:
             if decision.number % ACT_EVERY == 0 and output.block_end_tick is not None:
-                run.gate(output.block_end_tick + 5000, 10, 0)
+                ask_for_gate(run, output.block_end_tick + 5000, 10, 0)
                 os.write(acted, ACTED.pack(decision.number))
 
     with Recorder(path, header, bundle=bundle_bytes(bundle)) as recorder:
         config = RunOptions(deadline_us=1e9, lease_ms=1000, realtime=False)
         link = open_sim(f"sim:ideal?scene=uniform&pace=fast&seed={seed}")
         core = Core(plan, make_decider(bundle), 1, 0)
-        run_live(link, profile, bundle, plan, core, config, recorder, observers=Observers(act))
+        run_live(link, Job(profile, bundle, plan, config), core, recorder, observers=Observers(act))
 
 
 def last_acted(reader: int) -> int:

@@ -19,7 +19,7 @@ from pans.bundle.sensor import load_bundle
 from pans.decide.plan import build_plan
 from pans.decide.still import Core
 from pans.instrument.profile import load_profile
-from pans.live.loop import Observers, Recovery, RunResult, run_live
+from pans.live.loop import Job, Observers, Recovery, RunResult, run_live
 from pans.live.options import RunOptions
 from pans.protocol.links import Link
 from pans.record.recorder import Recorder
@@ -112,7 +112,7 @@ class Bench:
         with Recorder(self.path, header, bundle=FASHION.read_bytes()) as recorder:
             recovery = Recovery.of(self.link, "", 30.0)
             result = run_live(
-                self.link, self.profile, self.bundle, self.plan, core, config, recorder, recovery, observers
+                self.link, Job(self.profile, self.bundle, self.plan, config), core, recorder, recovery, observers
             )
             recorder.close({})
         recording = read_recording(self.path.read_bytes())

@@ -10,7 +10,7 @@ import pytest
 from pans.bundle.backends.choose import make_decider
 from pans.bundle.sensor import bundle_bytes
 from pans.decide.still.core import Core
-from pans.live.loop import LiveRun, Observers, Recovery, RunResult, run_live
+from pans.live.loop import Job, Observers, Recovery, RunResult, Status, run_live
 from pans.live.options import RunOptions
 from pans.record.reading.decision_log import LogEncoder
 from pans.record.recorder import PartLimits, Recorder
@@ -65,14 +65,14 @@ def record_small(
     path.parent.mkdir(exist_ok=True)
     with Recorder(path, header, bundle=bundle_bytes(bundle), limits=limits) as recorder:
 
-        def wait(run: LiveRun, output: Any) -> None:
+        def wait(run: Status, output: Any) -> None:
             """Let virtual time not outrun the disk: the next part is made by a thread."""
             if limits is not None and recorder.open_file.size_bytes >= limits.rotate_bytes:
                 recorder._next.result(timeout=20)
 
         observers, recovery = Observers(wait, prepared), Recovery.of(link, url, 10.0)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("pans.live.run.FLUSH_EVERY_NS", 20_000_000)
-            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
+            patch.setattr("pans.live.loop.FLUSH_EVERY_NS", 20_000_000)
+            result = run_live(link, Job(profile, bundle, plan, config), core, recorder, recovery, observers)
         result.decisions_sha256 = recorder.close({"decisions": result.tally.decisions})
     return result

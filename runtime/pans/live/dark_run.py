@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,7 @@ from pans.instrument.detector import afterpulses_of
 from pans.instrument.profile import Profile
 
 from .options import RunOptions
-
-if TYPE_CHECKING:
-    from .run import LiveRun
+from .status import Status
 
 # hours between false alarms about the dark counts, in the mean; as many about dead channels in the light
 FALSE_ALARM_H = 240.0
@@ -135,26 +133,24 @@ class DarkRun:
         calibration = None if one is None else {"sha256": one.sha256, "values": dict(one.values)}
         return {"guard": self._header, "calibration": calibration, "warnings": self.warnings}
 
-    def check_device(self, run: LiveRun) -> None:
+    def check_device(self, run: Status) -> None:
         """Before arming: is this the device that was calibrated? ConfigError if not."""
         if self.calibration is not None:
             self.calibration.check_made_for(self.profile, self.serial_of(run))
-        welcome = run.connection.session.welcome
-        objects = None if welcome is None else welcome.facts.get("objects")
+        objects = run.session.facts.get("objects")
         self._few_objects = isinstance(objects, int) and objects < MANY_OBJECTS
         if self.states is not None and isinstance(objects, int) and objects > 0:
             self.states.objects = objects
         for warning in self.warnings:
-            run.journal.note("calibration_warning", words=warning)
+            run.accounts.journal.note("calibration_warning", words=warning)
 
     @staticmethod
-    def serial_of(run: LiveRun) -> str | None:
+    def serial_of(run: Status) -> str | None:
         """The serial number that the device told, if any."""
-        welcome = run.connection.session.welcome
-        serial = None if welcome is None else welcome.facts.get("serial")
+        serial = run.session.facts.get("serial")
         return None if serial is None else str(serial)
 
-    def look(self, run: LiveRun, output: Output) -> None:
+    def look(self, run: Status, output: Output) -> None:
         """After a block: compare the clicks of its decisions, and of the states of an automaton, with those of the run's beginning.
 
         Not while the detector is in a state that changes them: that is named already, and is no change of light.
@@ -167,7 +163,7 @@ class DarkRun:
             if self.states.is_due(int(walks.shown[0])):
                 found = found + self.states.take(walks.shown, walks.clicked, counts=counts)
         for one in found:
-            run.journal.note("light_changed", **one)
+            run.accounts.journal.note("light_changed", **one)
 
     def figures(
         self, dark: DarkReport | None = None, clicks: int = 0, lit: int = 0, *, saturates: bool = True

@@ -16,7 +16,7 @@ from pans.live.timing.ledger import LatencyHistogram
 from pans.protocol.session import COMMAND_WINDOW
 from pans.protocol.wire import ADAPTIVE_PATTERN, HEADER, STRUCTS, MessageType, Opcode, Show, pack_command
 
-from .connection import Connection
+from .session import Session
 
 CRC_BYTES = 4
 _EXPOSURE_BYTES = 8  # of SHOW: the exposure, u64, stands first
@@ -72,17 +72,17 @@ class HostDriver:
         ]
         self._sent = (-1, -1)
 
-    def begin(self, connection: Connection) -> None:
+    def begin(self, session: Session) -> None:
         """Name the first state of the first walk, behind ARM; it leaves with it."""
         self._sent = (-1, -1)
-        self._submit(connection)
+        self._submit(session)
 
-    def turn(self, connection: Connection, arrival_ns: int) -> None:
+    def turn(self, session: Session, arrival_ns: int) -> None:
         """Name what follows the exposures that the core has taken, unless that has been said."""
-        if self._submit(connection):
-            session, now_ns = connection.session, connection.link.now_ns
-            session.poll(now_ns())
-            connection.flush()
+        if self._submit(session):
+            now_ns = session.link.now_ns
+            session.host.poll(now_ns())
+            session.flush()
             self.turns.add_many(np.array([now_ns() - arrival_ns]))
 
     def arrays(self, session: int) -> Drive:
@@ -103,13 +103,13 @@ class HostDriver:
         self._sent = sent
         self.turns.add_many(turns_ns)
 
-    def _submit(self, connection: Connection) -> bool:
+    def _submit(self, session: Session) -> bool:
         core = self._core
         following = self._place.following(core.windows, core.tracker.next_exposure)
         if following == self._sent or following[0] >= core.end_exposure:
             return False
-        if connection.session.in_flight >= COMMAND_WINDOW:  # what waits comes late: the next walk is named in time
+        if session.host.in_flight >= COMMAND_WINDOW:  # what waits comes late: the next walk is named in time
             return False
         exposure, state = self._sent = following
-        connection.session.submit(Opcode.SHOW, self.body(exposure, state), may_be_refused=True)
+        session.host.submit(Opcode.SHOW, self.body(exposure, state), may_be_refused=True)
         return True

@@ -29,8 +29,8 @@ from pans.protocol.session import COMMAND_WINDOW, HostSession
 from pans.protocol.wire import DARK_PATTERN, Arm, DeviceState, Gate, Opcode, PatternChunk, pack_command
 from pans.record.recorder import Recorder
 
-from .connection import ARM_LEAD_NS, NS_PER_S, Connection
 from .journal import Journal
+from .session import ARM_LEAD_NS, NS_PER_S, Session
 
 T = TypeVar("T")
 
@@ -49,7 +49,7 @@ class SecondInstrument:
             link.close()
             raise UsageError(f"{url}: a second instrument needs the host's real time", remedy="pace=real")
         self.url, self.profile, self._link = url, profile, link
-        self._connection: Connection | None = None
+        self._session: Session | None = None
         self.worst_uncertainty_ns = 0
         self._probe_due_ns = self._lease_due_ns = self._look_due_ns = 0
         self._last_pulse_ns = 0
@@ -62,11 +62,11 @@ class SecondInstrument:
         return SecondInstrument(url, open_link(f"serial:socket://{rest}" if scheme == "tcp" else url), profile)
 
     @property
-    def connection(self) -> Connection:
+    def session(self) -> Session:
         """Its session; LinkError before `connect`."""
-        if self._connection is None:
+        if self._session is None:
             raise LinkError(f"{self.url}: the second instrument is not connected")
-        return self._connection
+        return self._session
 
     def now_ns(self) -> int:
         """The host's clock."""
@@ -75,9 +75,9 @@ class SecondInstrument:
     def connect(self) -> None:
         """Shake hands, measure its clock and arm it; DeviceError if it is not of the profile, LinkError if it is silent."""
         # not before: its reader's thread shares the interpreter with the loop, and has its priority only if it starts after the loop got it
-        connection = self._connection = Connection(self._link)
+        session = self._session = Session(self._link)
         profile = self.profile
-        facts = connection.handshake().facts
+        facts = session.handshake().facts
         found = (facts["mode"], int(facts["tick_hz"]))
         if found != (profile.mode, profile.clock.tick_hz):
             raise DeviceError(
@@ -87,72 +87,72 @@ class SecondInstrument:
             )
         plan = idle_plan(profile)
         dark = PatternChunk(0, 0, 1, np.zeros(1, np.uint16))
-        connection.session.submit(Opcode.LOAD_PATTERN, pack_command(dark))
+        session.host.submit(Opcode.LOAD_PATTERN, pack_command(dark))
         for chunk in plan_chunks(plan):
-            connection.session.submit(Opcode.LOAD_PLAN, pack_command(chunk))
-        connection.wait_acknowledged()
-        connection.synchronise()
+            session.host.submit(Opcode.LOAD_PLAN, pack_command(chunk))
+        session.wait_acknowledged()
+        session.synchronise()
         self._arm()
-        connection.wait_acknowledged()
+        session.wait_acknowledged()
 
     def exchange(self, now_ns: int, *, waits: bool) -> None:
         """Read what came and send what is due; `waits` for an answer: look soon. LinkError when it is gone."""
-        session = self.connection.session
+        host = self.session.host
         if now_ns >= self._probe_due_ns:
-            session.probe(self.now_ns())
-            self.connection.flush()  # its round trip begins now, not at the next look
+            host.probe(self.now_ns())
+            self.session.flush()  # its round trip begins now, not at the next look
             self._probe_due_ns = now_ns + PROBE_EVERY_NS
         if now_ns >= self._lease_due_ns:
-            session.grant(0, LEASE_MS)
+            host.grant(0, LEASE_MS)
             self._lease_due_ns = now_ns + LEASE_MS * 1_000_000 // 4
         if now_ns < self._look_due_ns:
             return
         self._look_due_ns = now_ns + (LOOK_SOON_NS if waits else LOOK_EVERY_NS)
-        self.connection.pump(0.0)
-        status = session.status
+        self.session.pump(0.0)
+        status = host.status
         lapsed = status is not None and status.state in (DeviceState.SAFE, DeviceState.IDLE)
-        if lapsed and not session.in_flight and now_ns - self._arm_sent_ns > NS_PER_S:
-            session.submit(Opcode.RESET)
+        if lapsed and not host.in_flight and now_ns - self._arm_sent_ns > NS_PER_S:
+            host.submit(Opcode.RESET)
             self._arm()
 
     def submit(self, at_ns: int, duration_us: float, channel: int) -> tuple[int, int, int]:
         """Send a pulse for `at_ns` of the host's clock, at once; return the command's id, the tick, and how far off that may be in ns."""
-        clock = self.connection.known_clock()
+        clock = self.session.known_clock()
         tick = clock.to_tick(at_ns)
         uncertainty_ns = clock.to_host_ns(tick)[1]
         gate = Gate(tick, max(1, round(duration_us * clock.tick_hz / 1e6)), channel)
-        command_id = self.connection.session.submit(Opcode.GATE, pack_command(gate), may_be_refused=True)
-        self.connection.session.poll(self.now_ns())
-        self.connection.flush()
+        command_id = self.session.host.submit(Opcode.GATE, pack_command(gate), may_be_refused=True)
+        self.session.host.poll(self.now_ns())
+        self.session.flush()
         self._last_pulse_ns = max(self._last_pulse_ns, at_ns + round(duration_us * 1000))
         self._look_due_ns = 0
         return command_id, tick, uncertainty_ns
 
     def finish(self) -> None:
         """Let the pulses that are still to come happen and be answered, within a second, then stop the instrument."""
-        session = self.connection.session
+        host = self.session.host
         until_ns = self.now_ns() + SETTLE_NS
-        while self.now_ns() < min(until_ns, self._last_pulse_ns) or session.in_flight:
-            self.connection.pump(0.005)
+        while self.now_ns() < min(until_ns, self._last_pulse_ns) or host.in_flight:
+            self.session.pump(0.005)
             if self.now_ns() >= until_ns:
                 break
-        session.submit(Opcode.STOP)
-        while session.in_flight and self.now_ns() < until_ns + SETTLE_NS:
-            self.connection.pump(0.005)
+        host.submit(Opcode.STOP)
+        while host.in_flight and self.now_ns() < until_ns + SETTLE_NS:
+            self.session.pump(0.005)
 
     def close(self) -> None:
         """Close its port."""
-        if self._connection is None:
+        if self._session is None:
             self._link.close()
         else:
-            self._connection.close()
+            self._session.close()
 
     def facts(self) -> dict[str, Any]:
         """What the summary says about it."""
-        if self._connection is None:
+        if self._session is None:
             return {"url": self.url}
-        welcome = self.connection.session.welcome
-        fit = None if self.connection.clock is None else self.connection.clock.fit
+        welcome = self.session.host.welcome
+        fit = None if self.session.clock is None else self.session.clock.fit
         return {
             "url": self.url,
             "serial": None if welcome is None else welcome.facts.get("serial"),
@@ -164,8 +164,8 @@ class SecondInstrument:
 
     def _arm(self) -> None:
         now_ns = self.now_ns()
-        start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
-        self.connection.session.submit(Opcode.ARM, pack_command(Arm(start_tick, 0, LEASE_MS)))
+        start_tick = self.session.known_clock().to_tick(now_ns + ARM_LEAD_NS)
+        self.session.host.submit(Opcode.ARM, pack_command(Arm(start_tick, 0, LEASE_MS)))
         self._arm_sent_ns = now_ns
 
 
@@ -235,7 +235,7 @@ class GateQueue:
             self._ask_second(lambda: second.exchange(now_ns, waits=bool(self._sent)))
         if not self._waiting and not self._sent:
             return False
-        target = session if self.second is None else self.second.connection.session
+        target = session if self.second is None else self.second.session.host
         self._collect(target)
         now_tick = clock.to_tick(now_ns)
         first = True
@@ -257,7 +257,7 @@ class GateQueue:
         """The run is over: what was answered counts, what waits expires, what has no answer was refused as far as is known."""
         if self.second is not None:
             self._ask_second(self.second.finish)
-            session = self.second.connection.session
+            session = self.second.session.host
         self._collect(session)
         self._refuse_sent("no answer before the end of the run")
         while self._waiting:
@@ -290,7 +290,7 @@ class GateQueue:
             self._refuse(action, self._lost)
             return
         command_id, tick, own_ns = sent
-        self._session = second.connection.session
+        self._session = second.session.host
         self._sent.append((command_id, action))
         off_ns = uncertainty_ns + own_ns
         second.worst_uncertainty_ns = max(second.worst_uncertainty_ns, off_ns)

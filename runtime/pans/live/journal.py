@@ -15,7 +15,7 @@ from pans.protocol.session import Refusal
 from pans.protocol.wire import Opcode
 from pans.record.recorder import Recorder
 
-from .connection import Connection
+from .session import Session
 
 MAX_EVENTS = 1000  # of the summary; the recording has them all
 MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
@@ -63,25 +63,23 @@ class Journal:
         if self.recorder is not None:
             self.recorder.add_event(event)
 
-    def session(self, connection: Connection) -> None:
+    def session(self, session: Session) -> None:
         """Note which session and device clock the following ticks belong to."""
-        welcome = connection.session.welcome
-        facts = {} if welcome is None else welcome.facts
-        self.note("session", nonce=connection.session.nonce, epoch=str(facts.get("epoch", "unknown")))
-        self.clock(connection)
+        self.note("session", nonce=session.host.nonce, epoch=str(session.facts.get("epoch", "unknown")))
+        self.clock(session)
 
-    def clock(self, connection: Connection) -> None:
+    def clock(self, session: Session) -> None:
         """Note the probes and the jumps of the device's clock since the last time."""
-        for step in connection.clock_steps:
+        for step in session.clock_steps:
             self.note("clock_step", tick=step.tick, off_ns=step.off_ns, allowed_ns=step.allowed_ns)
-        connection.clock_steps.clear()
-        samples = connection.known_clock().take_samples()
+        session.clock_steps.clear()
+        samples = session.known_clock().take_samples()
         if self.recorder is not None and len(samples):
             self.recorder.add_clock(samples)
 
-    def refusals(self, connection: Connection) -> None:
+    def refusals(self, session: Session) -> None:
         """Note the pulses and the names of states that the device has refused."""
-        refusals = connection.session.refusals
+        refusals = session.host.refusals
         while refusals:
             self.refused(refusals.popleft())
 

@@ -1,24 +1,21 @@
-"""A lost device: look for it with growing pauses for a bounded time, and arm it for what is left of the run.
+"""A lost device: look for it with growing pauses for a bounded time.
 
-`reconnect` returns a connection that has been prepared anew, or raises the LinkError of the last attempt.
+`reconnect` returns a session that has been prepared anew, or raises the LinkError of the last attempt.
 """
 
 from __future__ import annotations
 
-import gc
 import re
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, repeat
 
 from pans.base.errors import DeviceError, LinkError
 from pans.protocol.links import Link, opened_again
 
-from .connection import Connection
-from .run import LiveRun
+from .session import Session
 
-NS_PER_MS = 1_000_000
 MOST_FRUITLESS = 8  # reconnections in a row without one decision in between
 
 
@@ -42,9 +39,9 @@ class Recovery:
 
 
 def reconnect(
-    recovery: Recovery, lost: Connection, since_ns: int, prepare: Callable[[Link], Connection]
-) -> tuple[Connection, int]:
-    """Try until `prepare(link)` succeeds or `give_up_s` have passed since `since_ns`; return the connection and the attempts.
+    recovery: Recovery, lost: Session, since_ns: int, prepare: Callable[[Link], Session]
+) -> tuple[Session, int]:
+    """Try until `prepare(link)` succeeds or `give_up_s` have passed since `since_ns`; return the session and the attempts.
 
     A device that answers and refuses (DeviceError) is not asked again.
     """
@@ -69,54 +66,23 @@ def reconnect(
     raise LinkError(f"{error.message} ({attempts} attempts in {recovery.give_up_s:g} s)", remedy=error.remedy)
 
 
-class Refusals:
-    """What the device refused last. The same refusal without progress in between ends a run: asking again would change nothing.
-
-    Refusals are the same that differ in numbers alone: ids of commands, ticks.
-    """
+class Progress:
+    """Whether a run gets on between one loss of the device and the next."""
 
     def __init__(self) -> None:
-        self._latest: tuple[str | int, ...] = ()
+        self._fruitless = self._decided = 0
+        self._refusal: tuple[str | int, ...] = ()
 
-    def again(self, run: LiveRun, error: DeviceError) -> bool:
-        """Whether the device has refused the same since the run last made progress."""
-        words = re.sub(r"\d+", "0", error.message)
-        now = (words, run.core.tracker.counters.exposures, run.tally.decisions)
-        again, self._latest = now == self._latest, now
+    def is_fruitless(self, decided: int) -> bool:
+        """Note that the device was lost; whether that is too often in a row without one whole decision, of `decided`, in between."""
+        self._fruitless, self._decided = (0 if decided > self._decided else self._fruitless) + 1, decided
+        return self._fruitless > MOST_FRUITLESS
+
+    def refused_again(self, refusal: str, *done: int) -> bool:
+        """Note a refusal; whether the device has refused the same before, and nothing of what is `done` has changed since.
+
+        Asking again would change nothing then. Refusals are the same that differ in numbers alone: ids of commands, ticks.
+        """
+        now: tuple[str | int, ...] = (re.sub(r"\d+", "0", refusal), *done)
+        again, self._refusal = now == self._refusal, now
         return again
-
-
-def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: Callable[[Link], Connection]) -> None:
-    """Find the device again and arm it for what is left of the run, or end the run because that failed."""
-    run.take_rest()
-    if run.is_fruitless(MOST_FRUITLESS):
-        words = f"lost {MOST_FRUITLESS + 1} times in a row without one whole decision in between"
-        run.lose_link(LinkError(f"the device was {words}; the last time: {error.message}"))
-        return
-    now_ns = run.now_ns()
-    run.outage_ns = now_ns if run.outage_ns is None else run.outage_ns
-    run.journal.note("link_lost", reason=error.message)
-    run.journal.clock(run.connection)
-    run.count_decoded()
-
-    def pause(seconds: float) -> None:
-        run.turned_s = time.monotonic()
-        recovery.pause(seconds)
-
-    try:
-        run.connection, attempts = reconnect(replace(recovery, pause=pause), run.connection, run.outage_ns, prepare)
-    except LinkError as failure:
-        run.lose_link(failure)
-        return
-    except KeyboardInterrupt:
-        run.link_lost = True  # nothing is waited for at the end
-        raise
-    run.reconnects += 1
-    gc.collect()  # it is off while armed, and an old connection's objects name each other: here nobody waits
-    outage_ms = (run.now_ns() - run.outage_ns) / NS_PER_MS
-    run.journal.note("reconnected", attempts=attempts, outage_ms=outage_ms)
-    run.settle(run.core.end())
-    if run.config.n_cycles and run.core.cycles_left(run.config.n_cycles) <= 0:
-        run.ended = "the link was lost within the last object"
-        return
-    run.arm()

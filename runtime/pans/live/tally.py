@@ -7,7 +7,6 @@ having measured only these objects. `RunTally.figures` returns the figures of th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -17,17 +16,12 @@ import numpy.typing as npt
 from pans.base.numbers import GROUPS, LIGHT, DecisionFigures, decision_figures
 from pans.decide import DecisionFlag, is_decided
 from pans.decide.dark import DarkReport
+from pans.decide.kernel import PhotonsOf
 from pans.live.timing.ledger import TimingLedger
 
 I64 = npt.NDArray[np.int64]
-PhotonsOf = Callable[[I64], npt.NDArray[np.float32]]  # object numbers (n,) -> NaN where it is not known
 _AMBIGUOUS = int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
-
-
-def unknown_photons(numbers: I64) -> npt.NDArray[np.float32]:
-    """Return NaN for each object."""
-    return np.full(len(numbers), np.nan, np.float32)
 
 
 def _some(values: I64, where: npt.NDArray[np.bool_]) -> I64:

@@ -20,9 +20,9 @@ from pans.base.machine.realtime import scheduled
 from pans.bundle.backends.choose import make_decider
 from pans.decide.still.core import Core
 from pans.instrument.profile import load_profile
-from pans.live.connection import Connection
-from pans.live.loop import Observers, RunResult, run_live
+from pans.live.loop import Job, Observers, RunResult, run_live
 from pans.live.options import RunOptions
+from pans.live.session import Session
 from pans.protocol.links.base import Link, open_link
 from pans.protocol.wire import DeviceState
 from pans_sim.device.clock import DeviceClock
@@ -143,7 +143,7 @@ def test_virtual_time_stops_at_each_emission() -> None:
     assert link.now_ns() == START_NS
     assert link.read(0.5) == b""  # nothing to come before a session
     assert link.now_ns() == START_NS + 500_000_000
-    Connection(link).handshake()
+    Session(link).handshake()
     before = link.now_ns()
     status = link.read(10.0)
     assert len(status) > 20
@@ -189,7 +189,7 @@ def test_a_client_that_hangs_up_leaves_the_light_off_and_may_return(listen: str)
     def run_on(link: Link, n_cycles: int, observers: Observers) -> RunResult:
         core = Core(plan, make_decider(bundle), 1, n_cycles)
         options = RunOptions(n_cycles=n_cycles, deadline_us=1e9, lease_ms=300, realtime=False)
-        return run_live(link, profile, bundle, plan, core, options, observers=observers)
+        return run_live(link, Job(profile, bundle, plan, options), core, observers=observers)
 
     with serving(listen) as (port, device):
         link = open_link(port.url)
@@ -341,7 +341,7 @@ def test_simulate_prints_its_url_and_serves_until_told_to_end(how: list[str], nu
             assert process.stdout is not None
             url = process.stdout.readline().decode().strip()
             link = open_link(url)
-            assert Connection(link).handshake().facts["simulated"] is True
+            assert Session(link).handshake().facts["simulated"] is True
             link.close()
             process.send_signal(number)
             assert process.wait(PATIENCE_S) == code

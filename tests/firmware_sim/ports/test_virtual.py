@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from pans.base.errors import LinkError
-from pans.live.connection import Connection
+from pans.live.session import Session
 from pans.protocol.links.reader import count_delimiters
 from pans_sim.ports.serve import open_sim
 
@@ -27,7 +27,7 @@ def test_many_reads_in_one_call_are_those_made_one_by_one(frames: int, size: int
     found = []
     for at_once in (True, False):
         link: Any = open_sim(URL)
-        connection = Connection(link)
+        connection = Session(link)
         connection.handshake()  # STATUS comes once a second from here on
         if not at_once:
             link.reads_ahead = False
@@ -39,7 +39,7 @@ def test_many_reads_in_one_call_are_those_made_one_by_one(frames: int, size: int
 
 def test_what_was_read_before_a_link_failed_is_kept_and_the_next_read_fails_again() -> None:
     link: Any = open_sim(URL + "&faults=disconnect:1s/3s")
-    connection = Connection(link)
+    connection = Session(link)
     connection.handshake()
     chunks = connection.reader.ahead(5.0, 100, 1 << 20, link.now_ns() + 60 * 10**9)
     assert chunks

@@ -19,6 +19,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from commands import fixed_run
+from live_status import small_status
 
 from pans.app.main import main
 from pans.app.run.one_run import _exit_code
@@ -26,6 +27,7 @@ from pans.base.errors import RecordingError
 from pans.base.files.output_files import locked
 from pans.bundle.sensor.bundle import write_bundle
 from pans.decide.decision import DECISION_DTYPE
+from pans.decide.still import Core
 from pans.live.options import RunOptions
 from pans.live.stop import AGAIN_S, ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
 from pans.live.watch.metrics import MetricsServer
@@ -241,21 +243,19 @@ def test_exit_codes_of_a_run(facts: dict[str, Any], code: int) -> None:
 
 def test_the_state_names_only_what_is_written(tmp_path: Path) -> None:
     with Recorder(tmp_path / "run.pansrec", {"simulated": True}) as recorder:
-        run: Any = MagicMock()
-        run.core.n_decisions, run.journal.trouble, run.turned_s = 3, None, 0.0
-        run.core.tallies = np.zeros(16, np.int64)
-        run.timing.total.max_ns, run.timing.total.quantile_ns.return_value = 0, 0
-        run.lateness.incidents.causes = run.lateness.incidents.missing = {}
-        run.core.guard, run.journal.counts = None, {"light_changed": 2}
+        run = small_status(recorder)
+        run.accounts.journal.note("light_changed", words="more light")
         recorder.add_decisions(np.zeros(3, DECISION_DTYPE))
         assert picture_of(run, recorder, 0.0)["decisions"] == 0
         recorder.flush()
         assert picture_of(run, recorder, 0.0)["decisions"] == 3
         hot = [SimpleNamespace(kind="hot", rate=rate, expected=expected) for rate, expected in ((6, 2), (1, 0), (3, 2))]
-        run.core.guard = SimpleNamespace(serious=hot)
+        assert isinstance(run.core, Core)
+        run.core.guard = SimpleNamespace(serious=hot)  # type: ignore[assignment]
         picture = picture_of(run, recorder, 0.0)
         assert [kind for kind, lasts in picture["alarms"].items() if lasts] == ["hot", "light"]
         assert picture["times_expected"] == {"hot": 3.0}
+        run.session.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs files that are read without a name")

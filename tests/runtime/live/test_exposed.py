@@ -15,7 +15,7 @@ from commands import fixed_run, json_of, page_of, words_of
 
 from pans.decide.follower import Place, exposure_timing
 from pans.decide.still.core import Core
-from pans.live.loop import RunResult, run_live
+from pans.live.loop import Job, RunResult, run_live
 from pans.live.options import RunOptions
 from pans.live.timing.ledger import TimingLedger
 from pans.protocol.session import STREAM_TYPES
@@ -83,7 +83,7 @@ def ran(path: Path, mode: str = "sequential", **board: Any) -> tuple[RunResult, 
     header = {"config": one.recorded(), "profile": {"toml": one.profile.text}}
     with Recorder(path / "run.pansrec", header) as recorder:
         link = VirtualLink(device, clock, "sim:board")
-        result = run_live(link, one.profile, one.bundle, one.plan, one.core, config, recorder)
+        result = run_live(link, Job(one.profile, one.bundle, one.plan, config), one.core, recorder)
         result.decisions_sha256 = recorder.close({})
     again = replay(read_recording(path / "run.pansrec"), one.bundle)
     assert again.as_recorded

@@ -16,7 +16,7 @@ from pans.bundle.sensor.bundle import load_bundle
 from pans.decide.plan.plan import build_plan
 from pans.instrument.profile import Profile, load_profile
 from pans.live import device_check as fit
-from pans.live.connection import Connection
+from pans.live.session import Session
 from pans.protocol.wire import Opcode
 from pans.protocol.wire.commands import Extension, announcement
 from pans_sim.device.clock import DeviceClock
@@ -43,7 +43,7 @@ def test_the_device_holds_what_the_bundle_has(levels: int) -> None:
     bundle = BUNDLE if levels == 2 else grey_bundle(profile)
     plan, clock = build_plan(profile, bundle), DeviceClock(profile.clock.tick_hz)
     device = Instrument(profile, load_scene("uniform"), power_on_tick=clock.tick_at(START_NS))
-    connection = Connection(VirtualLink(device, clock, "upload"))
+    connection = Session(VirtualLink(device, clock, "upload"))
     facts = connection.handshake().facts
     fit.check_device(facts, plan, bundle, profile.clock.tick_hz)
     connection.upload(plan, bundle)
@@ -64,15 +64,15 @@ def test_an_older_device_gets_fixed_patterns_as_before() -> None:
 
 def test_a_device_that_knows_no_automata_is_refused_before_anything_is_sent() -> None:
     """The firmware in tests/independent was written before there were automata."""
-    connection = Connection(VirtualLab(Firmware(Light.of_scene(SCENE, 1e5, 2, 0))))
+    connection = Session(VirtualLab(Firmware(Light.of_scene(SCENE, 1e5, 2, 0))))
     facts = connection.handshake().facts
     plan = build_plan(PROFILE, BUNDLE)
     with pytest.raises(DeviceError, match="announces no automata, needed 0xd00a27ff") as refused:
         fit.check_automaton(facts, plan)
     assert "fixed patterns" in refused.value.remedy
-    connection.session.submit(Opcode.LOAD_STATES, b"", may_be_refused=True)  # and if one were sent all the same
+    connection.host.submit(Opcode.LOAD_STATES, b"", may_be_refused=True)  # and if one were sent all the same
     connection.wait_acknowledged()
-    assert connection.session.refusals[0].status == 1
+    assert connection.host.refusals[0].status == 1
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,10 @@ from pans.decide.flow.core import FlowCore
 from pans.decide.flow.make import build_flow_plan, plan_flow
 from pans.decide.flow.settings import FlowSettings, flow_of_header, read_flow
 from pans.instrument.profile import load_profile
-from pans.live import connection
+from pans.live import session
 from pans.live.dark_run import DarkRun
 from pans.live.flow_run import FlowRun
-from pans.live.loop import LiveRun, Observers, Recovery, run_live
+from pans.live.loop import Job, Observers, Recovery, Status, run_live
 from pans.live.options import RunOptions
 from pans.protocol.links.base import open_link
 from pans.protocol.wire import DARK_PATTERN
@@ -79,7 +79,7 @@ def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: 
     link = open_sim(f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast")
     device = link.device  # type: ignore[attr-defined]
 
-    def watch(run: LiveRun, output: Any) -> None:
+    def watch(run: Status, output: Any) -> None:
         asked.extend(action.tick for action in output.actions)
 
     result, figures, _, _ = run(flow_folder, replace(SETTINGS, gate_classes=("a",)), link, 0.05, watch=watch)
@@ -263,7 +263,7 @@ def run(
     facts = {"shots": 1, "tick_hz": PROFILE.clock.tick_hz, "backend": "table", "confidence": 0.0, "dark": dark.header()}
     with Recorder(path, {"config": facts | {"flow": flow.header()}}, overwrite=True) as recorder:
         recovery, observers = Recovery.of(link, url, 10.0), Observers(watch, flow.prepared)
-        result = run_live(link, PROFILE, bundle, plan, core, config, recorder, recovery, observers)
+        result = run_live(link, Job(PROFILE, bundle, plan, config), core, recorder, recovery, observers)
         recorder.close({})
     return result, flow.figures().as_json(), read_recording(path), bundle
 
@@ -277,12 +277,12 @@ def test_the_core_alone_leaves_the_same(
     told = []
     for alone in (True, False):
         numbers = random.Random(7)
-        monkeypatch.setattr(connection, "secrets", SimpleNamespace(randbelow=numbers.randrange))
+        monkeypatch.setattr(session, "secrets", SimpleNamespace(randbelow=numbers.randrange))
         if alone:
             monkeypatch.setattr(FlowCore, "takes", False)
         else:
             monkeypatch.undo()
-            monkeypatch.setattr(connection, "secrets", SimpleNamespace(randbelow=random.Random(7).randrange))
+            monkeypatch.setattr(session, "secrets", SimpleNamespace(randbelow=random.Random(7).randrange))
         link = open_sim(f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast&faults={faults}")
         settings = replace(SETTINGS, dark_every=dark_every)
         result, figures, recording, _ = run(flow_folder, settings, link, 0.05)

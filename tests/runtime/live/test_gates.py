@@ -17,9 +17,9 @@ from links import Stepped, served
 from pans.base.errors import DeviceError, LinkError, UsageError
 from pans.decide.decision import Action
 from pans.instrument.profile import load_profile
-from pans.live.connection import Connection
 from pans.live.gates import MAX_WAITING, GateQueue, SecondInstrument, idle_plan, open_actuator
 from pans.live.journal import Journal
+from pans.live.session import Session
 from pans.protocol.clock import ClockModel
 from pans.protocol.links.base import open_link
 from pans.protocol.session import COMMAND_WINDOW, HostSession
@@ -329,7 +329,7 @@ def test_a_second_instrument_is_probed_kept_and_read_at_its_own_pace() -> None:
 def test_a_pulse_of_a_second_instrument_leaves_at_once_with_its_own_tick() -> None:
     steps = Steps(drift_ppm=80).armed()
     steps.exchange(300)
-    clock = steps.second.connection.known_clock()
+    clock = steps.second.session.known_clock()
     for length_us, ticks in ((1000.0, round(1000 * clock.tick_hz / 1e6)), (1e-6, 1)):
         now_ns = steps.link.now_ns()
         at_ns = now_ns + 50 * MS
@@ -349,7 +349,7 @@ def test_a_late_pulse_of_a_second_instrument_is_refused_and_the_session_goes_on(
     steps = Steps().armed()
     command_id, *_ = steps.second.submit(steps.link.now_ns() - MS, 10.0, 0)
     steps.exchange(50)
-    session = steps.second.connection.session
+    session = steps.second.session.host
     assert [(refusal.command_id, refusal.status) for refusal in session.refusals] == [(command_id, AckStatus.TOO_LATE)]
     assert steps.device.state is DeviceState.RUNNING
 
@@ -358,7 +358,7 @@ def test_a_late_pulse_of_a_second_instrument_is_refused_and_the_session_goes_on(
 def test_a_second_instrument_that_went_dark_is_armed_again_once(stopped: bool) -> None:
     steps = Steps().armed()
     if stopped:
-        steps.second.connection.session.submit(Opcode.STOP)
+        steps.second.session.host.submit(Opcode.STOP)
     else:
         steps.link.let_pass(3.0)
         assert steps.device.state is DeviceState.SAFE
@@ -384,7 +384,7 @@ def test_a_second_instrument_is_armed_again_once_a_second_and_not_while_it_has_n
     """No STATUS comes any more, so that it seems to be SAFE for ever."""
     steps = Steps().armed()
     steps.link.let_pass(3.5)
-    steps.second.connection.pump(0.0)
+    steps.second.session.pump(0.0)
     read = steps.link.read
     monkeypatch.setattr(steps.link, "read", lambda timeout_s: without_status(read(timeout_s)))
     if not hears:
@@ -436,14 +436,14 @@ def test_what_a_second_instrument_is_before_and_after_it_is_connected() -> None:
     steps = Steps()
     assert steps.second.facts() == {"url": "sim:ideal"}
     with pytest.raises(LinkError, match="sim:ideal: the second instrument is not connected"):
-        _ = steps.second.connection
+        _ = steps.second.session
     steps.armed()
     steps.second.worst_uncertainty_ns = 2500
-    facts, fit = steps.second.facts(), steps.second.connection.known_clock().fit
+    facts, fit = steps.second.facts(), steps.second.session.known_clock().fit
     assert fit is not None
     assert (facts["simulated"], facts["drift_ppm"]) == (True, fit.drift_ppm)
     assert (facts["uncertainty_us"], facts["worst_uncertainty_us"]) == (fit.uncertainty_ns / 1000, 2.5)
-    assert facts["serial"] == steps.second.connection.session.welcome.facts.get("serial")  # type: ignore[union-attr]
+    assert facts["serial"] == steps.second.session.host.welcome.facts.get("serial")  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("connected", [False, True])
@@ -484,7 +484,7 @@ def test_the_worst_uncertainty_of_a_pulse_is_that_of_both_clocks() -> None:
     far, near = bench.journal.events
     assert [event["kind"] for event in (far, near)] == 2 * ["gate_sent"]
     for event in (far, near):
-        own_ns = steps.second.connection.known_clock().to_host_ns(event["second_tick"])[1]
+        own_ns = steps.second.session.known_clock().to_host_ns(event["second_tick"])[1]
         assert event["uncertainty_us"] == (bench.clock.to_host_ns(event["tick"])[1] + own_ns) / 1000
     assert steps.second.worst_uncertainty_ns == far["uncertainty_us"] * 1000 > near["uncertainty_us"] * 1000
 
@@ -577,9 +577,9 @@ class Lab:
     """A first instrument whose clock is known, and a queue that pulses on the second."""
 
     def __init__(self, first: Served, second: SecondInstrument) -> None:
-        self.connection = Connection(open_link(first.port.url))
-        self.connection.handshake()
-        self.clock: ClockModel = self.connection.synchronise()
+        self.session = Session(open_link(first.port.url))
+        self.session.handshake()
+        self.clock: ClockModel = self.session.synchronise()
         self.journal = Journal(None)
         self.queue = GateQueue(None, self.journal)
         self.failed: list[int] = []
@@ -589,15 +589,15 @@ class Lab:
     def turns(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         stop_ns = time.perf_counter_ns() + round(seconds * 1e9)
         while time.perf_counter_ns() < stop_ns and not until():
-            self.connection.pump(0.001)
-            self.queue.turn(self.connection.session, self.clock, time.perf_counter_ns())
+            self.session.pump(0.001)
+            self.queue.turn(self.session.host, self.clock, time.perf_counter_ns())
 
     def events(self, kind: str) -> list[dict[str, Any]]:
         return [event for event in self.journal.events if event["kind"] == kind]
 
     def close(self) -> None:
-        self.queue.finish(self.connection.session)
-        self.connection.close()
+        self.queue.finish(self.session.host)
+        self.session.close()
         self.queue.second.close()
 
 
@@ -633,7 +633,7 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
         off_ns = other.clock.host_ns_at(pulse.tick) - first.clock.host_ns_at(tick)
         assert abs(off_ns) <= row["uncertainty_us"] * 1000
         assert (pulse.end_tick - pulse.tick) / PULSER.clock.tick_hz == pytest.approx(20e-6, rel=0.05)
-    facts, kept = second.facts(), second.connection.known_clock().history()
+    facts, kept = second.facts(), second.session.known_clock().history()
     quickest = np.sort(kept["round_trip_ns"][-10:])  # of those while it ran: none had to wait for the next look
     assert quickest[2] < 15 * MS
     assert facts["worst_uncertainty_us"] == max(row["uncertainty_us"] for row in rows) < 50_000

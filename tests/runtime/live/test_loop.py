@@ -27,7 +27,7 @@ from pans.instrument.calibration_file import load_calibration
 from pans.instrument.profile import load_profile
 from pans.live.dark_run import DarkRun
 from pans.live.journal import Journal
-from pans.live.loop import RunResult, run_live
+from pans.live.loop import Job, RunResult, run_live
 from pans.live.options import RunOptions
 from pans.protocol.links.base import Link
 from pans.protocol.wire import messages as wire
@@ -88,7 +88,7 @@ def run(
     link = link if wrap is None else wrap(link)
     config = RunOptions(shots=shots, n_cycles=n_objects * plan.cycles_per_object, deadline_us=16667.0)
     return run_live(
-        link, PROFILE, bundle, plan, Core(plan, make_decider(bundle, shots=shots), shots, config.n_cycles), config
+        link, Job(PROFILE, bundle, plan, config), Core(plan, make_decider(bundle, shots=shots), shots, config.n_cycles)
     )
 
 
@@ -160,7 +160,7 @@ def test_a_device_of_another_kind_is_refused(bundle: Bundle, scene: Path) -> Non
     plan = build_plan(PROFILE, bundle, shots_per_object=1)
     link = open_sim(f"sim:dmd-spad?scene={scene}&pace=fast")
     with pytest.raises(DeviceError, match=r"projector levels: 2, needed 124"):
-        run_live(link, PROFILE, bundle, plan, Core(plan, make_decider(bundle), 1, 1), RunOptions(n_cycles=1))
+        run_live(link, Job(PROFILE, bundle, plan, RunOptions(n_cycles=1)), Core(plan, make_decider(bundle), 1, 1))
 
 
 def test_several_shots_per_decision(bundle: Bundle, scene: Path) -> None:
@@ -224,7 +224,7 @@ def test_what_a_bundle_states_is_contradicted_by_many_objects_only(
     profile = small_setup()[0]
     calibration = load_calibration(tmp_path / "calibration.json") if calibrated else None
     dark, run = DarkRun(profile, calibration, "warn", []), MagicMock()
-    run.connection.session.welcome.facts = {} if objects is None else {"objects": objects}
+    run.session.facts = {} if objects is None else {"objects": objects}
     dark.check_device(run)
     dark.light.stated = 2.0 if stated else None
     clicks = np.random.default_rng(1).integers(2, 5, 1600 if stated else 20_000)

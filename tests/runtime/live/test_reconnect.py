@@ -13,7 +13,7 @@ from links import Wrapped, served
 from pans.base.errors import LinkError
 from pans.bundle.backends.choose import make_decider
 from pans.decide.still.core import Core
-from pans.live.loop import Observers, Recovery, run_live
+from pans.live.loop import Job, Observers, Recovery, run_live
 from pans.live.options import RunOptions
 from pans.live.reconnect import MOST_FRUITLESS
 from pans.protocol.links.base import open_link
@@ -99,7 +99,7 @@ def recorded_run(
     facts = {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": backend, "drive": plan.drive, "confidence": 0.0}
     with Recorder(path, {"config": facts}) as recorder:
         recovery, observers = way_back or Recovery.of(link, url, 60.0), Observers(watch=watch)
-        result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
+        result = run_live(link, Job(profile, bundle, plan, config), core, recorder, recovery, observers)
         recorder.close({})
     recording = read_recording(path)
     return result, recording, replay(recording, bundle)

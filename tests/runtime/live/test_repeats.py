@@ -10,7 +10,7 @@ import pytest
 from commands import json_of, page_of, words_of
 
 from pans.base import SHIPPED
-from pans.live.loop import RunResult, run_live
+from pans.live.loop import Job, RunResult, run_live
 from pans.live.options import RunOptions
 from pans.protocol.session import STREAM_TYPES
 from pans.protocol.wire import MessageType
@@ -94,7 +94,7 @@ def session(path: Path, mode: str, how: int, seed: int, often: float) -> tuple[R
     header = one.recorded()
     with Recorder(path, {"config": header}, overwrite=True) as recorder:
         link = VirtualLink(device, clock, "sim:repeats")
-        result = run_live(link, one.profile, one.bundle, one.plan, one.core, config, recorder)
+        result = run_live(link, Job(one.profile, one.bundle, one.plan, config), one.core, recorder)
         recorder.close({})
     recording = read_recording(path)
     again = replay(recording, one.bundle)
@@ -111,7 +111,7 @@ def session(path: Path, mode: str, how: int, seed: int, often: float) -> tuple[R
 def wrong_verdicts(folder: Path, sessions: int, monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[int]]:
     """Run so many sessions; return those whose verdict is wrong, and how many were of each kind of HOW."""
     wrong, kinds = [], [0] * len(HOW)
-    monkeypatch.setattr("pans.live.connection.secrets", SimpleNamespace(randbelow=random.Random(1).randrange))
+    monkeypatch.setattr("pans.live.session.secrets", SimpleNamespace(randbelow=random.Random(1).randrange))
     modes = fault_grid.MODES
     for number in range(sessions):
         mode = modes[number % len(modes)]

@@ -12,7 +12,7 @@ from small_runs import record_small
 
 from pans.app.main import main
 from pans.base.errors import DeviceError
-from pans.live.loop import LiveRun
+from pans.live.loop import Status
 from pans.protocol.wire import MessageType, Opcode, unpack_body
 from pans.record.reading import Recording, read_recording
 from pans.record.reading.format import Kind
@@ -80,9 +80,9 @@ def test_what_the_device_answered_is_on_record(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_a_refusal_that_ends_the_set_up_is_on_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def refused(run: LiveRun) -> None:
-        run.connection.session.submit(Opcode.LOAD_PLAN, b"nothing that is a plan")
-        run.connection.wait_acknowledged()
+    def refused(run: Status) -> None:
+        run.session.host.submit(Opcode.LOAD_PLAN, b"nothing that is a plan")
+        run.session.wait_acknowledged()
 
     path = tmp_path / "run.pansrec"
     with pytest.raises(DeviceError, match="refused command"):

@@ -22,7 +22,7 @@ from pans.bundle.sensor import Bundle, load_bundle
 from pans.decide.plan import build_plan
 from pans.decide.still import Core
 from pans.instrument.profile import Profile, load_profile, parse_profile
-from pans.live.loop import Recovery, run_live
+from pans.live.loop import Job, Recovery, run_live
 from pans.live.options import RunOptions
 from pans.protocol.links import open_link
 from pans.record.recorder import Recorder
@@ -69,7 +69,7 @@ def _row(bundle: Bundle, slot_us: float, realtime: bool, drive: str, options: Be
         with Recorder(Path(folder) / "loop.pansrec", {"simulated": True}) as recorder:
             # starved for a whole lease, the host finds its instrument dark
             recovery = Recovery.of(link, link.name, RECOVER_S)
-            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery)
+            result = run_live(link, Job(profile, bundle, plan, config), core, recorder, recovery)
             recorder.close({})
         cpu_s, steal = time.process_time() - started, steal_ms()
     turns: Row = {}

@@ -102,7 +102,7 @@ def _calibrate(args: argparse.Namespace) -> int:
 def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str, Any], Counter[str]]:
     """Run one design through the ordinary session; return the core with its sums, the device's facts and what contradicts the evidence."""
     from pans.calibrate.measurement import CalibrationCore
-    from pans.live.loop import Observers, run_live
+    from pans.live.loop import Job, Observers, run_live
     from pans.live.options import RunOptions
     from pans.live.stop import INTERRUPTED
     from pans.protocol.links import open_link
@@ -114,7 +114,8 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     config = RunOptions(n_cycles=design.n_cycles, lease_ms=profile.timing.lease_ms)
     with progress_bar("exposures", design.n_cycles * design.plan.slots_per_cycle) as report:
         seen = Observers(lambda run, _: report(run.core.tracker.next_exposure), acts=False)
-        result = run_live(open_link(device), profile, design.bundle, design.plan, core, config, observers=seen)
+        job = Job(profile, design.bundle, design.plan, config)
+        result = run_live(open_link(device), job, core, observers=seen)
     if result.ended == INTERRUPTED:
         raise KeyboardInterrupt(result.ended)
     if result.ended != "completed":

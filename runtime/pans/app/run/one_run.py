@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from pans.bundle.sensor import Bundle
     from pans.calibrate.registration import InUse
     from pans.decide import Follower, Output
-    from pans.live.loop import FlowRun, LiveRun, Observers, RunResult
+    from pans.live.loop import FlowRun, Observers, RunResult, Status
     from pans.live.watch import MetricsServer, OscSender, Watchdog
     from pans.protocol.links import Link
     from pans.record.recorder import Recorder
@@ -334,7 +334,7 @@ class _Run:
     ) -> tuple[RunOptions, RunResult, Summary]:
         """Run, with all observers: the dark counts' guard, the live view, metrics and the state file, which get the verdict."""
         from pans.decide.kernel import BATCH_NS
-        from pans.live.loop import Observers, Recovery, running, scene_words
+        from pans.live.loop import Job, Observers, Recovery, running, scene_words
         from pans.live.watch import Watchers
 
         around, monitor, besides = self.around, self.around.monitor, self.around.besides
@@ -356,12 +356,11 @@ class _Run:
         monitor.begin(facts, around.stop)
         with Watchers(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
 
-            def prepared(run: LiveRun) -> None:
+            def prepared(run: Status) -> None:
                 self.dark.check_device(run)
                 if self.registration is not None:
                     self.registration.registered.check_made_for(self.profile, self.dark.serial_of(run))
-                welcome = run.connection.session.welcome
-                if welcome is not None and (words := scene_words(welcome.facts, options.device)):
+                if words := scene_words(run.session.facts, options.device):
                     say(f"pans: {words}")
                 if not link.virtual and (missing := lacking()):
                     say(f"pans: {sys.platform} has no {', no '.join(missing)}; decisions that are late are counted")
@@ -372,7 +371,7 @@ class _Run:
                 if self.flow_run is not None:
                     self.flow_run.prepared(run)
 
-            def look(run: LiveRun, output: Output) -> None:
+            def look(run: Status, output: Output) -> None:
                 self.dark.look(run, output)
                 seen.note_news(run)
                 monitor.watch(run, output)
@@ -384,8 +383,8 @@ class _Run:
             # a neighbour that hears of each decision hears of it at once
             at_once = around.osc is not None or (besides is not None and besides.watch is not None)
             observers = Observers(look, prepared, around.stop, acts=False, gather_ns=0 if at_once else BATCH_NS)
-            what = self.dark.profile, self.bundle, self.plan, self.core, self.options
-            result = around.ending.enter_context(running(link, *what, recorder, recovery, observers))
+            job = Job(self.dark.profile, self.bundle, self.plan, self.options)
+            result = around.ending.enter_context(running(link, job, self.core, recorder, recovery, observers))
             monitor.close_notes()
             options, summary = self._summary(options, result, recorder)
             seen.conclude(summary.verdict, summary.faults)

@@ -29,7 +29,7 @@ from pans.decide.plan import build_plan
 from pans.decide.still import Core
 from pans.instrument.optics import Imaging, seen
 from pans.instrument.profile import Profile
-from pans.live.loop import Connection, Observers, run_live
+from pans.live.loop import Job, Observers, Session, run_live
 from pans.live.options import RunOptions
 from pans.live.stop import Stop
 from pans.protocol.links import open_link
@@ -312,11 +312,11 @@ class Trial(NamedTuple):
 def scene_size(device: str) -> int:
     """Return how many objects the scene of a simulated instrument has, 0 where the device does not say."""
     with closing(open_link(device)) as link:
-        connection = Connection(link)
+        session = Session(link)
         try:
-            objects = connection.handshake().facts.get("objects", 0)
+            objects = session.handshake().facts.get("objects", 0)
         finally:
-            connection.detach()
+            session.detach()
     return objects if isinstance(objects, int) and objects > 0 else 0
 
 
@@ -411,7 +411,7 @@ class Tuning:
                 n_cycles=n_cycles, deadline_us=timing.decision_deadline_us, lease_ms=timing.lease_ms, realtime=False
             )
             watching = Observers(lambda _, output: log.note(output.decisions), stop=self.stop, acts=False)
-            result = run_live(link, self.profile, bundle, plan, core, config, None, None, watching)
+            result = run_live(link, Job(self.profile, bundle, plan, config), core, observers=watching)
         self.stop.obey()
         if result.link_lost or len(log.counts) != len(log.decisions) or not log.counts:
             what = "lost during" if result.link_lost else "no decision in"

@@ -7,6 +7,7 @@ messages are left to Python. Start at calls.py (`Kernel`), then receive.py; arra
 from . import arrays as arrays
 from .arrays import OVERSLEPT_NS, Drive
 from .calls import BATCH_NS, Kernel, Limits, StreamCore
+from .follow_up import FollowUp, PhotonsOf, follow_up_of
 from .receive import QUIET_NS, turn, unpack_blocks
 from .system_calls import now_ns, offered, read_now, wait_for, write_now
 
@@ -15,10 +16,13 @@ __all__ = [
     "OVERSLEPT_NS",
     "QUIET_NS",
     "Drive",
+    "FollowUp",
     "Kernel",
     "Limits",
+    "PhotonsOf",
     "StreamCore",
     "arrays",
+    "follow_up_of",
     "now_ns",
     "offered",
     "read_now",

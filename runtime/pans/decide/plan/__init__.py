@@ -10,7 +10,7 @@ plan.py checks that a bundle fits the profile: pattern memory, pixels, levels, m
 (10, 2)
 """
 
-from .marks import mark_of
+from .marks import mark_of, unknown_photons
 from .plan import NO_SHOT, Cycle, Plan, build_plan, detector_warnings, exposure_us, lay_out, ticks_of
 from .plan_codec import drive_words, plan_chunks, plan_commands, plan_from_chunks, reading_of
 
@@ -29,4 +29,5 @@ __all__ = [
     "plan_from_chunks",
     "reading_of",
     "ticks_of",
+    "unknown_photons",
 ]

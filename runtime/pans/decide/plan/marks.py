@@ -87,3 +87,8 @@ def mark_of(row: np.void) -> Mark:
     """Return the mark that stands in a row of MARK_DTYPE."""
     seq, number, truth, half, exposure, tick, photons = row.item()[4:]
     return Mark(seq, number, truth, exposure, tick, photons, half)
+
+
+def unknown_photons(numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+    """Return NaN for each of objects (n,), whose light nobody told, float32 (n,)."""
+    return np.full(len(numbers), np.nan, np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from pans.decide.plan import Plan
-from pans.live.connection import Connection
+from pans.live.session import Session
 from pans.protocol.links import Link
 from pans.protocol.tracker import Gap
 from pans.record.recorder import Recorder
@@ -31,10 +31,10 @@ class Lateness:
         if recorder is not None and not link.virtual:
             recorder.watch_write = partial(self.evidence.worked, DISK)
 
-    def attach(self, connection: Connection, start_ns: int, deciding: int | None) -> None:
-        """Take evidence from `connection`, and of the thread that decides, from here on; its exposures begin at `start_ns`."""
-        connection.evidence = self.evidence
-        self.evidence.watch(connection.reader.thread_id, deciding)
+    def attach(self, session: Session, start_ns: int, deciding: int | None) -> None:
+        """Take evidence from `session`, and of the thread that decides, from here on; its exposures begin at `start_ns`."""
+        session.evidence = self.evidence
+        self.evidence.watch(session.reader.thread_id, deciding)
         self.block_ns, self._asked, self._damaged = start_ns, False, 0
 
     def poll_s(self, now_ns: int) -> float:
@@ -57,25 +57,25 @@ class Lateness:
         """Note that the stream goes on."""
         self.block_ns, self._asked = arrival_ns, False
 
-    def ask_if_overdue(self, connection: Connection, block_ns: int, now_ns: int) -> bool:
+    def ask_if_overdue(self, session: Session, block_ns: int, now_ns: int) -> bool:
         """Probe the link, once in a silence, where the block behind that of `block_ns` is overdue; return whether that was done."""
         overdue = not self._asked and now_ns >= block_ns + self._patience_ns
         if overdue:
-            connection.session.probe(now_ns)
+            session.host.probe(now_ns)
             self._asked = True
         return overdue
 
-    def lost(self, gap: Gap, connection: Connection, now_ns: int) -> Attribution:
+    def lost(self, gap: Gap, session: Session, now_ns: int) -> Attribution:
         """Return the verdict on exposures that never came."""
-        counters = connection.decoder.counters
+        counters = session.decoder.counters
         damaged = counters.crc_errors + counters.cobs_errors + counters.short_frames + counters.oversized_frames
         attribution = self.incidents.lost(gap, min(self.block_ns, now_ns), now_ns, damaged - self._damaged)
         self._damaged = damaged
         return attribution
 
-    def settled(self, connection: Connection, now_ns: int, *, idle: bool) -> Attribution | None:
+    def settled(self, session: Session, now_ns: int, *, idle: bool) -> Attribution | None:
         """Do what is due after a turn that brought something, or nothing (`idle`); return a verdict that is ready."""
         if idle:
-            self.ask_if_overdue(connection, self.block_ns, now_ns)
+            self.ask_if_overdue(session, self.block_ns, now_ns)
         self.evidence.read_if_stale(now_ns)
         return self.incidents.verdict(now_ns)

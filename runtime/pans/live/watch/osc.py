@@ -21,7 +21,7 @@ from .metrics import parse_address
 
 if TYPE_CHECKING:
     from pans.decide import Output
-    from pans.live.run import LiveRun
+    from pans.live.status import Status
 
 # An element of a bundle: its size, address, types and arguments, big-endian; strings end with a zero and fill words of four bytes.
 OSC_DTYPE = np.dtype(
@@ -56,7 +56,7 @@ class OscSender:
         self._socket.setblocking(False)
         self.sent = self.dropped = 0  # decisions
 
-    def watch(self, run: LiveRun, output: Output) -> None:
+    def watch(self, run: Status, output: Output) -> None:
         """Send the decisions of `output`."""
         rows = rows_of(output.decisions)
         if not len(rows):
@@ -67,7 +67,7 @@ class OscSender:
             messages[name] = rows[column]
         messages["clicks"], messages["flags"] = rows["clicks"], rows["flags"]
         messages["label"] = np.where(rows["label"] == NO_LABEL, -1, rows["label"].astype(np.int32))
-        messages["late"] = np.isin(rows["index"], run.late) if run.late else 0
+        messages["late"] = np.isin(rows["index"], run.accounts.late) if run.accounts.late else 0
         for first in range(0, len(rows), PER_DATAGRAM):
             some = messages[first : first + PER_DATAGRAM]
             with suppress(OSError):  # the buffer is full, or the network is gone: a run does not end because of that

@@ -1,6 +1,6 @@
 """A run as one flat picture: what it has done, what went wrong last, what it uses; and the file that holds it, written each second.
 
-Whether the loop turns is judged by its own stamp: it sets `LiveRun.turned_s` at each iteration, and while it looks for a lost device at
+Whether the loop turns is judged by its own stamp: it sets `Status.turned_s` at each iteration, and while it looks for a lost device at
 each attempt.
 """
 
@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 from pans.base.errors import DamagedFileError, UsageError
 from pans.base.files import canonical_json, parse_json_object, replace_file
 from pans.base.numbers import Part, decision_figures, live_figures
-from pans.decide.still import DARK_CLICKS, DARK_EXPOSURES
 from pans.live.journal import words_of
 
 if TYPE_CHECKING:
-    from pans.live.run import LiveRun
+    from pans.live.accounts import Account
+    from pans.live.status import Status
     from pans.record.recorder import Recorder
 
 FORMAT = "pans-state 1"
@@ -37,12 +37,12 @@ STALLED_AFTER_S = 0.75  # an iteration waits 20 ms at most; the file, written ea
 LOST_STALLED_AFTER_S = 15.0  # while a lost device is looked for: pauses of 2 s, a handshake of 5 s, the upload
 
 
-def loop_age_s(run: LiveRun) -> float:
+def loop_age_s(run: Status) -> float:
     """Return how long ago the loop turned, in seconds."""
     return max(0.0, time.monotonic() - run.turned_s)
 
 
-def is_stalled(run: LiveRun) -> bool:
+def is_stalled(run: Status) -> bool:
     """Whether the loop should have turned by now."""
     return loop_age_s(run) > (STALLED_AFTER_S if run.outage_ns is None else LOST_STALLED_AFTER_S)
 
@@ -56,7 +56,7 @@ def read_state(path: Path) -> dict[str, Any] | None:
     return found if found.get("format") == FORMAT else None
 
 
-def alarms_of(run: LiveRun) -> dict[str, dict[str, Any]]:
+def alarms_of(run: Status) -> dict[str, dict[str, Any]]:
     """Return `alarms`, for each of ALARMS whether it lasts, 1 or 0, and `times_expected`, the dark rate over the expected one of each kind.
 
     A change of the light lasts to the end of the run. A rate is that at the finding, of several channels the highest.
@@ -65,11 +65,11 @@ def alarms_of(run: LiveRun) -> dict[str, dict[str, Any]]:
     found = [] if guard is None else guard.serious
     alarms = dict.fromkeys(ALARMS, 0) | {one.kind: 1 for one in found}
     times = sorted((one.rate / one.expected, one.kind) for one in found if one.expected > 0)
-    alarms["light"] = int(run.journal.counts["light_changed"] > 0)
+    alarms["light"] = int(run.accounts.journal.counts["light_changed"] > 0)
     return {"alarms": alarms, "times_expected": {kind: ratio for ratio, kind in times}}
 
 
-def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float) -> dict[str, Any]:
+def picture_of(run: Status | None, recorder: Recorder | None, started_s: float) -> dict[str, Any]:
     """Return the run's figures as they are now, JSON-able, units in the keys; `started_s` is on time.monotonic's scale."""
     picture: dict[str, Any] = {
         "format": FORMAT,
@@ -84,43 +84,42 @@ def picture_of(run: LiveRun | None, recorder: Recorder | None, started_s: float)
         picture |= {"parts": recorder.parts} if recorder.parts else {}
     if run is None:
         return picture
-    timing, stream, tallies = run.timing, run.core.tracker.counters, run.core.tallies
-    told = run.core.exposed
+    told, account = run.core.exposed, run.accounts.account()
     exposed = {"exposure_start_us": told.start_error, "exposure_length_us": told.length_error} if told.exposures else {}
-    incidents, trouble = run.lateness.incidents, run.journal.trouble
+    trouble = account.trouble
     return picture | {
         "state": state_of(run),
         "loop_age_s": round(loop_age_s(run), 3),
         "ended": run.ended,
         # of those that are recorded only what is in the file: the rest is lost if the process is killed
         "decisions": run.core.n_decisions if recorder is None else recorder.n_written,
-        "late": timing.late,
-        "late_cause": dict(incidents.causes),
-        "lost_exposures": stream.lost_exposures,
-        "lost_cause": dict(incidents.missing),
-        "gaps": stream.gaps,
-        "exposures": stream.exposures,
-        "latency_p99_us": timing.total.summary()["p99"],  # None of too few decisions
-        "latency_max_us": timing.total.max_ns / 1000,
-        "dark_exposures": int(tallies[DARK_EXPOSURES]),
-        "dark_clicks": int(tallies[DARK_CLICKS]),
-        **{key: ticks * run.plan.tick_us for key, ticks in exposed.items()},
+        "late": account.late,
+        "late_cause": account.late_cause,
+        "lost_exposures": account.stream["lost_exposures"],
+        "lost_cause": account.lost_cause,
+        "gaps": account.stream["gaps"],
+        "exposures": account.stream["exposures"],
+        "latency_p99_us": account.latency_us["p99"],  # None of too few decisions
+        "latency_max_us": account.latency_us["max"] or 0.0,
+        "dark_exposures": account.dark_exposures,
+        "dark_clicks": account.dark_clicks,
+        **{key: ticks * run.job.plan.tick_us for key, ticks in exposed.items()},
         "reconnects": run.reconnects,
-        **_of_decisions(run),
+        **_of_decisions(account),
         **alarms_of(run),
         "last_error": f"{trouble['kind']}: {words_of(trouble)}" if trouble else "",
     }
 
 
-def _of_decisions(run: LiveRun) -> dict[str, Any]:
+def _of_decisions(account: Account) -> dict[str, Any]:
     """Return those figures of the state file that follow from the decisions alone, as in the summary."""
     # not `decisions`: of a recording those that are in the file count
     wanted = [one for one in live_figures() if one.part is Part.DECISIONS and one.key != "decisions"]
-    found = decision_figures(run.tally.sums()) if wanted else None
+    found = decision_figures(account.decided) if wanted else None
     return {one.live: getattr(found, one.key) for one in wanted}
 
 
-def state_of(run: LiveRun) -> str:
+def state_of(run: Status) -> str:
     """Return what the run does, in one or two words."""
     if run.ended:
         return "stopped"

@@ -23,7 +23,7 @@ from pans.base.errors import EXIT_INTERRUPTED, EXIT_TIMING
 from pans.live.stop import ASKED_TO_STOP, INTERRUPTED
 
 if TYPE_CHECKING:
-    from pans.live.run import LiveRun
+    from pans.live.status import Status
     from pans.record.recorder import Recorder
 
 # A loop that turns reads the signal within 20 ms and takes at most 1 s until the device has said that it is dark.
@@ -38,7 +38,7 @@ class Watchdog:
     """Ends this process when it was asked to end and does not; to be entered in the main thread, inside `stop_signals`."""
 
     def __init__(self, *, continuous: bool) -> None:
-        self.run: LiveRun | None = None
+        self.run: Status | None = None
         self.recorder: Recorder | None = None  # to be flushed
         self.note: Callable[[str], object] = str  # is called with why the process ends
         self.closes = False  # from here on the light is off and files are closed
@@ -74,9 +74,10 @@ class Watchdog:
         """Wait for the run to end, and end it when it does not."""
         if self._is_done_by(asked_s + LIGHT_OFF_AFTER_S):
             return
-        if self.run is not None and not self.run.stops:
-            link, session, receiver = self.run.connection.link, self.run.connection.session, self.run.receiver
-            _within(STEP_S, lambda: link.write(session.stop_frames(receiver.next_id())))  # in the loop's place
+        if self.run is not None and not self.run.receiver.stops:
+            session, receiver = self.run.session, self.run.receiver
+            # in the loop's place
+            _within(STEP_S, lambda: session.link.write(session.host.stop_frames(receiver.next_id())))
         if self._is_done_by(asked_s + END_AFTER_S):
             return
         while self.closes or (

@@ -22,7 +22,7 @@ from .state_file import Repeated, StateFile, is_stalled, picture_of, read_state
 
 if TYPE_CHECKING:
     from pans.live.options import RunOptions
-    from pans.live.run import LiveRun
+    from pans.live.status import Status
     from pans.live.stop import Stop
     from pans.record.recorder import Recorder
 
@@ -45,7 +45,7 @@ class Watchers:
     _stop: Stop
     _metrics: MetricsServer | None
     _host: HostWatch | None = None
-    _run: LiveRun | None = None
+    _run: Status | None = None
     _state: StateFile | None = None
     _notifier: Notifier | None = None
     _started_s: float = field(default_factory=time.monotonic)
@@ -99,7 +99,7 @@ class Watchers:
             self.conclude("FAIL", [why])
         self._outcome |= ended
 
-    def prepared(self, run: LiveRun) -> None:
+    def prepared(self, run: Status) -> None:
         """Watch `run` from here on."""
         self._run = run
         if self._watchdog is not None:
@@ -118,10 +118,10 @@ class Watchers:
         facts = {} if self._host is None else self._host.facts
         return picture_of(self._run, self._recorder, self._started_s) | facts | self._outcome
 
-    def note_news(self, run: LiveRun) -> None:
+    def note_news(self, run: Status) -> None:
         """Note in the journal of `run` what was found about the computer; called by the loop."""
         while self._host is not None and self._host.news:
-            run.journal.note(**self._host.news.popleft())
+            run.accounts.journal.note(**self._host.news.popleft())
 
     def _note_end(self, why: str) -> None:
         """The watchdog ends the process."""
@@ -151,7 +151,7 @@ class Notifier:
         known = microseconds.isdecimal() and 0 < int(microseconds) < 1 << 62
         return cls(address, int(microseconds) / 1e6 / NOTIFICATIONS_PER_TIMEOUT if known else NOTIFY_EVERY_S)
 
-    def begin(self, run: LiveRun) -> None:
+    def begin(self, run: Status) -> None:
         """Say that the service is ready, and from here on that the loop of `run` turns."""
         self._send("READY=1")
 

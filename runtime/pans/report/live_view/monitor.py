@@ -26,7 +26,7 @@ from pans.base.errors import UsageError
 if TYPE_CHECKING:
     from pans.bundle.sensor import Bundle
     from pans.decide import Decision, Output
-    from pans.live.loop import LiveRun
+    from pans.live.loop import Status
     from pans.live.stop import Stop
 
     from .snapshot import Snapshots
@@ -56,7 +56,7 @@ class Monitor:
         self._latest: deque[Decision] = deque(maxlen=KEPT_DECISIONS)
         self._notes: deque[dict[str, Any]] = deque(maxlen=NOTES_WAITING)
         self._stop: Stop | None = None
-        self._run: LiveRun | None = None
+        self._run: Status | None = None
         self.url = ""
 
     def __enter__(self) -> Self:
@@ -101,14 +101,14 @@ class Monitor:
             self._thread = threading.Thread(target=self._keep, args=(facts,), name="pans-monitor", daemon=True)
             self._thread.start()
 
-    def prepared(self, run: LiveRun, bundle: Bundle, look: Callable[[], dict[str, Any]]) -> None:
+    def prepared(self, run: Status, bundle: Bundle, look: Callable[[], dict[str, Any]]) -> None:
         """Show `run` from here on, and what `look` returns of it (watch.state_file)."""
         from .snapshot import Snapshots
 
         self._run = run
         self._snapshots = Snapshots(run, bundle, self._latest, look, words=bool(self.url))
 
-    def watch(self, run: LiveRun, output: Output) -> None:
+    def watch(self, run: Status, output: Output) -> None:
         """Take the decisions of a block."""
         self._latest.extend(output.decisions[-KEPT_DECISIONS:])
         if self._notes:
@@ -117,8 +117,8 @@ class Monitor:
     def close_notes(self) -> None:
         """Note in the run's journal, and so in its recording, what was written on the page; called by the loop."""
         while self._notes and (run := self._run) is not None:
-            tick = run.connection.known_clock().to_tick(run.now_ns())
-            run.journal.note("note", **self._notes.popleft(), tick=tick)
+            tick = run.session.known_clock().to_tick(run.now_ns())
+            run.accounts.journal.note("note", **self._notes.popleft(), tick=tick)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

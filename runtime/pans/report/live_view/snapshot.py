@@ -29,7 +29,7 @@ from .alarms import INSTANT
 if TYPE_CHECKING:
     from pans.bundle.sensor import Bundle
     from pans.decide import Decision
-    from pans.live.loop import LiveRun
+    from pans.live.loop import Account, Status
 
 LATEST = 12  # decisions
 LOOKS, LOOK_EVERY_S = 8, 0.003  # for a word that is whole
@@ -47,14 +47,14 @@ class Snapshots:
     """
 
     def __init__(
-        self, run: LiveRun, bundle: Bundle, latest: deque[Decision], look: Callable[[], dict[str, Any]], *, words: bool
+        self, run: Status, bundle: Bundle, latest: deque[Decision], look: Callable[[], dict[str, Any]], *, words: bool
     ) -> None:
         self._run, self._bundle, self._latest, self._look = run, bundle, latest, look
         self._began_s = time.monotonic()
-        self._counts = np.zeros_like(run.timing.total.counts)
+        self._counts = np.zeros_like(run.accounts.timing.total.counts)
         self._told: set[int] = set()
         self._told_events = 0
-        automaton = run.plan.automaton
+        automaton = run.job.plan.automaton
         self._light = None if automaton is None else bundle.light_of(automaton)  # of each state
         self._breathe: Callable[[float], None] = time.sleep
         self._core = run.core if words and isinstance(run.core, Core) else None  # whose click words are told
@@ -64,31 +64,30 @@ class Snapshots:
     def take(self, breathe: Callable[[float], None] = time.sleep) -> dict[str, Any]:
         """Return the run's figures as they are now; `breathe` is called between the parts."""
         self._breathe = breathe
-        link, welcome = self._run.connection.link, self._run.connection.session.welcome
+        session, account = self._run.session, self._run.accounts.account()
         picture = self._look() | {"kind": "picture", "elapsed_s": round(time.monotonic() - self._began_s, 3)}
-        picture["simulated"] = bool(link.simulated or (welcome and welcome.facts.get("simulated")))
-        picture["virtual_time"] = link.virtual
+        picture["simulated"] = bool(session.link.simulated or session.facts.get("simulated"))
+        picture["virtual_time"] = session.link.virtual
         for part in (self._results, self._latency, self._decisions, self._dark, self._clock):
             breathe(BREATH_S)
-            picture |= part()
+            picture |= part(account)
         return picture
 
-    def _results(self) -> dict[str, Any]:
-        run, core = self._run, cast(Any, self._run.core)  # of any kind
-        wrong = sum((run.contradictions + core.contradictions).values()) + core.tracker.counters.repeats_differing
+    def _results(self, account: Account) -> dict[str, Any]:
+        core = cast(Any, self._run.core)  # of any kind
+        wrong = sum(account.contradictions.values()) + account.stream["repeats_differing"]
         light = None if self._light is None else float(core.windows.walks.shown @ self._light)
-        figures: dict[str, Any] = run.tally.sums() | {"objects": run.tally.objects}
+        figures: dict[str, Any] = account.decided | {"objects": account.objects}
         return figures | {"walk_light": light, "contradictions": wrong}
 
-    def _latency(self) -> dict[str, Any]:
+    def _latency(self, account: Account) -> dict[str, Any]:
         """The histogram of latencies as it has grown since the last picture: [duration in ns, how many more]."""
-        total = self._run.timing.total
-        before, self._counts = self._counts, total.counts.copy()
+        before, self._counts = self._counts, account.latency_counts
         grown = self._counts - before
         some = [[upper_edge(bucket), int(grown[bucket])] for bucket in np.flatnonzero(grown).tolist()]
         return {"latency": some}
 
-    def _decisions(self) -> dict[str, Any]:
+    def _decisions(self, account: Account) -> dict[str, Any]:
         """The latest decisions, the click word of one of them, and the pixels of patterns that are new.
 
         The loop may be ahead of the decisions that it has handed over. A word belongs to the decision whose checksum it has.
@@ -108,7 +107,7 @@ class Snapshots:
 
     def _word(self, core: Core, row: Decision, counts: NDArray[np.int64]) -> dict[str, Any]:
         """A decision with its patterns, the clicks on each, and each class's probability where it is that of the decision."""
-        automaton, clicks = self._run.plan.automaton, counts.tolist()
+        automaton, clicks = self._run.job.plan.automaton, counts.tolist()
         if automaton is None:
             shown = list(range(min(len(clicks), PIXELS_MAX)))
         else:
@@ -139,7 +138,7 @@ class Snapshots:
         grey = np.round(picture[::step, ::step] * (255 / (float(values.max()) or 1.0))).astype(np.uint8)
         return {"shape": list(grey.shape), "grey": base64.b64encode(grey.tobytes()).decode()}
 
-    def _dark(self) -> dict[str, Any]:
+    def _dark(self, account: Account) -> dict[str, Any]:
         guard = self._run.core.guard
         if guard is None:
             return {}
@@ -158,14 +157,14 @@ class Snapshots:
             ],
         }
 
-    def _clock(self) -> dict[str, Any]:
-        clock = self._run.connection.clock
+    def _clock(self, account: Account) -> dict[str, Any]:
+        clock = self._run.session.clock
         fit = None if clock is None else clock.fit
-        news = self._run.journal.events[self._told_events : self._told_events + EVENTS_MAX]
+        news = self._run.accounts.journal.events[self._told_events : self._told_events + EVENTS_MAX]
         self._told_events += len(news)
         return {
             "clock_drift_ppm": None if fit is None else round(fit.drift_ppm, 4),
-            "clock_uncertainty_us": self._run.timing.worst_uncertainty_ns / 1000,
+            "clock_uncertainty_us": account.clock_uncertainty_us,
             "events": [[e["kind"], words_of(e), e.get("since")] for e in news if e["kind"] in INSTANT],
         }
 

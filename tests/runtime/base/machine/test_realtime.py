@@ -160,12 +160,14 @@ def test_real_time_is_asked_for_with_a_device_and_not_with_a_simulated_one(
     simulated: bool, told: bool, options: dict[str, bool], asked: bool
 ) -> None:
     link = SimpleNamespace(virtual=False, simulated=simulated, now_ns=time.perf_counter_ns, fileno=lambda: None)
-    welcome = SimpleNamespace(facts={"simulated": told})
     reader = SimpleNamespace(thread_id=None)
-    connection = SimpleNamespace(link=link, reader=reader, session=SimpleNamespace(welcome=welcome))
+    session = SimpleNamespace(link=link, reader=reader, facts={"simulated": told})
     receiver = SimpleNamespace(thread_id=None)
     run: Any = SimpleNamespace(
-        connection=connection, config=RunOptions(**options), realtime=dict[str, Any](), receiver=receiver
+        session=session,
+        job=SimpleNamespace(options=RunOptions(**options)),
+        realtime=dict[str, Any](),
+        receiver=receiver,
     )
     with _granted(run):
         assert ("sched_fifo" in run.realtime, "mlockall" in run.realtime) == (asked, asked)

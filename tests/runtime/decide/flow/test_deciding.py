@@ -17,7 +17,7 @@ from pans.decide.decision import DecisionFlag, Output, joined
 from pans.decide.flow.core import FlowCore
 from pans.decide.kernel import arrays as ring
 from pans.decide.kernel.calls import Kernel
-from pans.live.flow_run import settled_blocks
+from pans.decide.kernel.follow_up import follow_up_of
 from pans.protocol.wire import MessageType, encode_frame
 from pans.protocol.wire.framing import FrameDecoder
 
@@ -37,14 +37,13 @@ TABLES = {shots: table(shots) for shots in (1, 2)}
 
 def by_turn(core: FlowCore, data: bytes, cuts: list[int]) -> Output:
     """The kernel, and what it leaves to the core by `step`."""
-    turn, output = Kernel(core.steps(SESSION), FrameDecoder()), NOTHING
+    turn, output, follow_up = Kernel(core.steps(SESSION), FrameDecoder()), NOTHING, follow_up_of(core)
     for first, stop in zip([0, *cuts], [*cuts, len(data)]):
         ended = turn.feed([(1, data[first:stop])])
         while True:
-            for came in settled_blocks(turn) if len(turn.blocks) else ():
+            follow_up.marks(turn)
+            for came in follow_up.outputs(turn, turn.rows):
                 output = joined(output, came)
-            if not len(turn.blocks):
-                core.remember_rows(turn.marks())
             if ended == ring.ALL_TAKEN:
                 break
             if ended == ring.ODD:

@@ -21,9 +21,9 @@ from pans.bundle.backends.choose import make_decider
 from pans.decide.kernel import receive
 from pans.decide.kernel.calls import Kernel
 from pans.decide.still.core import Core
-from pans.live.connection import Connection
-from pans.live.loop import NO_OBSERVERS, Observers, Recovery, RunResult, run_live
+from pans.live.loop import NO_OBSERVERS, Job, Observers, Recovery, RunResult, run_live
 from pans.live.options import RunOptions
+from pans.live.session import Session
 from pans.protocol.links.base import open_link
 from pans.protocol.session import HostSession
 from pans.record.reading import read_recording
@@ -67,7 +67,9 @@ def recorded(setup: Any, link: Any, path: Path, observers: Any = NO_OBSERVERS) -
     facts = {"config": {"shots": 1, "tick_hz": setup.profile.clock.tick_hz, "backend": backend, **driven}}
     with Recorder(path, facts) as recorder:
         recovery = None if link.virtual else Recovery.of(link, setup.url, 10.0)  # a busy machine may arm too late
-        result = run_live(link, setup.profile, setup.bundle, setup.plan, core, config, recorder, recovery, observers)
+        result = run_live(
+            link, Job(setup.profile, setup.bundle, setup.plan, config), core, recorder, recovery, observers
+        )
         recorder.close({})
     return result, read_recording(path)
 
@@ -108,15 +110,14 @@ def test_a_recording_that_fails_counts_nothing_twice(tmp_path: Path, monkeypatch
             recorded(setup, open_link(setup.url), tmp_path / "run.pansrec", Observers(prepared=runs.append))
     finally:
         setup.close()
-    runs[0].count_decoded()
     assert runs[0].stopped
-    assert runs[0].contradictions == {}
+    assert runs[0].accounts.contradictions == {}
 
 
 def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It has its time when it is made: a wait before it is sent would count as its way to the device."""
     told: list[str] = []
-    for owner, name in ((HostSession, "probe"), (Connection, "flush"), (Kernel, "run")):
+    for owner, name in ((HostSession, "probe"), (Session, "flush"), (Kernel, "run")):
         original = getattr(owner, name)
 
         def noted(*arguments: Any, name: str = name, original: Any = original, **options: Any) -> Any:

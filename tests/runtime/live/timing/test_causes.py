@@ -20,7 +20,7 @@ from pans.bundle.backends.choose import make_decider
 from pans.decide.plan.plan import build_plan
 from pans.decide.still.core import Core
 from pans.instrument.profile import load_profile
-from pans.live.loop import run_live
+from pans.live.loop import Job, run_live
 from pans.live.options import RunOptions
 from pans.live.timing.causes import (
     CAUSES,
@@ -316,7 +316,7 @@ def test_whole_runs_in_virtual_time_blame_what_was_done_to_them(faults: str, cau
     path = tmp_path / "run.pansrec"
     with Recorder(path, {}) as recorder:
         link = open_sim(f"sim:ideal?scene=uniform&pace=fast&seed=2&faults={faults}")
-        result = run_live(link, profile, bundle, plan, core, config, recorder)
+        result = run_live(link, Job(profile, bundle, plan, config), core, recorder)
         recorder.close({})
     assert result.ended == "completed"
     assert set(result.late_cause) | set(result.lost_cause) == causes

@@ -135,7 +135,7 @@ def test_a_run_whose_light_is_off_has_time_to_close_its_links_and_files(monkeypa
     dog = watchdog.Watchdog(continuous=True)
 
     class Dark:
-        stops = True
+        receiver = SimpleNamespace(stops=True)
 
         @property
         def stopped(self) -> bool:

@@ -25,9 +25,9 @@ import pans
 from pans.base.errors import LinkError, UsageError
 from pans.bundle.backends.choose import make_decider
 from pans.decide.still.core import Core
-from pans.live.connection import Connection
-from pans.live.loop import Observers, Recovery, RunResult, run_live
+from pans.live.loop import Job, Observers, Recovery, RunResult, run_live
 from pans.live.options import RunOptions
+from pans.live.session import Session
 from pans.protocol.links import base as link_module
 from pans.protocol.links import reader as link_reader
 from pans.protocol.links.base import Link, open_link
@@ -98,9 +98,9 @@ def test_without_data_a_read_comes_back_empty_after_its_time(rigged: Rig) -> Non
 def test_every_byte_arrives_in_order(rigged: Rig) -> None:
     """Two thousand probes in writes of many sizes: 256 byte values, long writes, and one answer each."""
     link = rigged.link
-    connection = Connection(link)
+    connection = Session(link)
     connection.handshake()
-    nonce = connection.session.nonce
+    nonce = connection.host.nonce
     connection.reader.stop()
     probes = 2000
     data = b"".join(wire.encode_ping(number, number * 0x0101_0101_0101, nonce) for number in range(probes))
@@ -153,7 +153,7 @@ def run_on(link: Link, n_cycles: int, recovery: Recovery | None = None, pull: An
     profile, bundle, plan = small_setup("sequential")
     core = Core(plan, make_decider(bundle), 1, n_cycles)
     config = RunOptions(n_cycles=n_cycles, deadline_us=1e9, realtime=False)
-    return run_live(link, profile, bundle, plan, core, config, recovery=recovery, observers=Observers(pull))
+    return run_live(link, Job(profile, bundle, plan, config), core, recovery=recovery, observers=Observers(pull))
 
 
 def test_a_whole_run_decides(rigged: Rig) -> None:
@@ -444,14 +444,14 @@ def test_a_device_that_another_program_uses_is_said_to_be_in_use(monkeypatch: py
     monkeypatch.setattr("pans.protocol.session.HELLO_GIVE_UP_NS", 300_000_000)
     device, clock = build_instrument(OPTIONS, time.perf_counter_ns())
     with served(device, clock) as port:
-        first = Connection(open_link(port.url))
+        first = Session(open_link(port.url))
         first.handshake()
-        second = Connection(open_link(port.url))
+        second = Session(open_link(port.url))
         with pytest.raises(LinkError, match="in use by another program") as refused:
             second.handshake()
         assert "firmware" not in refused.value.remedy
         second.close()
         first.close()
-        third = Connection(open_link(port.url))
+        third = Session(open_link(port.url))
         third.handshake()
         third.close()

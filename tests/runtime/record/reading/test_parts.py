@@ -19,7 +19,7 @@ from pans.app.main import main
 from pans.base.errors import DamagedFileError, RecordingError, UsageError
 from pans.base.files.container import open_regular
 from pans.decide.plan.plan import Plan
-from pans.live.loop import LiveRun
+from pans.live.loop import Status
 from pans.protocol.wire.schema import RECEIVE_WINDOW
 from pans.record.reading import Recording, read_recording, recording
 from pans.record.reading.exposures import click_list, iter_exposures
@@ -222,14 +222,14 @@ def test_limits_that_cannot_be_meant(limits: tuple[int, int]) -> None:
 def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
     runs = []
 
-    def prepared(run: LiveRun) -> None:
-        file = run.recorder.open_file  # type: ignore[union-attr]
+    def prepared(run: Status) -> None:
+        file = run.accounts.recorder.open_file  # type: ignore[union-attr]
         file._file = Disk(file._file, write=fails(errno.ENOSPC))
         runs.append(run)
 
     with pytest.raises(RecordingError, match="No space left on device"):
         record_small(tmp_path / "run.pansrec", 3000, limits=PartLimits(1 << 30), prepared=prepared)
-    status = runs[0].connection.session.status
+    status = runs[0].session.host.status
     assert status.state == 0  # IDLE: it was told to stop
     assert not read_recording(parts_in(tmp_path)[0]).complete
 

@@ -306,10 +306,10 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Watched:
 def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path: Path) -> None:
     assert main([*fixed_run(60, trials=2), "--out", str(tmp_path / "run")]) == 0
     run, history = watched.run, watched.history
-    tally, last = run.tally, history.picture
+    tally, last = run.accounts.tally, history.picture
     assert last["decisions"] == tally.decisions == 120
     assert last["right"] / last["judged"] == tally.figures().accuracy == tally.confusion.trace() / 120
-    assert sum(history.latency.values()) == run.timing.total.total
+    assert sum(history.latency.values()) == run.accounts.timing.total.total
     assert [row[0] for row in last["latest"]] == list(range(108, 120))
     bundle, _ = load_bundle(SHIPPED / "fashion10.pans")
     word = last["word"]
@@ -330,7 +330,7 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(watched: Watched, tmp_path:
 @pytest.mark.parametrize("drive", ["device", "host"])
 def test_a_walk_is_told_beside_its_own_decision(watched: Watched, drive: str, tmp_path: Path) -> None:
     assert main(["demo", "--pace", "fast", "--drive", drive, "--seconds", "2", "--out", str(tmp_path / "run")]) == 0
-    automaton, found = watched.run.plan.automaton, 0
+    automaton, found = watched.run.job.plan.automaton, 0
     rows = {int(row["index"]): row for row in read_recording(tmp_path / "run" / "run.pansrec").decisions()}
     for one in watched.pictures:
         if "word" not in one:
@@ -354,10 +354,10 @@ def test_what_is_asked_for_on_the_page_is_done_and_recorded(watched: Watched, tm
 
     class Asked(Watched):
         def watch(self, run: Any, output: Any) -> None:
-            if run.tally.decisions >= 20 and asked:
+            if run.accounts.tally.decisions >= 20 and asked:
                 self._listen(io.StringIO("".join(json.dumps(one) + "\n" for one in asked)))
                 asked.clear()
-            elif run.tally.decisions >= 40:
+            elif run.accounts.tally.decisions >= 40:
                 self._listen(io.StringIO('{"stop": true}\n'))
             super().watch(run, output)
 

@@ -1,14 +1,16 @@
-"""A session on an open link: moves bytes between them, and does the steps before arming.
+"""`Session`: the link, what was agreed on it, and the device's clock; it ends with the link.
 
-`pump` reads, decodes, answers and sends; it returns the stream frames that came, stamped. The calls of the set-up (handshake, upload,
-clock) return when the device has agreed, or raise LinkError (it is silent or gone) or DeviceError (it refused).
+`open_session` brings a device to where ARM can follow: handshake, check, upload, clock. Each of these steps returns when the device has
+agreed, or raises LinkError (it is silent or gone) or DeviceError (it refused). `pump` reads, decodes, answers and sends; it returns the
+stream frames that came, stamped. Of an armed run receiver.py takes the bytes, but what is sent is sent here, except the next SHOW of the
+kernel.
 """
 
 from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pans.base.errors import DeviceError, LinkError, PansError
 from pans.bundle.sensor import Bundle
@@ -17,13 +19,26 @@ from pans.live.timing.causes import Evidence, Stamped
 from pans.protocol.clock import ClockModel, ClockStep
 from pans.protocol.links import Chunk, Link, LinkReader
 from pans.protocol.session import ANSWER_TYPES, HostSession
-from pans.protocol.wire import Frame, FrameDecoder, Opcode, Welcome, pack_body, wrong_facts
+from pans.protocol.wire import (
+    Arm,
+    DeviceState,
+    Frame,
+    FrameDecoder,
+    Opcode,
+    Welcome,
+    pack_body,
+    pack_command,
+    wrong_facts,
+)
+from pans.record.recorder import Recorder
 
-from .device_check import upload_commands
+from .device_check import check_device, check_scene, upload_commands
+from .job import Job
 
 NS_PER_S = 1_000_000_000
 # for ARM and GRANT to arrive, one retransmission, and a host that does not run for some 50 ms
 ARM_LEAD_NS = NS_PER_S // 10
+RECEIVE_WINDOW = 4096  # stream messages
 SETUP_POLL_S = 0.02
 CLOCK_BURST = 16
 PROBE_GIVE_UP_NS = NS_PER_S // 4  # of one probe of the burst: a lost one is not waited for
@@ -36,7 +51,7 @@ class Arrived(NamedTuple):
     what: Frame
 
 
-class Connection:
+class Session:
     """Link, reader, decoder, session and clock of one session.
 
     For the recording: `on_sent` sees every outgoing byte string, `on_answer` the header and payload of every WELCOME, ACK and PONG.
@@ -51,13 +66,18 @@ class Connection:
         self.link = link
         self.reader = LinkReader(link)
         self.decoder = FrameDecoder()
-        self.session = HostSession(secrets.randbelow(0xFFFFFFFF) + 1)
+        self.host = HostSession(secrets.randbelow(0xFFFFFFFF) + 1)
         self.clock: ClockModel | None = None
         self.clock_steps: list[ClockStep] = []  # since the last look
         self.evidence: Evidence | None = None  # of what makes work late, once a run wants it
         self.on_sent, self.on_answer = on_sent, on_answer
-        self.delivered = 0  # messages returned by `pump` and `rest`
+        self.armed = False  # ARM was sent
+        self.delivered = 0  # messages for the core
+        self.taken = 0  # those of them that it was given, or that came before ARM
         self.answers = 0  # frames that were the session's alone
+        self.broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
+        self.counted = False  # its counters are in the accounts
+        self._granted_until = 0  # stream messages
         self._failure: PansError | None = None  # met while digesting, kept until all that came with it is delivered
 
     def pump(self, timeout_s: float) -> list[Arrived]:
@@ -71,7 +91,7 @@ class Connection:
     def send_due(self) -> bool:
         """Send what is due and return whether that was anything; raises what the latest frames ended the session with."""
         self.raise_failure()
-        self.session.poll(self.link.now_ns())
+        self.host.poll(self.link.now_ns())
         return self.flush()
 
     def chunks(self, timeout_s: float, *, asked: bool = False) -> list[Chunk]:
@@ -106,10 +126,10 @@ class Connection:
 
     def take_pongs(self) -> None:
         """Give the clock what came for it."""
-        while self.clock is not None and self.session.pongs:
-            pong, arrival_ns = self.session.pongs.popleft()
+        while self.clock is not None and self.host.pongs:
+            pong, arrival_ns = self.host.pongs.popleft()
             if not self.clock.can_be(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns):
-                self.session.counters.implausible += 1
+                self.host.counters.implausible += 1
                 continue
             step = self.clock.add_probe(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns)
             if step is not None:
@@ -133,25 +153,36 @@ class Connection:
     def digest(self, frame: Frame, arrival_ns: int) -> bool:
         """Give a frame to the session, which is on record and counted, and return whether it is the core's too."""
         try:
-            is_cores = self.session.on_frame(frame, arrival_ns)
+            is_cores = self.host.on_frame(frame, arrival_ns)
         except PansError as error:
             self._failure, is_cores = self._failure or error, False
         return is_cores
 
     def flush(self) -> bool:
         """Send what the session has to say; return whether that was anything."""
-        data = self.session.take_output()
+        data = self.host.take_output()
         if data:
             self.link.write(data)
             if self.on_sent is not None:
                 self.on_sent(self.link.now_ns(), data)
         return bool(data)
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the device says of itself; empty before the handshake."""
+        return {} if self.host.welcome is None else dict(self.host.welcome.facts)
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether the device has said that it is dark."""
+        status = self.host.status
+        return status is not None and status.state in (DeviceState.IDLE, DeviceState.SAFE)
+
     def handshake(self) -> Welcome:
         """Open the session and return what the device says of itself; the device leaves SAFE if it was latched there."""
-        self.session.start(self.link.now_ns())
+        self.host.start(self.link.now_ns())
         try:
-            while self.session.welcome is None:
+            while self.host.welcome is None:
                 self.pump(SETUP_POLL_S)
         except LinkError as error:
             if isinstance(error, DeviceError) or not self.link.is_shared():
@@ -160,28 +191,27 @@ class Connection:
                 f"{self.link.name} is in use by another program, and answers one at a time: {error.message}",
                 remedy="end the other program, or name another device",
             ) from error
-        welcome = self.session.welcome
+        welcome = self.host.welcome
         if wrong := wrong_facts(welcome.facts):
             raise DeviceError(
                 f"the device's WELCOME: {'; '.join(wrong)}", remedy="see docs/reference/protocol.md, section 3"
             )
         self.clock = ClockModel(int(welcome.facts["tick_hz"]))
-        self.session.submit(Opcode.RESET)
+        self.host.submit(Opcode.RESET)
         self.wait_acknowledged()
         return welcome
 
     def wait_acknowledged(self) -> None:
         """Wait until every command has been acknowledged."""
-        while self.session.in_flight:
+        while self.host.in_flight:
             self.pump(SETUP_POLL_S)
 
     def upload(self, plan: Plan, bundle: Bundle) -> None:
         """Send the patterns, the plan and its automaton's states, and wait until the device has them."""
-        facts = {} if self.session.welcome is None else self.session.welcome.facts
-        for opcode, body in upload_commands(plan, bundle, facts):
-            while not self.session.has_room:
+        for opcode, body in upload_commands(plan, bundle, self.facts):
+            while not self.host.has_room:
                 self.pump(SETUP_POLL_S)
-            self.session.submit(opcode, body)
+            self.host.submit(opcode, body)
         self.wait_acknowledged()
 
     def synchronise(self) -> ClockModel:
@@ -190,7 +220,7 @@ class Connection:
         for _ in range(CLOCK_BURST):
             wanted = clock.n_probes + 1
             now_ns = self.link.now_ns()
-            self.session.probe(now_ns)
+            self.host.probe(now_ns)
             while clock.n_probes < wanted and self.link.now_ns() - now_ns < PROBE_GIVE_UP_NS:
                 self.pump(SETUP_POLL_S)
         if clock.n_probes == 0:
@@ -203,6 +233,33 @@ class Connection:
             raise LinkError("the device's clock is not known before the handshake")
         return self.clock
 
+    # -- of an armed run -----------------------------------------------------------------------------------------------
+
+    def arm(self, arm: Arm) -> None:
+        """Ask for exposures from an absolute device tick on; what comes from here on is the core's."""
+        if not self.armed:
+            self.armed, self.taken = True, self.delivered
+        self.host.submit(Opcode.ARM, pack_command(arm))
+
+    def granted(self, next_seq: int) -> int:
+        """Return how many messages from `next_seq` on the device may send before the next grant is due."""
+        return self._granted_until - next_seq - RECEIVE_WINDOW // 2
+
+    def grant(self, next_seq: int, lease_ms: int) -> None:
+        """Renew the lease, and let the device send RECEIVE_WINDOW messages from `next_seq` on."""
+        self._granted_until = next_seq + RECEIVE_WINDOW
+        self.host.grant(self._granted_until, lease_ms)
+
+    def note_broken(self, error: LinkError) -> None:
+        """Keep why nothing more can be sent until all that has arrived is decided."""
+        self.broken = self.broken or error
+
+    def raise_broken(self) -> None:
+        """Raise why nothing more can be sent, once."""
+        broken, self.broken = self.broken, None
+        if broken is not None:
+            raise broken
+
     def detach(self) -> None:
         """Stop reading and leave the link as it is, for whoever opens it again."""
         self.reader.stop()
@@ -210,3 +267,30 @@ class Connection:
     def close(self) -> None:
         """Close the link and its reader."""
         self.reader.close()
+
+
+def open_session(
+    link: Link,
+    job: Job,
+    recorder: Recorder | None,
+    failed: Callable[[Session], object],
+    uploaded: Callable[[], None] | None = None,
+) -> Session:
+    """Open a session, check that it is the right device, and bring it to where ARM can follow; `failed` is told of one that breaks.
+
+    `uploaded` is called when the device has the plan: what is compiled elsewhere meanwhile can be waited for.
+    """
+    session = Session(link) if recorder is None else Session(link, recorder.add_command, recorder.add_answer)
+    try:
+        facts = session.handshake().facts
+        check_device(facts, job.plan, job.bundle, job.profile.clock.tick_hz)
+        check_scene(facts, job.bundle)
+        session.upload(job.plan, job.bundle)
+        if uploaded is not None:
+            uploaded()
+        session.synchronise()
+    except BaseException:
+        session.detach()
+        failed(session)
+        raise
+    return session
