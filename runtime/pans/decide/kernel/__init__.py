@@ -7,7 +7,8 @@ messages are left to Python. Start at calls.py (`Kernel`), then receive.py; arra
 from . import arrays as arrays
 from .arrays import OVERSLEPT_NS, Drive
 from .calls import BATCH_NS, Kernel, Limits, StreamCore
-from .follow_up import FollowUp, PhotonsOf, follow_up_of
+from .follow_up import FollowUp, follow_up_of
+from .follow_up import PhotonsOf as PhotonsOf
 from .receive import QUIET_NS, turn, unpack_blocks
 from .system_calls import now_ns, offered, read_now, wait_for, write_now
 
@@ -19,7 +20,6 @@ __all__ = [
     "FollowUp",
     "Kernel",
     "Limits",
-    "PhotonsOf",
     "StreamCore",
     "arrays",
     "follow_up_of",
