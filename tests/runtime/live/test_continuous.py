@@ -334,7 +334,7 @@ def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_stays_an_int
         except KeyboardInterrupt as interrupt:
             raise ImportError("initialization failed") from interrupt
 
-    monkeypatch.setattr("pans.app.run.one_run._Run", loading)
+    monkeypatch.setattr("pans.app.run.one_run.prepare", loading)
     words = ["run", str(bundle_file), "--device", "sim:ideal?pace=fast&scene=uniform", "--out", str(tmp_path / "out")]
     assert main([*words, "--decisions", "4"]) == 130
 

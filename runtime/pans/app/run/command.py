@@ -47,7 +47,8 @@ def _run(args: argparse.Namespace) -> int:
     from pans.bundle.sensor import bundle_path
 
     from .files import input_files
-    from .one_run import check_together, run_and_report
+    from .one_run import run_and_report
+    from .prepare import check_together
 
     profile = args.profile or profile_of(args.device)
     options = _options(args, files_read=() if args.config is None else (args.config,), warns_uncalibrated=True)

@@ -1,6 +1,6 @@
 """One run from its options to its files: check, prepare, open, run, report. `run_once` is the page to read.
 
-What is prepared (bundle, plan, core, header) is made while the port opens. The loop is live/loop.py's.
+What is prepared (prepare.py: bundle, plan, core, header) is made while the port opens. The loop is live/loop.py's.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import hashlib
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from pans.base.console import check_options, emit, html_card, option_fields, refuse_without, say, state, warn
+from pans.base.console import emit, html_card, say, state, warn
 from pans.base.errors import (
     EXIT_ALERT,
     EXIT_DEVICE,
@@ -26,36 +26,28 @@ from pans.base.errors import (
     EXIT_TIMING,
     DamagedFileError,
     PansError,
-    UsageError,
 )
-from pans.base.files import RUNS
-from pans.base.machine import check_core, lacking
+from pans.base.machine import lacking
 from pans.base.numbers import Shown, shown
-from pans.decide.flow import FlowSettings, read_flow, with_gate
-from pans.instrument.calibration_file import MAX_AGE_H
 from pans.instrument.profile import Profile, load_profile
-from pans.live.options import FLOW, RunOptions
+from pans.live.options import RunOptions
 from pans.live.stop import DISK_NEARLY_FULL, INTERRUPTED, RECORDING_DELETED, REFUSED, Stop, stop_signals
 from pans.protocol.links import open_link
 
-from .files import check_run_files, claimed, gone_if_refused, part_limits, recording_header, what_was_run
+from .files import check_run_files, claimed, gone_if_refused, part_limits, what_was_run
+from .prepare import Prepared, check_together, prepare
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pans.bundle.automaton import DoseCap
-    from pans.bundle.sensor import Bundle
-    from pans.calibrate.registration import InUse
-    from pans.decide import Follower, Output
-    from pans.live.loop import FlowRun, Observers, RunResult, Status
-    from pans.live.watch import MetricsServer, OscSender, Watchdog
+    from pans.decide import Output
+    from pans.live.loop import Observers, RunResult, Status
+    from pans.live.watch import MetricsServer, OscSender, Watchdog, Watchers
     from pans.protocol.links import Link
     from pans.record.recorder import Recorder
     from pans.report.live_view import Monitor
     from pans.report.summary import Summary
-
-ROUNDING = 1e-9  # of a dose cap: a sum of light is known to so many digits
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,18 +73,6 @@ class Outcome:
             "recording": self.recording,
         }
         return html_card("Run", rows)
-
-
-class _Around(NamedTuple):
-    """What lives around a run: who ends it, who displays it, and what is closed when its outcome is known."""
-
-    stop: Stop
-    watchdog: Watchdog | None
-    monitor: Monitor
-    metrics: MetricsServer | None
-    osc: OscSender | None
-    besides: Observers | None
-    ending: ExitStack
 
 
 def run_and_report(args: argparse.Namespace, options: RunOptions) -> int:
@@ -122,6 +102,45 @@ def run_once(
     the outcome once the files are whole and before the link is closed, which may wait for a device or a child process. `besides` observe
     the run, too, as those who only look; their `stop` ends it from another thread.
     """
+    options, profile = _checked(options, profile)
+    with (
+        _asked_to_end(options, besides, ends_process=ends_process) as (stop, watchdog),
+        ExitStack() as listening,  # ports first: a busy one is refused before anything is compiled or opened
+        ExitStack() as ending,  # the link, when the outcome has been told
+    ):
+        metrics, osc = _listeners_of(options, listening)
+        with _monitor_of(options) as monitor:
+            opening = _in_background(lambda: open_link(options.device))
+            if monitor.url:
+                say(f"pans: live page at {monitor.url}")
+            prepared = _prepared_meanwhile(options, profile, opening)
+            from pans.live.loop import Recovery, running  # loaded by now, while the port opened
+            from pans.live.watch import Watchers
+
+            link = opening.result()
+            ending.callback(link.close)
+            with claimed(options) as options, ExitStack() as files:
+                if options.trace is not None:
+                    link = _traced(options, link, options.trace, ending)
+                recorder = _recorder_of(options, prepared, link, files)
+                monitor.begin(_facts_of(options, prepared, link), stop)
+                with Watchers(options, recorder, watchdog, stop, metrics) as seen:
+                    observers = _observers(options, prepared, seen, monitor, osc, besides, stop)
+                    recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
+                    job, core = prepared.job, prepared.core
+                    result = ending.enter_context(running(link, job, core, recorder, recovery, observers))
+                    monitor.close_notes()
+                    options, summary = _summary(options, prepared, result, recorder)
+                    seen.conclude(summary.verdict, summary.faults)
+                if recorder is not None:
+                    summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
+            done = _outcome(options, prepared, result, summary)
+        report(done)
+        return done
+
+
+def _checked(options: RunOptions, profile: Profile | None) -> tuple[RunOptions, Profile]:
+    """Return options that make sense together, and the profile, with the deadline that holds."""
     check_together(options)
     profile = profile or load_profile(options.profile or "")
     if options.deadline_us:  # it sizes the blocks, too
@@ -132,22 +151,25 @@ def run_once(
         started_ns=options.started_ns or time.perf_counter_ns(),
     )
     check_run_files(options)
+    return options, profile
+
+
+@contextmanager
+def _asked_to_end(
+    options: RunOptions, besides: Observers | None, *, ends_process: bool
+) -> Iterator[tuple[Stop, Watchdog | None]]:
+    """Who ends the run: a signal, somebody else's thread, or the watchdog, which takes the process with it."""
     continuous, watchdog = not (options.seconds or options.decisions), None
-    asked = None if besides is None else besides.stop
-    with stop_signals(continuous=continuous, stop=asked) as stop, ExitStack() as watched:
+    with (
+        stop_signals(continuous=continuous, stop=None if besides is None else besides.stop) as stop,
+        ExitStack() as watched,
+    ):
         if ends_process:
             from pans.live.watch import Watchdog
 
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
         try:
-            # ports first: a busy one is refused before anything is compiled or opened
-            with ExitStack() as listened, ExitStack() as ending:
-                metrics, osc = _listeners_of(options, listened)
-                with _monitor_of(options) as monitor:
-                    around = _Around(stop, watchdog, monitor, metrics, osc, besides, ending)
-                    done = _prepare_and_run(options, profile, around)
-                report(done)
-                return done
+            yield stop, watchdog
         except PansError:
             raise
         except Exception as error:
@@ -156,283 +178,146 @@ def run_once(
             raise
 
 
-def check_together(options: RunOptions) -> None:
-    """Raise UsageError for options that are out of range, or make no sense together."""
-    check_options(options)
-    check_core(options.core)
-    if options.flow is None:
-        of_flow = {one.name: one.default for one, _ in option_fields(options) if one.metadata["group"] == FLOW}
-        refuse_without(options, "--flow", of_flow)
-    elif flow_of(options) is not None and (options.decisions or options.trials != 1):
-        remedy = "--seconds, in place of --decisions and --trials"
-        raise UsageError("a flow has as many decisions as objects pass", remedy=remedy)
-    if options.calibration is None and options.registration is None:
-        refuse_without(options, "--calibration or --registration", {"calibration_max_age_h": MAX_AGE_H})
-    if options.keep_mb and not options.rotate_mb:
-        raise UsageError("--keep-mb deletes parts, and there are none", remedy="say how large with --rotate-mb")
-    if options.keep_runs_mb:
-        if options.out_root is None or not options.keep_mb:
-            remedy = "leave --out and --record out, and bound each run with --rotate-mb and --keep-mb"
-            raise UsageError(f"--keep-runs-mb deletes earlier runs in {RUNS} that are in parts", remedy=remedy)
-        if options.keep_runs_mb < 2 * options.keep_mb:
-            what = f"--keep-runs-mb {options.keep_runs_mb:g} is below twice --keep-mb {options.keep_mb:g}"
-            raise UsageError(what, remedy="leave room for this run and the one before")
-    if options.rotate_mb and options.on_dark != "warn":
-        raise UsageError(
-            f"--rotate-mb with --on-dark {options.on_dark}: what the guard has learnt is not in a part, which could not be replayed",
-            remedy="record without parts, or use --on-dark warn",
-        )
-    part_limits(options)
-    _check_address(options.serve, options.serve_public, "--serve")
-    if options.serve_control and (options.serve_public or not options.serve):
-        what = "has no effect without --serve" if not options.serve else "and --serve-public: there is no password"
-        remedy = (
-            "add --serve HOST:PORT, or leave it out" if not options.serve else "use a tunnel (docs/how-to/live-view.md)"
-        )
-        raise UsageError(f"--serve-control {what}", remedy=remedy)
-    _check_address(options.metrics, options.metrics_public, "--metrics")
+def _prepared_meanwhile(options: RunOptions, profile: Profile, opening: Future[Link]) -> Prepared:
+    """Prepare the run while its port opens; an error closes the port."""
+    try:
+        prepared = prepare(options, profile)
+        _load_ahead()
+    except BaseException as error:
+        try:
+            opening.result().close()
+        except Exception as besides:
+            if isinstance(error, PansError):
+                error.message += f"\nbesides, the device could not be opened: {besides}"
+        raise
+    return prepared
 
 
-def _check_address(address: str, public: bool, option: str) -> None:
-    """Check where a page is served; one that others can reach is said aloud."""
-    if not address:
-        if public:
-            raise UsageError(f"{option}-public has no effect without {option}", remedy=f"add {option}, or leave it out")
-        return
-    from pans.live.watch import check_address, is_public
+def _recorder_of(options: RunOptions, prepared: Prepared, link: Link, opened: ExitStack) -> Recorder | None:
+    """Return what records, if `options` ask for it; they name the folder that the run was given."""
+    from pans.record.recorder import Recorder
 
-    check_address(address, public=public, option=option)
-    if is_public(address):
-        warn(f"other machines can read the figures at {address}; there is no password")
-
-
-def flow_of(options: RunOptions) -> FlowSettings | None:
-    """Return the settings of the flow that is asked for; None without one."""
-    if options.flow is None:
+    if options.recording is None:
         return None
-    classes = tuple(name for part in options.gate_class for name in part.split(",") if name)
-    settings = with_gate(read_flow(options.flow), classes, options.gate_delay_us)
-    return settings if options.pool is None else replace(settings, pool=options.pool)
-
-
-def dose_of(options: RunOptions, bundle: Bundle, profile: Profile) -> DoseCap | None:
-    """Return what each walk of an automaton may bring, so that no object receives more than the dose cap; None of fixed patterns.
-
-    UsageError where the cap cannot be kept: for fixed patterns that bring more, passive bundles, objects in flow, and patterns that a
-    registration changes.
-    """
-    if not options.dose_cap:
-        return None
-    if bundle.analyser is not None or options.flow is not None or options.registration is not None:
-        raise UsageError(
-            "--dose-cap is for patterns that are displayed to one object after another as the bundle states them: not for passive "
-            "optics, --flow or --registration",
-            remedy="leave --dose-cap out, or the other one",
+    opened.enter_context(gone_if_refused(options))
+    header = prepared.header | {"simulated": link.simulated, "virtual_time": link.virtual}
+    # the bundle's bytes are not held by a name: they may have 64 MiB, and the run begins here
+    return opened.enter_context(
+        Recorder(
+            options.recording,
+            header,
+            bundle=_same_bundle(options.bundle, prepared.header["bundle_sha256"]),
+            overwrite=options.force,
+            limits=part_limits(options),
         )
-    if bundle.automaton is not None:
-        from pans.bundle.automaton import STATES_MAX, DoseCap
-
-        states = min(profile.projector.automaton_states or STATES_MAX, STATES_MAX)
-        return DoseCap(options.dose_cap / options.trials, states)
-    light = bundle.illumination() * options.shots * options.trials
-    if light > options.dose_cap * (1 + ROUNDING):
-        raise UsageError(
-            f"{bundle.name} sends {light:.6g} photoelectrons of illumination to an object ({bundle.n_features} patterns, "
-            f"{options.shots} shots, {options.trials} trials), --dose-cap allows {options.dose_cap:.6g}",
-            remedy="pans order BUNDLE --by dose --dose-cap N makes a bundle of as many patterns as stay below; or fewer shots or trials",
-        )
-    return None
+    )
 
 
-class _Run:
-    """One run: all that it needs but its link, made at once; `recorded` runs it."""
+def _facts_of(options: RunOptions, prepared: Prepared, link: Link) -> dict[str, Any]:
+    """Return what the live view is told before the run."""
+    bundle, profile = prepared.bundle, prepared.profile
+    return {
+        "kind": "begin",
+        "classes": list(bundle.classes),
+        "encoder": bundle.encoder,
+        "title": f"{bundle.name} on {profile.name}",
+        "simulated": link.simulated,
+        "expected": prepared.expected_decisions,
+        "deadline_us": options.deadline_us,
+        "late_allowed": options.late_allowed,
+        "exposure_tolerance_us": profile.exposure_tolerance_us(prepared.job.plan.exposure_us),
+        "trials": options.trials,
+        "illumination": prepared.illumination,
+        "clicks_stated": prepared.dark.light.stated,
+    }
 
-    def __init__(self, options: RunOptions, profile: Profile, around: _Around) -> None:
-        from pans.bundle.backends import make_decider
-        from pans.bundle.sensor import load_bundle
-        from pans.decide.plan import build_plan, detector_warnings, drive_words
-        from pans.decide.still import Core
-        from pans.instrument.calibration_file import now_utc
-        from pans.live.loop import DarkRun, open_actuator
 
-        self.profile, self.around = profile, around
-        flow, shots, seconds = flow_of(options), options.shots, options.seconds
-        bundle, bundle_sha256 = load_bundle(options.bundle)
-        dose = dose_of(options, bundle, profile)
-        decider = make_decider(bundle, shots=shots, backend=options.backend, confidence=options.confidence, dose=dose)
-        self.registration: InUse | None = None
-        if options.registration is not None:
-            from pans.calibrate.registration import in_use
+def _observers(
+    options: RunOptions,
+    prepared: Prepared,
+    seen: Watchers,
+    monitor: Monitor,
+    osc: OscSender | None,
+    besides: Observers | None,
+    stop: Stop,
+) -> Observers:
+    """Join who observes the run: the guards of dark counts and light, state file, live view, neighbours."""
+    from pans.decide.kernel import BATCH_NS
+    from pans.live.loop import Observers, scene_words
 
-            self.registration = in_use(options.registration, bundle, profile, now_utc(), options.calibration_max_age_h)
-            say(f"pans: {self.registration.words()}")
-            bundle = self.registration.shown
-        self.bundle = bundle  # with the patterns that are displayed
-        placed = self.registration.profile if self.registration and not options.calibration else profile
-        self.dark = DarkRun.of(options, placed)
-        n_objects = -(-options.decisions // options.trials)
-        self.expected_decisions = n_objects * options.trials
-        self.frames = shots if flow is None else shots * flow.pool  # of a decision; a flow adds windows
-        self.core: Follower
-        self.flow_run: FlowRun | None = None
-        if flow is not None:
-            from pans.decide.flow import plan_flow
-            from pans.live.loop import FlowRun
+    def before_arming(run: Status) -> None:
+        prepared.dark.check_device(run)
+        if prepared.registration is not None:
+            serial = prepared.dark.serial_of(run)
+            prepared.registration.registered.check_made_for(prepared.profile, serial)
+        if words := scene_words(run.session.facts, options.device):
+            say(f"pans: {words}")
+        if not run.session.link.virtual and (missing := lacking()):
+            say(f"pans: {sys.platform} has no {', no '.join(missing)}; decisions that are late are counted")
+        seen.prepared(run)
+        monitor.prepared(run, prepared.bundle, seen.look)
+        if besides is not None and besides.prepared is not None:
+            besides.prepared(run)
+        if prepared.flow_run is not None:
+            prepared.flow_run.prepared(run)
 
-            self.plan, flow_core, n_cycles = plan_flow(self.dark.profile, bundle, decider, flow, shots, seconds)
-            seconds = 0.0  # the end of a flow is in its plan
-            flow_core.guard = self.dark.guard(self.plan, bundle, shots, flow=True)
-            second = load_profile(options.act_profile) if options.act_profile else profile
-            self.core, self.flow_run = flow_core, FlowRun(flow_core, open_actuator(options.act, second))
-        else:
-            self.plan = build_plan(
-                self.dark.profile,
-                bundle,
-                shots_per_object=shots * options.trials,
-                dark_slots_per_cycle=options.dark_slots,
-                order=options.order,
-                drive=options.drive,
-                automaton=decider.automaton,
-            )
-            if self.plan.automaton is not None:
-                say(f"pans: {drive_words(self.dark.profile, bundle, self.plan)}")
-            n_cycles = n_objects * self.plan.cycles_per_object
-            self.dark.expect(self.plan, bundle, options.trials)
-            self.core = Core(self.plan, decider, shots, n_cycles, self.dark.guard(self.plan, bundle, shots))
-        self.header = recording_header(options, profile, bundle_sha256, decider, n_objects, self.plan)
-        parts = {"dark": self.dark, "registration": self.registration, "flow": self.flow_run}
-        self.header["config"] |= {name: part.header() for name, part in parts.items() if part is not None}
-        self.options = replace(options, n_cycles=n_cycles, lease_ms=profile.timing.lease_ms, seconds=seconds)
-        for warning in (*self.dark.warnings, *detector_warnings(self.dark.profile, bundle, self.plan.exposure_us)):
-            warn(warning)
+    def look(run: Status, output: Output) -> None:
+        prepared.dark.look(run, output)
+        seen.note_news(run)
+        monitor.watch(run, output)
+        if osc is not None:
+            osc.watch(run, output)
+        if besides is not None and besides.watch is not None:
+            besides.watch(run, output)
 
-    def recorded(self, options: RunOptions, link: Link) -> Outcome:
-        """Run with a recording, if `options` ask for one; they name the folder that the run was given."""
-        from pans.record.recorder import Recorder
+    # a neighbour that hears of each decision hears of it at once
+    at_once = osc is not None or (besides is not None and besides.watch is not None)
+    return Observers(look, before_arming, stop, acts=False, gather_ns=0 if at_once else BATCH_NS)
 
-        recorder: Recorder | None = None
-        with ExitStack() as opened:
-            if options.recording is not None:
-                opened.enter_context(gone_if_refused(options))
-                # the bundle's bytes are not held by a name: they may have 64 MiB, and the run begins here
-                recorder = opened.enter_context(
-                    Recorder(
-                        options.recording,
-                        self.header | {"simulated": link.simulated, "virtual_time": link.virtual},
-                        bundle=_same_bundle(options.bundle, self.header["bundle_sha256"]),
-                        overwrite=options.force,
-                        limits=part_limits(options),
-                    )
-                )
-            options, result, summary = self._watched(options, link, recorder)
-            if recorder is not None:
-                summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
-        return self._conclude(options, result, summary)
 
-    def _watched(
-        self, options: RunOptions, link: Link, recorder: Recorder | None
-    ) -> tuple[RunOptions, RunResult, Summary]:
-        """Run, with all observers: the dark counts' guard, the live view, metrics and the state file, which get the verdict."""
-        from pans.decide.kernel import BATCH_NS
-        from pans.live.loop import Job, Observers, Recovery, running, scene_words
-        from pans.live.watch import Watchers
+def _summary(
+    options: RunOptions, prepared: Prepared, result: RunResult, recorder: Recorder | None
+) -> tuple[RunOptions, Summary]:
+    """Return the summary; and the options with what is left of a recording that was deleted during the run."""
+    from pans.report.summary import summarise, walk_figures
 
-        around, monitor, besides = self.around, self.around.monitor, self.around.besides
-        recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
-        facts = dict(
-            kind="begin",
-            classes=list(self.bundle.classes),
-            encoder=self.bundle.encoder,
-            title=f"{self.bundle.name} on {self.profile.name}",
-            simulated=link.simulated,
-            expected=self.expected_decisions,
-            deadline_us=options.deadline_us,
-            late_allowed=options.late_allowed,
-            exposure_tolerance_us=self.profile.exposure_tolerance_us(self.plan.exposure_us),
-            trials=options.trials,
-            illumination=self.bundle.illumination() * self.frames,
-            clicks_stated=self.dark.light.stated,
-        )
-        monitor.begin(facts, around.stop)
-        with Watchers(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
+    plan, tally, of_flow = prepared.job.plan, result.tally, prepared.flow_run
+    walks = walk_figures(result, plan, prepared.bundle, prepared.profile.name, options.confidence)
+    shown = None if walks is None else walks.illumination_mean
+    clicks = lit = 0  # exposures with light that may each have given a click; unknown of objects that pass by
+    if of_flow is None:
+        fixed = tally.decisions * tally.shots * plan.n_patterns if plan.automaton is None else 0
+        clicks, lit = tally.of["decisions"].clicks, fixed or tally.exposures * plan.channels_at_once
+    summary = summarise(
+        result,
+        illumination=prepared.illumination if shown is None else shown,
+        expected_decisions=prepared.expected_decisions,
+        flow=None if of_flow is None else of_flow.figures(),
+        dark=prepared.dark.figures(result.dark, clicks, lit, saturates=plan.largest == 1),
+        walks=walks,
+        registration=None if prepared.registration is None else prepared.registration.facts(),
+        late_allowed=options.late_allowed,
+        may_be_busy=options.may_be_busy,
+    )
+    if recorder is None or (kept := recorder.keep_deleted()) is None:
+        return options, summary
+    fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
+    warn(fault)
+    options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
+    return options, replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
 
-            def prepared(run: Status) -> None:
-                self.dark.check_device(run)
-                if self.registration is not None:
-                    self.registration.registered.check_made_for(self.profile, self.dark.serial_of(run))
-                if words := scene_words(run.session.facts, options.device):
-                    say(f"pans: {words}")
-                if not link.virtual and (missing := lacking()):
-                    say(f"pans: {sys.platform} has no {', no '.join(missing)}; decisions that are late are counted")
-                seen.prepared(run)
-                monitor.prepared(run, self.bundle, seen.look)
-                if besides is not None and besides.prepared is not None:
-                    besides.prepared(run)
-                if self.flow_run is not None:
-                    self.flow_run.prepared(run)
 
-            def look(run: Status, output: Output) -> None:
-                self.dark.look(run, output)
-                seen.note_news(run)
-                monitor.watch(run, output)
-                if around.osc is not None:
-                    around.osc.watch(run, output)
-                if besides is not None and besides.watch is not None:
-                    besides.watch(run, output)
+def _outcome(options: RunOptions, prepared: Prepared, result: RunResult, summary: Summary) -> Outcome:
+    """Write the page and return what came of the run."""
+    from pans.report.summary import write_markdown
 
-            # a neighbour that hears of each decision hears of it at once
-            at_once = around.osc is not None or (besides is not None and besides.watch is not None)
-            observers = Observers(look, prepared, around.stop, acts=False, gather_ns=0 if at_once else BATCH_NS)
-            job = Job(self.dark.profile, self.bundle, self.plan, self.options)
-            result = around.ending.enter_context(running(link, job, self.core, recorder, recovery, observers))
-            monitor.close_notes()
-            options, summary = self._summary(options, result, recorder)
-            seen.conclude(summary.verdict, summary.faults)
-        return options, result, summary
-
-    def _summary(self, options: RunOptions, result: RunResult, recorder: Recorder | None) -> tuple[RunOptions, Summary]:
-        """Return the summary; and the options with what is left of a recording that was deleted during the run."""
-        from pans.report.summary import summarise, walk_figures
-
-        walks = walk_figures(result, self.plan, self.bundle, self.profile.name, options.confidence)
-        shown = None if walks is None else walks.illumination_mean
-        summary = summarise(
-            result,
-            illumination=self.bundle.illumination() * self.frames if shown is None else shown,
-            expected_decisions=self.expected_decisions,
-            flow=None if self.flow_run is None else self.flow_run.figures(),
-            dark=self.dark.figures(result.dark, *self._lit(result), saturates=self.plan.largest == 1),
-            walks=walks,
-            registration=None if self.registration is None else self.registration.facts(),
-            late_allowed=options.late_allowed,
-            may_be_busy=options.may_be_busy,
-        )
-        if recorder is None or (kept := recorder.keep_deleted()) is None:
-            return options, summary
-        fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
-        warn(fault)
-        options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
-        return options, replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
-
-    def _lit(self, result: RunResult) -> tuple[int, int]:
-        """Return clicks, and exposures with light that may each have given one; 0 and 0 of objects that pass by."""
-        tally = result.tally
-        if self.flow_run is not None:
-            return 0, 0
-        fixed = tally.decisions * tally.shots * self.plan.n_patterns if self.plan.automaton is None else 0
-        return tally.of["decisions"].clicks, fixed or tally.exposures * self.plan.channels_at_once
-
-    def _conclude(self, options: RunOptions, result: RunResult, summary: Summary) -> Outcome:
-        """Write the page and return what came of the run."""
-        from pans.report.summary import write_markdown
-
-        confusion, page = result.tally.confusion, options.page
-        if self.flow_run is not None:
-            confusion = confusion + self.flow_run.core.matcher.confusion
-        if page is not None:
-            facts = what_was_run(options, self.profile, self.bundle.name, self.header, summary)
-            write_markdown(page, summary, facts, confusion, self.bundle.classes, force=options.force)
-        return Outcome(summary, confusion, options.recording, page)
+    confusion, page, bundle = result.tally.confusion, options.page, prepared.bundle
+    if prepared.flow_run is not None:
+        confusion = confusion + prepared.flow_run.core.matcher.confusion
+    if page is not None:
+        facts = what_was_run(options, prepared.profile, bundle.name, prepared.header, summary)
+        write_markdown(page, summary, facts, confusion, bundle.classes, force=options.force)
+    return Outcome(summary, confusion, options.recording, page)
 
 
 def _same_bundle(path: Path, sha256: str) -> bytes:
@@ -443,28 +328,6 @@ def _same_bundle(path: Path, sha256: str) -> bytes:
     if hashlib.sha256(data).hexdigest() != sha256:
         raise DamagedFileError(f"{path}: changed while the run began", remedy="run it again")
     return data
-
-
-def _prepare_and_run(options: RunOptions, profile: Profile, around: _Around) -> Outcome:
-    opening = _in_background(lambda: open_link(options.device))
-    if around.monitor.url:
-        say(f"pans: live page at {around.monitor.url}")
-    try:
-        run = _Run(options, profile, around)
-        _load_ahead()
-    except BaseException as error:
-        try:
-            opening.result().close()
-        except Exception as besides:
-            if isinstance(error, PansError):
-                error.message += f"\nbesides, the device could not be opened: {besides}"
-        raise
-    link = opening.result()
-    around.ending.callback(link.close)
-    with claimed(options) as options:
-        if options.trace is not None:
-            link = _traced(options, link, options.trace, around)
-        return run.recorded(options, link)
 
 
 def _in_background(call: Callable[[], Link]) -> Future[Link]:
@@ -498,7 +361,7 @@ def _load_ahead() -> None:
     load_drawing()
 
 
-def _traced(options: RunOptions, link: Link, path: Path, around: _Around) -> Link:
+def _traced(options: RunOptions, link: Link, path: Path, ending: ExitStack) -> Link:
     """Return `link` with a trace; one that could not be written to its end is reported, and ends nothing."""
     from pans.protocol.links import TracedLink
 
@@ -509,7 +372,7 @@ def _traced(options: RunOptions, link: Link, path: Path, around: _Around) -> Lin
         if traced.trouble:
             say(f"pans: {path}: the trace is not whole: {traced.trouble}")
 
-    around.ending.callback(close)
+    ending.callback(close)
     return traced
 
 

@@ -10,7 +10,7 @@ from automata import automaton_bundle
 from bundles import made_bundle
 from commands import Pans
 
-from pans.app.run.one_run import dose_of
+from pans.app.run.prepare import dose_of
 from pans.base import SHIPPED
 from pans.base.errors import UsageError
 from pans.bundle.automaton import STATES_MAX, DoseCap
