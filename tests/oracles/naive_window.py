@@ -65,3 +65,26 @@ def follow_walk(plan: Plan, cycle: int, exposures: dict[int, tuple[int, int]]) -
         elif planned == DARK_PATTERN or found["fate"] == "whole":
             found["strange"] += 1
     return found
+
+
+def earliest_decision(plan: Plan, shots: int, exposures: list[tuple[int, int]]) -> int:
+    """Return the earliest exposure that can end a window, whatever is clicked, after `exposures` of which none was lost."""
+    last_shots = range(shots - 1, plan.shots_per_object, shots)
+    exposure, nodes = 0, {0}
+    while True:
+        cycle, slot = divmod(exposure, plan.slots_per_cycle)
+        nodes = {0} if slot == 0 else nodes
+        planned = int(plan.slot_pattern[slot])
+        ends = False
+        if plan.automaton is None:
+            same_shot = plan.slot_shot == plan.slot_shot[slot]
+            shot = cycle % plan.cycles_per_object * plan.shots_per_cycle + int(plan.slot_shot[slot])
+            ends = planned != DARK_PATTERN and shot in last_shots and slot == int(same_shot.nonzero()[0].max())
+        elif planned == ADAPTIVE_PATTERN:
+            clicks = range(plan.largest + 1) if exposure >= len(exposures) else [exposures[exposure][1]]
+            states = {node for node in nodes if node < plan.automaton.n_states}
+            nodes = {int(plan.automaton.successors[node][bit]) for node in states for bit in clicks}
+            ends = any(node >= plan.automaton.n_states for node in nodes)
+        if ends and exposure >= len(exposures):
+            return exposure
+        exposure += 1

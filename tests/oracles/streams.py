@@ -71,8 +71,13 @@ def by_thread(
     pieces: list[bytes],
     pause: Callable[[str], None] = lambda step: None,
     gather_ns: int = 0,
+    tick_us: float = 0.0,
+    kept: list[bytes] | None = None,
 ) -> tuple[np.ndarray, list[Any], StreamCore]:
-    """As `by_descriptor`, but the kernel serves in a thread of its own; Python calls `pause` at each step of its side."""
+    """As `by_descriptor`, but the kernel serves in a thread of its own; Python calls `pause` at each step of its side.
+
+    With `tick_us` the kernel sleeps while no decision can fall due. `kept` gets what would be recorded.
+    """
     streamed = StreamCore(plan, decider, shots, 0, SESSION)
     core, turn = streamed.core, streamed.turn
     rows, events = [np.zeros(0, DECISION_DTYPE)], list[Any]()
@@ -86,7 +91,7 @@ def by_thread(
 
     thread, sender, ended = DecidingThread(), threading.Thread(target=send), ring.ALL_TAKEN
     with ours, theirs:
-        turn.allow(0, 0, gather_ns, tells_exposed=True)
+        turn.allow(0, 0, gather_ns, tells_exposed=True, tick_us=tick_us)
         thread.start(turn, ours.fileno())
         sender.start()
         while ended != ring.GONE:
@@ -97,6 +102,8 @@ def by_thread(
             ended, parked = turn.end.ended, bool(turn.reported[ring.PARKED])
             pause("received")
             rows.append(turn.rows.copy())
+            if kept is not None:
+                kept += [turn.bytes_of(span) for spans in (turn.messages, turn.answers) for span in spans]
             core.remember_rows(turn.marks())
             for _, frame, standing in turn.passed():
                 events += core.step(frame, standing).events
@@ -105,7 +112,7 @@ def by_thread(
                     rows.append(batch.rows.copy())
                     events += batch.events
                 core.steps(SESSION)
-                turn.allow(0, 0, gather_ns, tells_exposed=True)
+                turn.allow(0, 0, gather_ns, tells_exposed=True, tick_us=tick_us)
                 pause("taken")
                 thread.go_on()
             pause("accounted for")

@@ -10,6 +10,7 @@ the click of channel k. Of a detector that counts, outcome j is j photons, the l
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -212,19 +213,26 @@ def walk_difference(automaton: Automaton, words: NDArray[Any], walks: NDArray[An
 
 def greatest_light(automaton: Automaton, light: NDArray[np.float64]) -> float:
     """Return the most light that one walk can take, of the light of each state, float64 (states,)."""
-    order = np.argsort(automaton.depth, kind="stable")
-    ends = np.searchsorted(automaton.depth[order], np.arange(automaton.n_slots + 1))
     most = np.zeros(len(automaton.posteriors))
-    for slot in range(automaton.n_slots - 1, -1, -1):
-        states = order[ends[slot] : ends[slot + 1]]
+    for states in _slots_backwards(automaton):
         most[states] = light[states] + most[automaton.successors[states]].max(axis=1)
     return float(most[0])
 
 
-def shortest_walk(automaton: Automaton) -> int:
-    """Return the exposures of the shortest walk: one more than the depth of the first state with a leaf behind it."""
-    ends = (automaton.successors >= automaton.n_states).any(axis=1)
-    return int(automaton.depth[ends].min()) + 1
+def exposures_to_leaf(automaton: Automaton) -> NDArray[np.int64]:
+    """Return the fewest exposures from each state to a leaf, that of the state included, int64 (states,)."""
+    fewest = np.zeros(len(automaton.posteriors), np.int64)
+    for states in _slots_backwards(automaton):
+        fewest[states] = 1 + fewest[automaton.successors[states]].min(axis=1)
+    return fewest[: automaton.n_states]
+
+
+def _slots_backwards(automaton: Automaton) -> Iterator[NDArray[np.int64]]:
+    """Yield the states of each slot, those of the last slot first."""
+    order = np.argsort(automaton.depth, kind="stable")
+    ends = np.searchsorted(automaton.depth[order], np.arange(automaton.n_slots + 1))
+    for slot in range(automaton.n_slots - 1, -1, -1):
+        yield order[ends[slot] : ends[slot + 1]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -240,18 +240,19 @@ class Receiver:
         """Before the kernel begins to serve, or goes on: tell it how things stand."""
         self._load(kernel)
         lateness, tells = self._lateness, self.session.host.tells_exposed
-        kernel.allow(lateness.longest_ns, lateness.evidence.floor_ns, self._gather_ns, tells_exposed=tells)
+        limits, tick_us = (lateness.longest_ns, lateness.evidence.floor_ns, self._gather_ns), self._core.plan.tick_us
+        kernel.allow(*limits, tells_exposed=tells, tick_us=tick_us)
 
     def _receive_batch(self, kernel: Kernel, due_ns: int) -> Batches:
         """Wait until a batch is handed over, and yield it; answer what only Python can answer."""
         session, thread = self.session, self._thread
         assert thread is not None
-        session.send_due()
+        self._send(kernel, session.send_due)
         thread.wait(min(max(due_ns - session.link.now_ns(), LEAST_NS), WAIT_NS) / NS_PER_S)
         if kernel.control[ring.OVERDUE]:
             kernel.control[ring.OVERDUE] = 0
             session.host.probe(session.link.now_ns())
-            session.flush()
+            self._send(kernel, session.flush)
         yield from self._handed_over(kernel)
         if not self._parked:
             return
@@ -265,6 +266,15 @@ class Receiver:
         elif ended == ring.BROKEN:
             self._sent(kernel, ended)
         self._go_on(kernel)
+
+    def _send(self, kernel: Kernel, send: Callable[[], bool]) -> None:
+        """Send by `send`. A clock probe wakes the kernel: the arrival of its PONG must not be the end of a sleep."""
+        probes = self.session.host.has_probe
+        if probes:
+            kernel.stay_awake(self.session.link.now_ns())
+        send()
+        if probes and self._thread is not None:  # after the probe has left: waking takes as long as a good way there
+            self._thread.wake()
 
     def _handed_over(self, kernel: Kernel) -> Batches:
         """Yield the batch that has been handed over, if there is one; then the kernel may write over it."""

@@ -86,7 +86,7 @@ class HostSession:
         self._oldest_ns = 0
         self._fast_retry_ns = 0  # not before
         self._repeats = False  # commands that are sent again wait in the output
-        self._probe_id = 0
+        self._probe_id = self._probe_sent = 0
         self._probes: dict[int, int] = {}  # sent and not answered: id and host time
 
     # -- what the host wants -------------------------------------------------------------------------------------------
@@ -133,6 +133,11 @@ class HostSession:
         return b"".join((*before, wire.encode_command(max(self.next_id, next_id), Opcode.STOP, b"", self.nonce)))
 
     @property
+    def has_probe(self) -> bool:
+        """Whether a clock probe is in the output."""
+        return self._probe_id != self._probe_sent
+
+    @property
     def has_room(self) -> bool:
         """Whether `submit` takes another command."""
         return len(self._waiting) < MAX_WAITING
@@ -153,6 +158,7 @@ class HostSession:
             return b""
         data = b"".join(self._output)
         self._output.clear()
+        self._probe_sent = self._probe_id
         self._repeats = False
         return data
 

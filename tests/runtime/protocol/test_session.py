@@ -238,6 +238,16 @@ def test_a_probe_counts_once_and_by_its_own_echo() -> None:
     assert (session.counters.implausible, session.counters.stale_probes) == (1, 2)
 
 
+def test_a_session_knows_of_a_probe_that_has_not_left() -> None:
+    session = opened()
+    session.grant(10, 1000)
+    assert not session.has_probe
+    session.probe(2)
+    assert session.has_probe
+    session.take_output()
+    assert not session.has_probe
+
+
 def test_of_64_probes_without_an_answer_the_oldest_is_given_up() -> None:
     session = opened()
     for number in range(1, session_module.MAX_PROBES + 2):

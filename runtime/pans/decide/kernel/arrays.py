@@ -33,10 +33,13 @@ HALVES, HALF, FIRST, LIMIT, KEPT_LIMIT, FIRST_ROW, ROW_LIMIT = range(25, 32)
 SERVES, WAKE_FD, TELL_FD, BATCH_NS, BATCH_MESSAGES, PARK, PARKED, READY, HUNGRY = range(32, 41)
 # when it handed over last; the block after which it has reported the next one overdue, when, and whether Python is to see to it
 HANDED_NS, OVERDUE_BLOCK_NS, OVERDUE_NS, OVERDUE = range(41, 45)
+# of its sleep while no decision can fall due. Set by the caller: the length of a tick in ps (0: it never sleeps), and when a clock probe
+# was sent last. Kept by the kernel: when a PONG came last, and of a tick at which an exposure ended, when its block comes at the earliest
+TICK_PS, PROBED_NS, PONG_NS, PACE_TICK, PACE_NS = range(45, 50)
 # what a call, or a batch, reports: errno, bytes of the last command that were not sent, when anything of the session came last, up to
 # where each ring and the rows are used, the exposure that comes next, how often a flow has told of the empty field, and why it ended
-ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT = range(45, 55)
-STOP_ROW, FOLLOWING, TOLD, ENDED, N_CONTROL = range(55, 60)
+ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT = range(50, 60)
+STOP_ROW, FOLLOWING, TOLD, ENDED, N_CONTROL = range(60, 65)
 
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)

@@ -84,6 +84,7 @@ class Steps(Protocol):
 NO_LIMITS = Limits()
 _NOTHING = Counts._make([0] * len(Counts._fields))
 BATCH_NS = 50_000_000  # for so long blocks are gathered: accounting costs the same for one block as for twenty
+PS_PER_US = 1_000_000
 BATCH_MESSAGES = 512  # at once from so many on: an eighth of the receive window
 
 
@@ -157,12 +158,22 @@ class Kernel:
         finally:
             control[ring.HALVES], control[ring.HALF], control[ring.SERVES] = 1, 0, 0
 
-    def allow(self, patience_ns: int, floor_ns: int, batch_ns: int, *, tells_exposed: bool = False) -> None:
-        """Say what a serving kernel may do from here on; it is parked, or has not begun. The device may tell of its exposures."""
+    def allow(
+        self, patience_ns: int, floor_ns: int, batch_ns: int, *, tells_exposed: bool = False, tick_us: float = 0.0
+    ) -> None:
+        """Say what a serving kernel may do from here on; it is parked, or has not begun. The device may tell of its exposures.
+
+        With the length of a tick, the kernel sleeps while no exposure can end a decision.
+        """
         control, is_open = self.control, self.steps.takes
         control[ring.PATIENCE_NS], control[ring.FLOOR_NS] = patience_ns, floor_ns
         control[ring.OPEN] = is_open + (is_open and tells_exposed)
         control[ring.BATCH_NS], control[ring.BATCH_MESSAGES] = batch_ns, BATCH_MESSAGES
+        control[ring.TICK_PS] = round(tick_us * PS_PER_US)
+
+    def stay_awake(self, now_ns: int) -> None:
+        """Let a serving kernel be awake until the PONG comes of a probe that is about to leave; it has to be woken."""
+        self.control[ring.PROBED_NS] = now_ns
 
     def receive_batch(self) -> bool:
         """Look at the batch that a serving kernel has handed over; False where there is none. `release` gives its half back."""

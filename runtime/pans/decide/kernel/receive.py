@@ -45,6 +45,16 @@ def answering(kind: Any) -> tuple[Any, tuple[str, ...]]:
     return (send_show if kind is WalkArrays else _answer_nothing), ()
 
 
+@inner
+def _spare_nothing(walk):  # type: ignore[no-untyped-def]
+    return np.int64(0)
+
+
+def sparing(kind: Any) -> tuple[Any, tuple[str, ...]]:
+    """Return the kernel that says how long a walk of class `kind` brings no decision, and no names: it wants the whole walk."""
+    return (core.ticks_to_spare if issubclass(kind, WalkArrays) else _spare_nothing), ()
+
+
 def _typed(chosen: tuple[Any, tuple[str, ...]], context: Any, walk: Any, rest: tuple[Any, ...]) -> tuple[Any, Any]:
     """Return what the compiler wants of a call of a kernel that takes `rest` and then fields of the walk, or the walk and then `rest`.
 
@@ -78,6 +88,10 @@ if numba.config.DISABLE_JIT:
         """Answer a block with the kernel of the walk's kind."""
         return answering(type(walk))[0](walk, *rest)
 
+    def ticks_to_spare(walk: Any) -> Any:
+        """Ask the kernel of the walk's kind how long no decision can fall due."""
+        return sparing(type(walk))[0](walk)
+
 else:
 
     @intrinsic
@@ -90,6 +104,11 @@ else:
         """Answer a block that has been taken; False when that could not be sent whole."""
         return _typed(answering(walk.instance_class), context, walk, (drive, rings, control, scratch))
 
+    @intrinsic
+    def ticks_to_spare(context, walk):  # type: ignore[no-untyped-def]
+        """Ticks from the latest exposure to the last one that brings no decision for sure; 0 where there is none."""
+        return _typed(sparing(walk.instance_class), context, walk, ())
+
 
 READ_BYTES = 1 << 16  # at once, as protocol/links/serial.py
 LEAST_WAIT_NS = 200_000
@@ -97,6 +116,11 @@ QUIET_NS = 5_000_000
 NAP_NS = 200_000_000  # longest wait of a serving kernel: a wake-up that was lost costs no more
 # a device that is late all the time is asked so often: each probe costs both sides a wake-up
 SILENCE_EVERY_NS = 100_000_000
+# A sleep lasts two blocks at least, or it saves nothing, and at most half a terminal's buffer of 4096 bytes (a socket's is larger).
+SLEEP_NS, SLEEP_BYTES, LEAST_SLEEP_BLOCKS = 2_000_000, 2048, 2
+AWAKE_NS = 200_000  # before a decision can fall due: a timer fires 50 us late by itself, and waking takes as long
+PONG_WAIT_NS = 250_000_000  # as long as live/session.py waits for a probe
+LONGEST_TICKS = 1 << 30  # between two blocks: times TICK_PS that fits into 64 bits
 HUNGRY_NS = 1_000_000  # how often it looks whether Python has done with the batch before
 _ACK, _PONG = int(MessageType.ACK), int(MessageType.PONG)
 _STATUS, _EXPOSED = int(MessageType.STATUS), int(MessageType.EXPOSED)
@@ -168,7 +192,12 @@ def _until_ended(fed, reads, decoder, walk, drive, rings, control, scratch):  # 
 
 @inner
 def _await_served(decoder, walk, rings, control, scratch):  # type: ignore[no-untyped-def]
-    """Read as soon as something is there, and hand over when it is time; ALL_TAKEN when new bytes are decoded, or why the kernel parks."""
+    """Read what comes, and hand over when it is time; ALL_TAKEN when new bytes are decoded, or why the kernel parks.
+
+    Bytes are read as soon as they are there, but while no decision can fall due only after a sleep, many at once.
+    """
+    _keep_pace(walk, control)
+    slept = False
     while True:
         if control[ring.STOP] or control[ring.PARK]:
             return ring.DUE
@@ -177,7 +206,8 @@ def _await_served(decoder, walk, rings, control, scratch):  # type: ignore[no-un
         now = now_ns(scratch)
         due, gathered = now + NAP_NS, control[ring.N_MESSAGES] - control[ring.FIRST]
         patience = control[ring.PATIENCE_NS]
-        if patience and control[ring.OVERDUE_BLOCK_NS] != control[ring.BLOCK_NS]:
+        # after a sleep the block that seems overdue may be there
+        if patience and control[ring.OVERDUE_BLOCK_NS] != control[ring.BLOCK_NS] and not slept:
             at = max(control[ring.BLOCK_NS] + patience, control[ring.OVERDUE_NS] + SILENCE_EVERY_NS)
             if now >= at:  # Python asks the device, once in each silence
                 control[ring.OVERDUE_BLOCK_NS], control[ring.OVERDUE_NS] = control[ring.BLOCK_NS], now
@@ -194,6 +224,14 @@ def _await_served(decoder, walk, rings, control, scratch):  # type: ignore[no-un
                 control[ring.HUNGRY], due = 1, min(due, now + HUNGRY_NS)
             else:
                 due = min(due, at)
+        sleep = np.int64(0) if slept else _sleep_ns(walk, rings, control, now, due)
+        if sleep:
+            slept = True
+            _nap(rings, control, sleep, scratch)
+            _note_wait(rings.notes, control, now, now + sleep, now_ns(scratch))
+            continue
+        if slept:
+            slept, due = False, now
         ready = wait_both(control[ring.FD], control[ring.WAKE_FD], due - now, scratch)
         _note_wait(rings.notes, control, now, due, now_ns(scratch))
         if ready < 0 and ready != -INTERRUPTED:
@@ -206,6 +244,46 @@ def _await_served(decoder, walk, rings, control, scratch):  # type: ignore[no-un
                 return ring.ALL_TAKEN
             if found != -AGAIN and found != -INTERRUPTED:
                 return _failed(control, found)
+
+
+@inner
+def _keep_pace(walk, control):  # type: ignore[no-untyped-def]
+    """Note when the block of the latest exposure comes at the earliest: as the quickest before it, by the plan and the device's clock.
+
+    A block that waited, here or on the way, changes nothing of that. Clocks may differ by one in 1024 (protocol/clock.MAX_RATE_ERROR).
+    """
+    ticks = walk.state[0].last_tick - control[ring.PACE_TICK]
+    if ticks == 0 or not control[ring.TICK_PS]:
+        return
+    at = control[ring.ARRIVAL_NS]
+    if control[ring.PACE_NS] and 0 < ticks < LONGEST_TICKS:
+        passed = ticks * control[ring.TICK_PS] // 1000
+        at = min(at, control[ring.PACE_NS] + passed + (passed >> 10))
+    control[ring.PACE_TICK], control[ring.PACE_NS] = walk.state[0].last_tick, at
+
+
+@inner
+def _sleep_ns(walk, rings, control, now, due):  # type: ignore[no-untyped-def]
+    """How long the kernel may sleep though blocks come: until the one before a decision, and not beyond `due`; 0: it stays awake.
+
+    The arrival of a block that decides nothing is then known no better than to a sleep. That of a PONG measures the link.
+    """
+    n, ps = control[ring.N_STEPS], control[ring.TICK_PS]
+    if not ps or not control[ring.OPEN] or control[ring.DRIVES] or control[ring.URGENT] or n - control[ring.FIRST] < 2:
+        return np.int64(0)
+    if control[ring.PROBED_NS] > control[ring.PONG_NS] and now - control[ring.PROBED_NS] < PONG_WAIT_NS:
+        return np.int64(0)
+    ticks = rings.steps[n - 1, ring.END_TICK] - rings.steps[n - 2, ring.END_TICK]
+    if not 0 < ticks < LONGEST_TICKS:
+        return np.int64(0)
+    between = ticks * ps // 1000
+    if LEAST_SLEEP_BLOCKS * between > SLEEP_NS:
+        return np.int64(0)
+    latest = rings.messages[control[ring.N_MESSAGES] - 1]
+    blocks = SLEEP_BYTES // (latest[ring.END] - latest[ring.BEGIN])
+    spare = min(ticks_to_spare(walk), blocks * ticks) * ps // 1000 - max(AWAKE_NS - between, 0)
+    sleep = min(control[ring.PACE_NS] + spare, now + SLEEP_NS, due) - now
+    return sleep if sleep >= LEAST_SLEEP_BLOCKS * between else np.int64(0)
 
 
 @inner
@@ -408,6 +486,8 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
             if load_session(buffer, start) != walk.state[0].session:
                 return ring.ODD
             _keep(buffer, start, stop, rings.kept, rings.answers, ring.N_ANSWERS, control)
+            if buffer[start] == _PONG:
+                control[ring.PONG_NS] = control[ring.ARRIVAL_NS]
             control[ring.PLACE] += 1
             continue
         if not control[ring.OPEN]:

@@ -294,6 +294,35 @@ def planned_tick(exposure, state, offsets):  # type: ignore[no-untyped-def]
 
 
 @inner
+def ticks_to_spare(walk):  # type: ignore[no-untyped-def]
+    """Ticks from the end of the latest exposure to that of the last one before a decision can fall due; 0 where the next may bring it.
+
+    A walk may end as early as its shortest way to a leaf allows, a fixed window ends with its last exposure.
+    """
+    state, windows = walk.state[0], walk.windows
+    upcoming, n_windows = state.next_exposure, windows.last.size
+    visit, window, node = upcoming // state.visit_exposures, np.int64(0), np.int64(0)
+    n_states = windows.walks.successors.shape[0]
+    if state.next_window < n_windows:
+        if visit != state.visit:  # a window waits for what was lost
+            return np.int64(0)
+        window = state.next_window
+        if n_states:
+            node = windows.walks.nodes[window]
+    elif visit == state.visit:  # only dark exposures are left of it
+        visit += 1
+    first = visit * state.visit_exposures
+    earliest = first + windows.longest[1, window]
+    if 0 <= node < n_states:
+        begin = first + (windows.longest[1, window - 1] + 1 if window else 0)
+        earliest = min(earliest, max(begin, upcoming) + windows.walks.to_leaf[node] - 1)
+    last = min(earliest, state.end_exposure - 1) - 1
+    if last < upcoming:
+        return np.int64(0)
+    return planned_tick(last, state, windows.offsets) - planned_tick(upcoming - 1, state, windows.offsets)
+
+
+@inner
 def note_end(tick, count, state, offsets):  # type: ignore[no-untyped-def]
     """Note when the last of `count` exposures that were accounted for ended, and how far that is from the plan's time."""
     state.last_tick = tick + (count - 1) * state.period_ticks + state.exposure_ticks

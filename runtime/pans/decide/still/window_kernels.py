@@ -25,12 +25,14 @@ BROKEN = -1  # where a walk stands whose exposure was lost or showed the wrong s
 class Walks(NamedTuple):
     """The walks of the visit under way, one per window; arrays of length 0 where the patterns are fixed.
 
-    `successors` uint32 (states, outcomes). `nodes` int64 (windows,) is where each walk stands: a state, `states` + a leaf, or BROKEN.
+    `successors` uint32 (states, outcomes). `to_leaf` int64 (states,) are the fewest exposures from a state to a leaf.
+    `nodes` int64 (windows,) is where each walk stands: a state, `states` + a leaf, or BROKEN.
     `need` int64 (windows,) is how many right exposures make it whole, `last` int64 (windows,) the last exposure of the visit that belongs
     to it. `shown` and `clicked` int64 (states,) count the exposures of each state in the whole run, and those with a click.
     """
 
     successors: npt.NDArray[np.uint32]
+    to_leaf: npt.NDArray[np.int64]
     nodes: npt.NDArray[np.int64]
     need: npt.NDArray[np.int64]
     last: npt.NDArray[np.int64]
@@ -98,7 +100,7 @@ def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # 
     dark, and all else for nothing.
     """
     slot_at, window_at = maps
-    successors, nodes, need, last, shown, clicked = walks
+    successors, _, nodes, need, last, shown, clicked = walks
     n_states = successors.shape[0]
     for i in range(patterns.shape[0]):
         slot, window, stamp = slot_at[relative + i], window_at[relative + i], patterns[i]

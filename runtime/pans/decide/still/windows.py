@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.base.errors import PlanError
+from pans.bundle.automaton import exposures_to_leaf
 from pans.decide.core_state import CORE_DTYPE
 from pans.decide.decision import DECISION_DTYPE
 from pans.decide.plan.plan import Plan
@@ -239,8 +240,9 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
     """Return what the windows of `plan` need and, of an automaton, its walks; PlanError if they cannot be followed."""
     automaton = plan.automaton
     if automaton is None:
-        none = read_only(np.zeros((0, 2), np.uint32)), np.zeros(0, np.int64)
-        return Walks(*none, np.full(len(last), shots * n_features, np.int64), last, *np.zeros((2, 0), np.int64))
+        none: I64 = np.zeros(0, np.int64)
+        need = np.full(len(last), shots * n_features, np.int64)
+        return Walks(read_only(np.zeros((0, 2), np.uint32)), none, none, need, last, none, none)
     slots = int(np.count_nonzero(plan.slot_pattern == ADAPTIVE_PATTERN))
     if shots != 1:
         raise PlanError(
@@ -250,7 +252,8 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
     if not automaton.n_slots <= slots <= n_features:
         raise PlanError(f"walks of {automaton.n_slots} exposures in cycles of {slots} for numbers of {n_features}")
     nodes, (shown, clicked) = np.zeros(len(last), np.int64), np.zeros((2, automaton.n_states), np.int64)
-    return Walks(read_only(automaton.successors), nodes, np.full(len(last), slots, np.int64), last, shown, clicked)
+    successors, need = read_only(automaton.successors), np.full(len(last), slots, np.int64)
+    return Walks(successors, exposures_to_leaf(automaton), nodes, need, last, shown, clicked)
 
 
 def visit_maps(plan: Plan, shots: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pans.base.numbers import decision_figures
-from pans.bundle.automaton import Automaton, shortest_walk
+from pans.bundle.automaton import Automaton, exposures_to_leaf
 from pans.bundle.backends import NO_LABEL
 from pans.bundle.sensor import Analyser, Bundle, amplification, load_bundle
 from pans.calibrate.registration import load_registration
@@ -76,7 +76,7 @@ def _automaton_facts(bundle: Bundle, automaton: Automaton) -> dict[str, Any]:
         "outcomes": automaton.n_outcomes,
         "channels": automaton.channels,
         "exposures_longest": automaton.n_slots,
-        "exposures_shortest": shortest_walk(automaton),
+        "exposures_shortest": int(exposures_to_leaf(automaton)[0]),
         "states_per_slot_most": int(np.bincount(automaton.depth).max()),
         "dwell_steps": automaton.dwell_steps,
         "dark_states": int(np.count_nonzero(bundle.state_light() == 0)),

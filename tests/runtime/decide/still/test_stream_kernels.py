@@ -9,6 +9,8 @@ from automata import automaton_bundle, random_automaton
 from heads import head_bundle, random_layers
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from inner_kernels import called
+from naive_window import earliest_decision
 from plans import parallel, pattern_major, shot_major, walk_plan, walked
 from streams import SESSION, click_frames, compare, spoilt
 
@@ -18,7 +20,7 @@ from pans.bundle.backends.verdict import Verdict, Verdicts
 from pans.decide.decision import DecisionFlag
 from pans.decide.kernel.calls import StreamCore
 from pans.decide.plan.plan import Plan
-from pans.decide.still import kernel_state
+from pans.decide.still import kernel_state, kernels
 from pans.decide.still.tables import count_crc_tables
 from pans.protocol.wire import DeviceState, MessageType, StateReason
 from pans.protocol.wire import messages as wire
@@ -250,3 +252,29 @@ def test_the_checksum_of_counts_from_tables(n_features: int, shots: int) -> None
             for feature, count in enumerate(counts.tolist()):
                 crc ^= int(table[byte, feature, (count >> 8 * byte) & 0xFF])
         assert crc == zlib.crc32(counts.astype("<i8").tobytes())
+
+
+@pytest.mark.uncompiled
+@pytest.mark.parametrize("case", CASES)
+def test_no_decision_falls_due_while_a_kernel_may_sleep(case: Any) -> None:
+    """After each block: no clicks can end a window earlier, and without dark slots the time is used to the end."""
+    plan, decider, shots = case()
+    slots, rng = plan.slots_per_cycle, np.random.default_rng(3)
+    lit = [(int(slot), int(rng.integers(2))) for _ in range(N_CYCLES) for slot in plan.slot_pattern]
+    sent = lit if plan.automaton is None else walked(plan, N_CYCLES, rng)
+    spare, streamed = called(kernels.ticks_to_spare), StreamCore(plan, decider, shots, N_CYCLES, SESSION)
+    exposures = 0
+    for message in click_frames(plan, sent, rng, 2):
+        list(streamed.feed(message))
+        if streamed.core.tracker.next_exposure == exposures:
+            continue
+        exposures = streamed.core.tracker.next_exposure
+        if exposures == slots * N_CYCLES:
+            break
+        earliest = min(earliest_decision(plan, shots, sent[:exposures]), slots * N_CYCLES - 1)
+        spared = int(spare(streamed.core.steps(SESSION).walk)) // 100
+        most = max(earliest - exposures, 0)
+        assert spared <= most
+        if plan.automaton is None or plan.dark_slots_per_cycle == 0:
+            assert spared == most
+    assert exposures == slots * N_CYCLES
