@@ -12,7 +12,7 @@ import re
 import stat
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -257,16 +257,19 @@ def block_ends(kind: int, index: int, chain: int, payload: bytes | memoryview) -
     return start + _CRC.pack(header_crc), _CRC.pack(payload_crc), payload_crc
 
 
-def read_block(file: BinaryIO, index: int, chain: int, limits: Mapping[int, int], where: str) -> Block | None:
+def read_block(
+    file: BinaryIO, index: int, chain: int, limits: Mapping[int, int], where: str, wanted: Container[int] | None = None
+) -> Block | None:
     """Return the block at the file's position, or None where the file was cut (or ends); DamagedFileError if altered.
 
-    `limits` maps each allowed kind to its largest payload in bytes; nothing is read beyond it.
+    `limits` maps each allowed kind to its largest payload in bytes; nothing is read beyond it. The payload of a kind that is not
+    `wanted` (None: all are) is passed over: it is empty, and has not been checked.
     """
-    place = f"{where}: block {index} at byte {file.tell()}"
-    head = file.read(_BLOCK_HEADER.size)
+    begin, head = file.tell(), file.read(_BLOCK_HEADER.size)
     if len(head) < _BLOCK_HEADER.size:
         return None
     length, found_index, kind, header_crc = _BLOCK_HEADER.unpack(head)
+    place = f"{where}: block {index} at byte {begin}"
     if zlib.crc32(head[:-4], chain) != header_crc:
         if not any(head) and _only_zeros_follow(file):
             return None  # a power cut after the file had grown, before its data reached the disk
@@ -275,15 +278,20 @@ def read_block(file: BinaryIO, index: int, chain: int, limits: Mapping[int, int]
         raise DamagedFileError(f"{place}: index {found_index}, kind {kind}, allowed: index {index}, a known kind")
     if length > limits[kind]:
         raise DamagedFileError(f"{place}: {length} bytes of kind {kind}, allowed at most {limits[kind]}")
-    payload, tail = file.read(length), file.read(_CRC.size)
-    if len(payload) < length or len(tail) < _CRC.size:
+    passed_over = wanted is not None and kind not in wanted
+    payload = b"" if passed_over else file.read(length)
+    if passed_over:
+        file.seek(length, os.SEEK_CUR)
+    tail = file.read(_CRC.size)
+    if len(tail) < _CRC.size:
         return None
-    payload_crc = zlib.crc32(payload, header_crc)
-    if _CRC.unpack(tail)[0] != payload_crc:
+    payload_crc: int = _CRC.unpack(tail)[0]
+    if not passed_over and payload_crc != zlib.crc32(payload, header_crc):
         raise DamagedFileError(f"{place}: altered (its payload of {length} bytes does not fit its checksum)")
+    end = begin + len(head) + length + len(tail)
     for watcher in _watchers:
-        watcher(where, id(file), file.tell(), os.fstat(file.fileno()).st_size)
-    return Block(index, kind, payload, file.tell(), payload_crc)
+        watcher(where, id(file), end, os.fstat(file.fileno()).st_size)
+    return Block(index, kind, payload, end, payload_crc)
 
 
 def last_block(file: BinaryIO, wanted: int, chain: int, limits: Mapping[int, int], where: str) -> Block | None:

@@ -63,12 +63,12 @@ class LogEncoder:
         self._encode = kernels.encode_rows
         self._hash = _LogHash()
         self._state = np.zeros(kernels.N_STATE, np.uint64)
-        self._keys = np.full((LONG_VERDICT, 3), 0, np.uint64)
+        self._keys = np.empty((LONG_VERDICT, 3), np.uint64)
         self._slots = np.full(_SLOTS, LONG_VERDICT, np.uint16)
-        self._runs: NDArray[np.void] = np.full(BLOCK_ROWS, 0, RUN_DTYPE)
-        self._verdicts: NDArray[np.void] = np.full(BLOCK_ROWS, 0, VERDICT_DTYPE)
-        self._exposures = np.full(BLOCK_ROWS, 0, EXPOSURES_DTYPE)
-        self._codes = np.full(BLOCK_ROWS, 0, np.uint16)
+        self._runs: NDArray[np.void] = np.empty(BLOCK_ROWS, RUN_DTYPE)
+        self._verdicts: NDArray[np.void] = np.empty(BLOCK_ROWS, VERDICT_DTYPE)
+        self._exposures = np.empty(BLOCK_ROWS, EXPOSURES_DTYPE)
+        self._codes = np.empty(BLOCK_ROWS, np.uint16)
         # what a kernel continues, and what it fills
         known, verdicts = (self._state, self._keys, self._slots), self._verdicts.view(_VERDICT_BITS)
         self._arrays = *known, self._runs, verdicts, self._exposures, self._codes
@@ -113,8 +113,8 @@ class LogReader:
     """DECISIONS blocks of one recording, in their order."""
 
     def __init__(self) -> None:
-        self._known: NDArray[np.void] = np.zeros(LONG_VERDICT, VERDICT_DTYPE)
-        self._known_exposures = np.zeros(LONG_VERDICT, EXPOSURES_DTYPE)
+        self._known: NDArray[np.void] = np.empty(LONG_VERDICT, VERDICT_DTYPE)
+        self._known_exposures = np.empty(LONG_VERDICT, EXPOSURES_DTYPE)
         self._n_known = 0
         self._hash = _LogHash()
 

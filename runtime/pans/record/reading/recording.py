@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,7 @@ from .format import (
 from .recorded_facts import checked_event, checked_header, checked_summary
 
 MESSAGES_AT_ONCE = ROWS_AT_ONCE = 1 << 14
+GATHERED_BYTES = MIB // 4  # of messages at once: blocks of a slow stream have a few
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +108,12 @@ class Recording:
         return html_card(f"Recording {self.path.name}", rows)
 
     def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
-        """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block."""
+        """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block.
+
+        Payloads of other kinds are passed over.
+        """
         with open_regular(self.path) as file:
-            for block in _blocks(file, _start(file, str(self.path)), str(self.path)):
+            for block in _blocks(file, _start(file, str(self.path)), str(self.path), wanted or None):
                 if not wanted or block.kind in wanted:
                     yield block
                 if block.end >= self.end_offset:
@@ -184,17 +188,26 @@ class Recording:
             return read_bundle(file, size, f"{self.path}: the bundle inside")[0]
 
     def iter_messages(self) -> Iterator[Messages]:
-        """Yield the device's messages in order, many at once: bodies in one block of the file, valid until the next ones."""
+        """Yield the device's messages in order, those of many blocks at once, valid until the next ones."""
         from .log_kernels import message_spans  # numba is loaded only by who replays
 
-        spans = np.zeros((MESSAGES_AT_ONCE, 2), np.int64)
+        buffer = np.empty(GATHERED_BYTES + LIMITS[Kind.MESSAGES], np.uint8)
+        spans, n, used = np.empty((MESSAGES_AT_ONCE, 2), np.int64), 0, 0
         for block in self.iter_blocks(Kind.MESSAGES):
-            payload, at = np.frombuffer(block.payload, np.uint8), 0
-            while at < len(payload):
-                count, at = message_spans(payload, at, spans)
-                if not count:
+            at, used = used, used + len(block.payload)
+            buffer[at:used] = np.frombuffer(block.payload, np.uint8)
+            while at < used:
+                count, at = message_spans(buffer[:used], at, spans[n:])
+                n += count
+                if n == len(spans):
+                    yield Messages(buffer, spans)
+                    n = 0
+                elif at < used:
                     raise _past_block(self.path, block)
-                yield Messages(payload, spans[:count])
+            if used >= GATHERED_BYTES:
+                yield Messages(buffer, spans[:n])
+                n = used = 0
+        yield Messages(buffer, spans[:n])
 
 
 def _pairs(block: Block, path: Path) -> Iterator[tuple[int, bytes]]:
@@ -258,9 +271,9 @@ def _start(file: Any, where: str) -> int:
     return check_prologue(start, MAGIC, FORMAT_VERSION, where)
 
 
-def _blocks(file: Any, chain: int, where: str) -> Iterator[Block]:
+def _blocks(file: Any, chain: int, where: str, wanted: Sequence[Kind] | None = None) -> Iterator[Block]:
     index = 0
-    while (block := read_block(file, index, chain, LIMITS, where)) is not None:
+    while (block := read_block(file, index, chain, LIMITS, where, wanted)) is not None:
         yield block
         if block.kind == Kind.END:
             if rest := len(file.read(MIB)):

@@ -28,6 +28,7 @@ from pans.protocol.wire import (
     unpack_states,
 )
 
+from .format import Kind
 from .recording import Recording
 
 TICK_HZ = Range(1000, 10_000_000_000, whole=True)
@@ -38,8 +39,8 @@ PHOTON_NUMBER = Range(1, MAX_PHOTON_NUMBER, whole=True)
 def _sent_commands(recording: Recording) -> Iterator[tuple[int, CommandMessage]]:
     """Yield the commands, each with the session that it was sent in; MalformedMessage for what is none."""
     decoder = FrameDecoder()
-    for _, data in recording.commands():
-        for frame in decoder.feed(data):
+    for _, sent in recording.read(Kind.COMMANDS):
+        for frame in decoder.feed(b"".join(data for _, data in sent)):
             if frame.type == MessageType.COMMAND:
                 yield frame.session, decode_command(frame.payload)
 
