@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from pans.decide.decision import DECISION_DTYPE
 from pans.decide.kernel import arrays as ring
-from pans.decide.kernel.calls import Limits, StreamCore
+from pans.decide.kernel.calls import Limits
+from pans.decide.kernel.stream_core import StreamCore
 from pans.decide.still.core import Core
 from pans.decide.still.kernel_state import IdleSteps
 from pans.live.deciding import DecidingThread

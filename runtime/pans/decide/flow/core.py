@@ -264,22 +264,21 @@ class FlowCore(Follower):
 
     def _decided(self, walk: FlowWalk, rows: slice) -> Output:
         """Give verdicts to the rows of `walk` that wait for one, compare all with the truth, and ask for pulses."""
-        guard = self.guard
-        decisions, passages, actions = list[Decision](), list[Passage](), list[Action]()
-        for at in range(rows.start, rows.stop):
+        guard, decides, actions = self.guard, self.decides, list[Action]()
+        for at in range(rows.start, rows.stop) if guard is not None or not decides else ():
             row, counts = walk.rows[at], walk.counts[at]
             if guard is not None and not row["flags"] & _GAP:
                 guard.take_object(counts.sum(axis=0), NO_OBJECT)
-            if not self.decides:
+            if not decides:
                 self._judge(row, counts)
-            decision, passage = Decision(*row.tolist()), Passage(*walk.passages[at].tolist())
+        decisions = [Decision(*row) for row in walk.rows[rows].tolist()]
+        passages = tuple(Passage(*row) for row in walk.passages[rows].tolist())
+        for decision, passage in zip(decisions, passages):
             gated = decision.label in self.gated
             if gated:
                 actions.append(self._pulse(decision.number, passage.leave_tick))
             self.matcher.add_decision(decision, passage, gated)
-            decisions.append(decision)
-            passages.append(passage)
-        return Output(decisions, [], None, tuple(passages), tuple(actions))
+        return Output(decisions, [], None, passages, tuple(actions))
 
     def _judge(self, row: Any, counts: I64) -> None:
         """Complete a row that the kernel has not decided, from the clicks of its windows int64 (pool, d_f)."""
@@ -405,9 +404,10 @@ class FlowCore(Follower):
         return output
 
     def remember_rows(self, rows: npt.NDArray[np.void]) -> None:
-        """See Follower."""
+        """See Follower; the kernel takes no mark of an object twice."""
+        super().remember_rows(rows)
         for row in rows:
-            self.remember(mark_of(row))
+            self.matcher.add_mark(mark_of(row))
 
     def remember(self, mark: Mark) -> None:
         """See Follower."""

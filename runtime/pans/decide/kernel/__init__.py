@@ -6,10 +6,11 @@ messages are left to Python. Start at calls.py (`Kernel`), then receive.py; arra
 
 from . import arrays as arrays
 from .arrays import OVERSLEPT_NS, Drive
-from .calls import BATCH_NS, Kernel, Limits, StreamCore
+from .calls import BATCH_NS, Kernel, Limits
 from .follow_up import FollowUp, follow_up_of
 from .follow_up import PhotonsOf as PhotonsOf
 from .receive import QUIET_NS, turn, unpack_blocks
+from .stream_core import StreamCore
 from .system_calls import now_ns, offered, read_now, wait_for, write_now
 
 __all__ = [

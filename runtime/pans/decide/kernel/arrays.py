@@ -14,8 +14,8 @@ I64 = npt.NDArray[np.int64]
 
 # control, int64 (N_CONTROL,). Set by the caller before a call: the descriptor, and whether it is read (0: only what is decoded already);
 # until when; how long after a block the next one is overdue (0: do not watch); how long to poll awake at first; how many messages may
-# come; whether a stream is open (2: and EXPOSED is expected), whether SHOW is sent, whether commands wait in the session; most rows of
-# one block; waits that lie closer together are one
+# come; whether a stream is open (2: STATUS is passed while the device measures, 3: EXPOSED, too); whether SHOW is sent, whether commands
+# wait in the session; most rows of one block; waits that lie closer together are one
 FD, READS, DUE_NS, PATIENCE_NS, EAGER_NS, BUDGET, OPEN, DRIVES, WAITING, BLOCK_ROWS, FLOOR_NS = range(11)
 STOP = 11  # set by anybody, at any time: the call ends
 # kept by both sides: the next decoded body and how many there are, when they were read, when a block came last; the session's
@@ -94,12 +94,14 @@ class Drive(NamedTuple):
 
 
 def make_rings() -> Rings:
-    """Return rings in memory that has been touched."""
-    kept: U8 = np.full(KEPT_BYTES, 1, np.uint8)
-    messages, answers, shows, notes = (np.full((MANY, 4), 1, np.int64) for _ in range(4))
-    steps, arrivals = np.full((MANY, N_STEP), 1, np.int64), np.full(MANY, 1, np.int64)
-    handed, spare = np.full(N_CONTROL, 0, np.int64), np.full(64, 1, np.uint8)
-    standings = np.full((MANY, 4), 1, np.int64)
+    """Return rings; their memory is touched when the kernel is warmed up."""
+    messages, answers, shows, notes, standings = (np.empty((MANY, 4), np.int64) for _ in range(5))
+    steps, arrivals, handed = (
+        np.empty((MANY, N_STEP), np.int64),
+        np.empty(MANY, np.int64),
+        np.empty(N_CONTROL, np.int64),
+    )
+    kept, spare = np.empty(KEPT_BYTES, np.uint8), np.empty(64, np.uint8)
     return Rings(kept, steps, messages, answers, shows, notes, arrivals, standings, handed, spare)
 
 

@@ -1,25 +1,18 @@
-"""`Kernel`: the calls of one connection's kernel, from bytes to rows; `StreamCore` does without a live run.
+"""`Kernel`: the calls of one connection's kernel, from bytes to rows.
 
-`run` and `feed` say why a call ended; what came stands in properties that are valid until the next call. A replay, the benches and the
-tests drive a core by `StreamCore`.
+`run` and `feed` say why a call ended; what came stands in properties that are valid until the next call. stream_core.py drives a core by
+it without a live run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from pans.bundle.backends import Decider
-from pans.decide.decision import DECISION_DTYPE, CoreEvent, Output
 from pans.decide.follower import Standing
-from pans.decide.plan.plan import Plan
-from pans.decide.still.core import Core
-from pans.decide.still.kernel_state import CoreState
-from pans.decide.still.kernels import DecisionTables
-from pans.protocol.session import STREAM_TYPES
 from pans.protocol.wire import CHUNK_BYTES, MARK_DTYPE, Frame, FrameDecoder, Messages, MessageType, unpack_body
 
 from . import arrays as ring
@@ -83,6 +76,7 @@ class Steps(Protocol):
 
 NO_LIMITS = Limits()
 _NOTHING = Counts._make([0] * len(Counts._fields))
+PAGE_BYTES = 4096
 BATCH_NS = 50_000_000  # for so long blocks are gathered: accounting costs the same for one block as for twenty
 PS_PER_US = 1_000_000
 BATCH_MESSAGES = 512  # at once from so many on: an eighth of the receive window
@@ -103,6 +97,7 @@ class Kernel:
         self.begin = self.end = _NOTHING
         self._kernel = turn
         self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
+        self._open = 1  # control[OPEN] of a call while the stream is open
         self._drive = no_drive() if drive is None else drive
         self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
         self.control[ring.FD], self.control[ring.HALVES] = -1, 1
@@ -114,7 +109,10 @@ class Kernel:
         self._walk = steps.walk
 
     def warm_up(self) -> None:
-        """Compile or load the kernels, before arming; nothing is read and nothing changes."""
+        """Compile or load the kernels and touch each page that they fill, before arming; nothing is read and nothing changes."""
+        for array in (*self.rings, self._walk.rows, *self._decoder):
+            pages = array.reshape(-1).view(np.uint8)[::PAGE_BYTES]
+            pages |= 0  # writes what is there
         self.run()
 
     def drives(self, drive: Drive) -> None:
@@ -130,7 +128,7 @@ class Kernel:
         if fd >= 0:
             control[ring.FD] = fd
         control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
-        control[ring.FLOOR_NS], control[ring.OPEN] = limits.floor_ns, self.steps.takes
+        control[ring.FLOOR_NS], control[ring.OPEN] = limits.floor_ns, self._open * self.steps.takes
         ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, control, self._scratch)
         self._report(control)
         return int(ended)
@@ -167,7 +165,7 @@ class Kernel:
         """
         control, is_open = self.control, self.steps.takes
         control[ring.PATIENCE_NS], control[ring.FLOOR_NS] = patience_ns, floor_ns
-        control[ring.OPEN] = is_open + (is_open and tells_exposed)
+        control[ring.OPEN] = is_open * (2 + tells_exposed)
         control[ring.BATCH_NS], control[ring.BATCH_MESSAGES] = batch_ns, BATCH_MESSAGES
         control[ring.TICK_PS] = round(tick_us * PS_PER_US)
 
@@ -208,9 +206,8 @@ class Kernel:
         return self._call(self._fed, -1, NO_LIMITS)
 
     def hold(self, messages: Messages) -> None:
-        """Take bodies of a recording, by `run`, until all are taken."""
-        buffer = messages.buffer if messages.buffer.flags.writeable else messages.buffer.copy()
-        self._decoder = Decoder(buffer, messages.spans, self._decoder.tally)
+        """Process bodies of a recording in the calls of `run` that follow; STATUS and EXPOSED are passed, as by a serving kernel."""
+        self._decoder, self._open = Decoder(*messages, self._decoder.tally), 3
         self.control[ring.PLACE : ring.ARRIVAL_NS + 1] = (0, len(messages.spans), 0)
 
     def stop(self) -> None:
@@ -223,6 +220,11 @@ class Kernel:
     def arrival_ns(self) -> int:
         """When the bytes were read that were decoded last."""
         return int(self.control[ring.ARRIVAL_NS])
+
+    @property
+    def has_bodies(self) -> bool:
+        """Whether decoded messages are left."""
+        return bool(self.control[ring.PLACE] < self.control[ring.N_BODIES])
 
     @property
     def odd_type(self) -> int:
@@ -288,12 +290,13 @@ class Kernel:
 
     def heads(self, kind: MessageType, dtype: npt.DTypeLike) -> tuple[I64, npt.NDArray[np.void]]:
         """Return the spans of the messages of one kind, in order, and what each begins with: rows of `dtype`, BLOCK_DTYPE or MARK_DTYPE."""
-        spans = self.messages[self.messages[:, ring.WHAT] == int(kind)]
-        kept, size = self.rings.kept.data, np.dtype(dtype).itemsize
-        return spans, np.frombuffer(b"".join([kept[at : at + size] for at in spans[:, ring.BEGIN].tolist()]), dtype)
+        spans, size = self.messages[self.messages[:, ring.WHAT] == int(kind)], np.dtype(dtype).itemsize
+        # what begins at each byte; `raw` is copied at once, its fields would be one by one
+        raw: npt.NDArray[np.void] = np.ndarray(len(self.kept) - size + 1, f"V{size}", self.kept, strides=(1,))
+        return spans, raw[spans[:, ring.BEGIN]].view(dtype)
 
     def passed(self) -> Iterator[tuple[int, Frame, Standing]]:
-        """Yield each STATUS and EXPOSED that a serving kernel has passed: when it came, and where the stream stood then."""
+        """Yield each STATUS and EXPOSED that the kernel has passed: when it came, and where the stream stood then."""
         what = self.messages[:, ring.WHAT]
         for at in np.flatnonzero((what == int(MessageType.STATUS)) | (what == int(MessageType.EXPOSED))).tolist():
             span, standing = self.messages[at], self.rings.standings[self.begin.messages + at]
@@ -302,105 +305,3 @@ class Kernel:
     def marks(self) -> npt.NDArray[np.void]:
         """Return the marks among `messages`, MARK_DTYPE (n,), in order."""
         return self.heads(MessageType.MARK, MARK_DTYPE)[1]
-
-
-_CORE_TYPES = STREAM_TYPES | {MessageType.STATUS, MessageType.EXPOSED}
-_NO_ROWS: npt.NDArray[np.void] = np.zeros(0, DECISION_DTYPE)
-
-
-class Batch(NamedTuple):
-    """Rows (n,) of DECISION_DTYPE, valid until the next batch, events, and the frames that are not the core's alone."""
-
-    rows: npt.NDArray[np.void]
-    events: Sequence[CoreEvent] = ()
-    others: Sequence[Frame] = ()
-
-
-class StreamCore:
-    """A decoder and a core, for the session `session`; all memory is allocated here, before arming."""
-
-    def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, session: int) -> None:
-        self._take_over(Core(plan, decider, shots, n_cycles), session)
-
-    @classmethod
-    def of(cls, core: Core, session: int) -> StreamCore:
-        """Return one for a core that exists."""
-        streamed = cls.__new__(cls)
-        streamed._take_over(core, session)
-        return streamed
-
-    def _take_over(self, core: Core, session: int) -> None:
-        self.core, self.decoder, self.wrong_session, self._session = core, FrameDecoder(), 0, session
-        self.turn = Kernel(core.steps(session), self.decoder)
-
-    @property
-    def tables(self) -> DecisionTables:
-        """What decides without asking the back end."""
-        steps = self.core.steps(self._session)
-        assert isinstance(steps, CoreState)
-        return steps.tables
-
-    def warm_up(self) -> None:
-        """Compile or load every kernel of the path, before arming."""
-        self.core.windows.warm_up()
-        self.turn.warm_up()
-
-    def follow(self, session: int) -> None:
-        """Take messages of `session`, which the core has begun."""
-        self._session = session
-        self.core.steps(session)
-
-    def begin(self, session: int, start_tick: int, n_cycles: int) -> Iterator[Batch]:
-        """Follow the stream that an ARM starts in `session`; what the one before left open is yielded."""
-        output = self.core.begin(start_tick, n_cycles)
-        self.follow(session)
-        yield from _batches(output)
-
-    def end(self) -> Iterator[Batch]:
-        """End the stream, and yield what it leaves open."""
-        yield from _batches(self.core.end())
-
-    def feed(self, data: Bytes) -> Iterator[Batch]:
-        """Take bytes as they arrived, whatever they hold; the iterator must be used up."""
-        for first in range(0, len(data), CHUNK_BYTES):
-            yield from self._continue(self.turn.feed([(0, data[first : first + CHUNK_BYTES])]), self.turn.feed_on)
-
-    def listen(self, fd: int, limits: Limits) -> Iterator[Batch]:
-        """Take what comes from a descriptor until `limits`, or until the other end has closed it; the iterator must be used up."""
-        yield from self._continue(self.turn.run(fd, limits), self.turn.run)
-
-    def replay(self, messages: Messages) -> Iterator[Batch]:
-        """Take recorded messages; the iterator must be used up. `others` has those of another session, for the caller to take."""
-        self.turn.hold(messages)
-        yield from self._continue(self.turn.run(), self.turn.run)
-
-    def _continue(self, ended: int, again: Callable[[], int]) -> Iterator[Batch]:
-        """Yield what a call of the kernel brought, and take what ended it, until nothing is left."""
-        while True:
-            rows = self.turn.rows
-            self.core.remember_rows(self.turn.marks())
-            if len(rows):
-                yield Batch(rows)
-            if ended == ring.ODD:
-                yield from self._take_one(self.turn.take_odd())
-            elif ended != ring.FULL:
-                return
-            self.core.steps(self._session)
-            ended = again()
-
-    def _take_one(self, frame: Frame) -> Iterator[Batch]:
-        """Let the core take a message that is not ordinary: one out of order, with a gap before it, or no block at all."""
-        if frame.session != self._session:
-            self.wrong_session += 1
-            yield Batch(_NO_ROWS, (), [frame])
-        elif frame.type not in _CORE_TYPES:
-            yield Batch(_NO_ROWS, (), [frame])
-        else:
-            yield from _batches(self.core.step(frame))
-            if frame.type == MessageType.STATUS:
-                yield Batch(_NO_ROWS, (), [frame])
-
-
-def _batches(output: Output) -> Iterator[Batch]:
-    if output.decisions or output.events:
-        yield Batch(np.array(output.decisions, DECISION_DTYPE), output.events)

@@ -192,27 +192,34 @@ class FlowFollowUp(IdleFollowUp):
         spans, heads = kernel.heads(MessageType.FRAMES, BLOCK_DTYPE)
         behind = (heads["exposure_index"] + heads["count"]).astype(np.int64)  # the exposure that follows each block
         empty = {told[0]: told for told in core.told_empty(kernel.end.told)}
-        places = np.flatnonzero(kernel.messages[:, ring.WHAT] == int(MessageType.MARK)).tolist()
-        marks, row = deque(zip(places, map(mark_of, kernel.marks()))), kernel.begin.rows
-        first = kernel.begin.messages
-        decided = kernel.rows_by_block > 0
-        some = decided | np.isin(behind, list(empty)) | by_block
-        decided[-1] = some[-1] = True
-        columns = blocks[:, ring.END_TICK : ring.MESSAGES + 1].tolist()
-        for block, (end_tick, stop, place) in enumerate(columns):
-            while marks and marks[0][0] < place - first:
-                core.remember(marks.popleft()[1])
+        mark_rows, places = kernel.marks(), np.flatnonzero(kernel.messages[:, ring.WHAT] == int(MessageType.MARK))
+        core.marks.add_rows(mark_rows)
+        marks = deque(map(mark_of, mark_rows))
+        # of each mark the block that follows it
+        before = np.searchsorted(blocks[:, ring.MESSAGES] - kernel.begin.messages, places, "right")
+        decided, told = kernel.rows_by_block > 0, np.isin(behind, list(empty))
+        decided[-1] = True
+        # The matcher need not see each block, but the last one before a mark or a decision, which may change what it finds.
+        some = decided | told | by_block
+        some[:-1] |= decided[1:]
+        some[before[before > 0] - 1] = True
+        which = np.flatnonzero(some)
+        n_marks, columns = np.searchsorted(before, which, "right"), blocks[some][:, [ring.END_TICK, ring.ROWS]]
+        row = kernel.begin.rows
+        for block, n, (end_tick, stop) in zip(which.tolist(), n_marks.tolist(), columns.tolist()):
+            while len(mark_rows) - len(marks) < n:
+                core.matcher.add_mark(marks.popleft())
             following = int(behind[block])
             if decided[block] or by_block:
                 frames = decode_frames(kernel.bytes_of(spans[block])[HEADER.size :]) if by_block else None
                 yield core.account(slice(row, stop), following, end_tick, empty.get(following), frames)
                 row = stop
                 continue
-            if some[block] and (events := core.watch(empty[following])):
+            if told[block] and (events := core.watch(empty[following])):
                 yield Output([], events, end_tick)
             core.matcher.settle(following)
-        for _, mark in marks:
-            core.remember(mark)
+        for mark in marks:
+            core.matcher.add_mark(mark)
 
 
 def _words_of(kept: npt.NDArray[np.uint8], spans: I64, heads: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:

@@ -492,7 +492,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
             continue
         if not control[ring.OPEN]:
             return ring.ODD
-        if control[ring.SERVES] and _passes(buffer, start, stop, control):
+        if control[ring.OPEN] >= 2 and _passes(buffer, start, stop, control):
             # the core judges it by where the stream stands now, when Python has time
             if load_session(buffer, start) != walk.state[0].session:
                 return ring.ODD
@@ -527,7 +527,7 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
 def _passes(buffer, start, stop, control):  # type: ignore[no-untyped-def]
     """Whether the body is one that changes nothing of how the stream goes on: STATUS while the device measures, EXPOSED."""
     if buffer[start] == _EXPOSED:
-        return control[ring.OPEN] == 2
+        return control[ring.OPEN] == 3
     if buffer[start] != _STATUS or stop - start <= stream.BODY_HEADER:
         return False
     state = buffer[start + stream.BODY_HEADER]  # the first field

@@ -18,8 +18,8 @@ class Marks:
     """
 
     def __init__(self) -> None:
-        self._rows: Rows = np.zeros(2 * MAX_MARKS, MARK_DTYPE)
-        self._objects: npt.NDArray[np.int64] = np.zeros(len(self._rows), np.int64)
+        self._rows: Rows = np.empty(2 * MAX_MARKS, MARK_DTYPE)
+        self._objects: npt.NDArray[np.int64] = np.empty(len(self._rows), np.int64)
         self._n = 0
         self.following = 0  # above the numbers of all objects that are remembered
 

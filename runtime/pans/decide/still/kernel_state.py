@@ -36,9 +36,9 @@ class CoreState:
         self._decider, self._shots = decider, shots
         asked = 0 if self.decides else decider.n_features
         rows_max = 2 * self.block_rows + min(ROWS_PER_CALL, COUNTS_PER_CALL // max(asked, 1))
-        # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
-        self._rows: Rows = np.full(rows_max, 0, DECISION_DTYPE)
-        self._counts = np.full((rows_max if asked else 0, decider.n_features), 0, np.int64)
+        # Filled by the kernel alone; `Kernel.warm_up` touches it.
+        self._rows: Rows = np.empty(rows_max, DECISION_DTYPE)
+        self._counts = np.empty((rows_max if asked else 0, decider.n_features), np.int64)
         self._marks = windows.walk.marks
         self.walk = windows.walk._replace(tables=tables, rows=self._rows, counts=self._counts)
 

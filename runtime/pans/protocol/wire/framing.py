@@ -135,10 +135,9 @@ class FrameDecoder:
         from . import kernels  # numba is loaded only by who decodes
 
         self._take_in = kernels.take_in
-        # filled, not zeroed: a page that was touched is no fault when it is first used
-        self.buffer: U8 = np.full(MAX_FRAME_BYTES + CHUNK_BYTES, 0, np.uint8)
+        self.buffer: U8 = np.empty(MAX_FRAME_BYTES + CHUNK_BYTES, np.uint8)
         self._view = self.buffer.data
-        self._bodies: I64 = np.full((len(self.buffer) // SMALLEST_FRAME_BYTES + 1, 2), 0, np.int64)
+        self._bodies: I64 = np.empty((len(self.buffer) // SMALLEST_FRAME_BYTES + 1, 2), np.int64)
         self._tally: I64 = np.zeros(kernels.N_TALLIES, np.int64)
 
     @property

@@ -16,7 +16,7 @@ from pans.bundle.backends.choose import make_decider
 from pans.bundle.heads.layers import quantise_head
 from pans.bundle.sensor.bundle import load_bundle
 from pans.decide.decision import DECISION_DTYPE
-from pans.decide.kernel.calls import StreamCore
+from pans.decide.kernel.stream_core import StreamCore
 from pans.decide.kernel.system_calls import offered
 from pans.protocol.wire.framing import FrameDecoder
 

@@ -23,7 +23,8 @@ from streams import SESSION, click_frames
 from pans.bundle.backends.choose import make_decider
 from pans.decide.kernel import arrays as ring
 from pans.decide.kernel import show as answer
-from pans.decide.kernel.calls import Kernel, Limits, StreamCore
+from pans.decide.kernel.calls import Kernel, Limits
+from pans.decide.kernel.stream_core import StreamCore
 from pans.decide.still.core import Core
 from pans.live.drive import HostDriver, WalkPlace
 from pans.protocol.wire import DARK_PATTERN, Opcode, pack_body

@@ -19,7 +19,7 @@ from tree import ROOT
 
 from pans.bundle.backends.choose import make_decider
 from pans.decide.kernel import arrays as ring
-from pans.decide.kernel.calls import StreamCore
+from pans.decide.kernel.stream_core import StreamCore
 from pans.live.deciding import DecidingThread
 from pans.protocol.wire import DeviceState, StateReason
 from pans.protocol.wire import messages as wire
@@ -179,7 +179,7 @@ STEPS = ("_hand_over", "_park", "_begin", "_read", "write_now", "wait_both", "_n
 ASLEEP = """
 import random, socket, sys, threading, time
 from pans.decide.kernel import arrays as ring, receive
-from pans.decide.kernel.calls import StreamCore
+from pans.decide.kernel.stream_core import StreamCore
 from pans.live.deciding import DecidingThread
 from pans.protocol.wire import messages as wire
 from streams import SESSION, click_frames

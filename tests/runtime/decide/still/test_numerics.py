@@ -13,7 +13,7 @@ from pans.bundle.backends.choose import make_decider
 from pans.bundle.backends.int8 import winner
 from pans.bundle.backends.verdict import log_evidence, softmax_winner, softmax_winners
 from pans.decide.decision import DECISION_DTYPE
-from pans.decide.kernel.calls import StreamCore
+from pans.decide.kernel.stream_core import StreamCore
 from pans.decide.still.core import Core
 from pans.protocol.wire import messages as wire
 from pans.protocol.wire.framing import FrameDecoder
