@@ -44,12 +44,14 @@ FLOW_S = 0.01
 _BLOCK = struct.Struct("<IIB3xI")
 
 
-def record_run(folder: Path, bundle: Path | None = None, profile: str = "ideal", more: str = "") -> Path:
+def record_run(
+    folder: Path, bundle: Path | None = None, profile: str = "ideal", more: str = "", **options: Any
+) -> Path:
     """Return the recording of a small run in virtual time, written in `folder`; `more` stands behind the device's URL."""
     if bundle is None:
         bundle = folder / "small.pans"
         write_bundle(small_setup()[1], bundle)
-    return _record(folder, bundle, profile, f"scene=uniform{more}", decisions=DECISIONS)
+    return _record(folder, bundle, profile, f"scene=uniform{more}", **{"decisions": DECISIONS} | options)
 
 
 def record_passive(folder: Path) -> Path:
@@ -58,11 +60,11 @@ def record_passive(folder: Path) -> Path:
     return record_run(folder, folder / "passive.pans", more=f"&optics={folder / 'passive.pans'}")
 
 
-def record_flow(folder: Path) -> Path:
-    """Return the recording of a small run of cells in flow, written in `folder`."""
+def record_flow(folder: Path, more: str = "", **options: Any) -> Path:
+    """Return the recording of a small run of cells in flow, written in `folder`; `more` stands behind the device's URL."""
     write_thirds(folder)
-    device = f"scene={folder / 'cells.toml'}"
-    return _record(folder, folder / "thirds.pans", "flow-snspd", device, flow=folder / "flow.toml", seconds=FLOW_S)
+    flow = {"flow": folder / "flow.toml", "seconds": FLOW_S} | options
+    return _record(folder, folder / "thirds.pans", "flow-snspd", f"scene={folder / 'cells.toml'}{more}", **flow)
 
 
 def passive_bundle() -> Bundle:

@@ -1,4 +1,4 @@
-"""A recording decided again: from its raw messages to decisions, with the same core as in the live run.
+"""A recording decided again: from its raw messages to decisions, by the same kernel and the same core as in the live run.
 
 `replay` returns the number of decisions, the hash of their log, which is the recorded one when nothing has changed, and how far they
 agree with a recording that was cut off. A `ClickLog` notes the clicks behind each decision on the way.
@@ -19,19 +19,20 @@ from pans.base.errors import DamagedFileError, UsageError
 from pans.base.files import likeness, npz_bytes, scene_arrays, shipped_scene, write_file
 from pans.bundle.backends import Decider, PictureDecider, Verdict, Verdicts, make_decider
 from pans.bundle.sensor import Bundle
-from pans.decide import DECISION_DTYPE, Decision, DecisionFlag, Follower, Place, exposure_timing
+from pans.decide import Decision, DecisionFlag, Follower, Place, RowDecisions, exposure_timing, rows_of
 from pans.decide.dark import recorded_guard
 from pans.decide.flow import FlowCore, PassageFigures, recorded_flow_core, replayed_figures
 from pans.decide.kernel import StreamCore
 from pans.decide.still import Core
 from pans.instrument.profile import parse_profile
-from pans.protocol.wire import Arm, Frame, MalformedMessage, MessageType, announces_exposed, decode_welcome, unpack_body
+from pans.protocol.wire import Arm, MalformedMessage, MessageType, announces_exposed, decode_welcome, unpack_body
 from pans.record.reading.decision_log import LogEncoder
 from pans.record.reading.parts import JoinedRecording, place_of
 from pans.record.reading.recording import Recording
 from pans.record.reading.sent_plan import SHOTS, TICK_HZ, Sent, automaton_of, never_armed, sent_to_device, walk_dose
 
 ASKED = DecisionFlag.NOT_FINITE | DecisionFlag.AMBIGUOUS  # abstained after the back end had been asked
+_ABSTAINED, _ASKED = int(DecisionFlag.ABSTAINED), int(ASKED)  # an enumeration's operators cost a microsecond each
 # what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
 _NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, MalformedMessage)
 
@@ -39,7 +40,7 @@ _NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, Ove
 class ClickLog(Decider):
     """Stands between a core and its back end, whichever, and remembers the clicks of every decision that it is asked for.
 
-    It has neither `look_up` nor `automaton`: a kernel would decide by them.
+    It has neither `look_up` nor `automaton`: a kernel would decide by them, and ask for no label.
     """
 
     def __init__(self) -> None:
@@ -76,7 +77,7 @@ class ClickLog(Decider):
 
     def note(self, decisions: Sequence[Decision]) -> None:
         """Take the decisions in their order: those that were asked for, in the order of asking."""
-        self.decisions += [one for one in decisions if not one.flags & DecisionFlag.ABSTAINED or one.flags & int(ASKED)]
+        self.decisions += [one for one in decisions if not one.flags & _ABSTAINED or one.flags & _ASKED]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,10 +147,9 @@ class _Log:
         self.sha256_as_far = ""
         self._n_recorded, self._pictures = n_recorded, pictures
         self.encoder = LogEncoder()
-        self.take([])
+        self.take(rows_of([]))
 
-    def take(self, decisions: Sequence[Any] | NDArray[np.void]) -> None:
-        rows = np.asarray(decisions, DECISION_DTYPE)
+    def take(self, rows: NDArray[np.void]) -> None:
         here = self._n_recorded - self.decisions  # rows up to the last recorded one
         if 0 <= here <= len(rows) and not self.sha256_as_far:
             self.encoder.update(rows[:here])
@@ -158,8 +158,8 @@ class _Log:
         else:
             self.encoder.update(rows)
         self.decisions += len(rows)
-        if self._pictures is not None and not isinstance(decisions, np.ndarray):
-            self._pictures.note(decisions)
+        if self._pictures is not None:
+            self._pictures.note(RowDecisions(rows))
 
 
 def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures, NDArray[np.int64]]:
@@ -177,12 +177,12 @@ def _replayed(recording: Recording, bundle: Bundle, pictures: ClickLog | None) -
     """Drive a core through `recording`; return it and the log of its decisions."""
     core, sent = _rebuilt(recording, bundle, pictures)
     log = _Log(recording.n_decisions, pictures)
-    for decisions in _decided(core, sent.arms, recording, by_kernel=pictures is None):
-        log.take(decisions)
+    for rows in _decided(core, sent.arms, recording):
+        log.take(rows)
     went_on = "part_ended" in recording.summary  # in the next part
     was_cut = not recording.complete and log.decisions >= recording.n_decisions  # the run did not end there
     if not (went_on or was_cut):
-        log.take(core.end().decisions)
+        log.take(rows_of(core.end().decisions))
     return core, log
 
 
@@ -202,6 +202,8 @@ def _rebuilt(recording: Recording, bundle: Bundle, pictures: ClickLog | None) ->
         if pictures is not None:
             decider = pictures.over(decider)
         guard = recorded_guard(config.get("dark", {}).get("guard", {}), plan, bundle, shots)
+        if guard is not None and guard.policy == "warn":
+            guard = None  # it changes no decision
         n_cycles = next(iter(sent.arms.values())).n_cycles
         if "flow" not in config:
             return Core(plan, decider, shots, n_cycles, guard), sent
@@ -242,47 +244,34 @@ def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
     return []
 
 
-def _decided(
-    core: Core | FlowCore, arms: Mapping[int, Arm], recording: Recording, *, by_kernel: bool
-) -> Iterator[Sequence[Any] | NDArray[np.void]]:
-    """Drive `core` as the live loop did, and yield its decisions; rows are valid until the next ones.
+def _decided(core: Core | FlowCore, arms: Mapping[int, Arm], recording: Recording) -> Iterator[NDArray[np.void]]:
+    """Drive `core` by the kernel, as the live loop did, and yield its decisions; rows are valid until the next ones.
 
-    `by_kernel` takes many messages in one call, where the core has a kernel. Those of another session than the present one begin the
-    streams of the next ARMs.
+    Messages of another session than the present one begin the streams of the next ARMs.
     """
-    streams, session = _begun(core, arms, place_of(recording)), 0
-    streamed = StreamCore.of(core, 0) if by_kernel and isinstance(core, Core) and core.takes else None
-
-    def batches() -> Iterator[tuple[Sequence[Any] | NDArray[np.void], list[Frame]]]:
-        if streamed is None:
-            yield from (([], [unpack_body(body)]) for _, body in recording.messages())
-            return
-        for messages in recording.iter_messages():
-            for batch in streamed.replay(messages):
-                yield batch.rows, [frame for frame in batch.others if frame.session != session]
-
-    for rows, frames in batches():
-        yield rows
-        for frame in frames:
-            while frame.session != session:
-                if (begun := next(streams, None)) is None:
-                    raise DamagedFileError(f"{recording.path}: a message of a session that never armed the device")
-                session, decisions = begun
-                yield decisions
-            if streamed is not None:
-                streamed.follow(session)
-            yield core.step(frame).decisions
-    yield from (decisions for _, decisions in streams)  # those that gave no message at all
+    streams, streamed = _begun(core, arms, place_of(recording)), StreamCore.of(core, 0)
+    for messages in recording.iter_messages():
+        for batch in streamed.replay(messages):
+            yield batch.rows
+            for frame in batch.others:
+                while frame.session != streamed.session:
+                    if (begun := next(streams, None)) is None:
+                        raise DamagedFileError(f"{recording.path}: a message of a session that never armed the device")
+                    session, rows = begun
+                    yield rows
+                    streamed.follow(session)
+                yield rows_of(core.step(frame).decisions)
+    yield from (rows for _, rows in streams)  # those that gave no message at all
 
 
-def _begun(core: Follower, arms: Mapping[int, Arm], place: Place | None) -> Iterator[tuple[int, Sequence[Any]]]:
+def _begun(core: Follower, arms: Mapping[int, Arm], place: Place | None) -> Iterator[tuple[int, NDArray[np.void]]]:
     """Begin the stream of each ARM, the first one at the `place` of a later part; yield its session, and the decisions."""
     for session, arm in arms.items():
         output = core.begin(arm.start_tick, arm.n_cycles)
         if place is not None:
             core.resume(place)
             place = None
-        yield session, output.decisions
+        yield session, rows_of(output.decisions)
 
 
 TRUTH_MAX_BYTES = 1 << 26  # as a scene file
