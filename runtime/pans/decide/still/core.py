@@ -64,7 +64,7 @@ class Core(Follower):
         if not self.takes:
             return super().steps(session)
         if self._bulk is None:
-            self._bulk = CoreState(self, self.windows, self._tables, self.decider, self.shots)
+            self._bulk = CoreState(self.tracker, self.marks, self.windows, self._tables, self.decider, self.shots)
         if not self._session_known:
             self._bulk.begin(session)
             self._session_known = True

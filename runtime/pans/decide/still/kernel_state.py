@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from pans.bundle.backends import NO_LABEL, Decider
 from pans.decide.decision import DECISION_DTYPE, DecisionFlag
+from pans.decide.plan.marks import Marks
+from pans.protocol.tracker import StreamTracker
 from pans.protocol.wire import Mark
 
 from . import kernels
@@ -27,12 +29,19 @@ Rows = npt.NDArray[np.void]
 
 
 class CoreState:
-    """What the kernel continues of `core` (a still.Core), whose windows are `windows`; all memory is allocated here, before arming."""
+    """What the kernel continues of a still.Core, of which it has the parts; all memory is allocated here, before arming."""
 
     def __init__(
-        self, core: Any, windows: DecisionWindows, tables: DecisionTables, decider: Decider, shots: int
+        self,
+        tracker: StreamTracker,
+        marks: Marks,
+        windows: DecisionWindows,
+        tables: DecisionTables,
+        decider: Decider,
+        shots: int,
     ) -> None:
-        self.core, self.windows, self.tables = core, windows, tables
+        self.windows, self.tables = windows, tables
+        self._tracker, self._known = tracker, marks
         self._decider, self._shots = decider, shots
         asked = 0 if self.decides else decider.n_features
         rows_max = 2 * self.block_rows + min(ROWS_PER_CALL, COUNTS_PER_CALL // max(asked, 1))
@@ -45,7 +54,7 @@ class CoreState:
     @property
     def takes(self) -> bool:
         """Whether the kernel may take the core's messages."""
-        return bool(self.core.tracker.open)
+        return self._tracker.open
 
     @property
     def decides(self) -> bool:
@@ -59,9 +68,9 @@ class CoreState:
 
     def begin(self, session: int) -> None:
         """Follow the stream of `session`, from where the core stands: its marks are known, others forgotten."""
-        self.core.state["session"] = session
+        self.walk.state["session"] = session
         self._marks.objects[:] = -1
-        for mark in self.core.marks.latest():
+        for mark in self._known.latest():
             self.remember(mark)
 
     def remember(self, mark: Mark) -> None:
@@ -86,7 +95,7 @@ class CoreState:
         silent = labels == NO_LABEL
         why = np.where(probabilities > 0, int(DecisionFlag.AMBIGUOUS), int(DecisionFlag.NOT_FINITE))
         rows["flags"][whole[silent]] = why[silent] | int(DecisionFlag.ABSTAINED)
-        self.core.n_abstained += int(silent.sum())
+        self.walk.state["n_abstained"] += int(silent.sum())
         return rows
 
 

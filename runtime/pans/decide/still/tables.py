@@ -68,13 +68,10 @@ def count_crc_tables(n_features: int, most: int) -> tuple[npt.NDArray[np.uint32]
     zeros = bytes(8 * n_features)
     base = zlib.crc32(zeros)
     table = np.zeros((n_bytes, n_features, 256), np.uint32)
-    for byte in range(n_bytes):
-        for feature in range(n_features):
-            single = np.zeros(8, np.uint32)  # CRC-32 is linear in the bits: eight of them make all 256 values
-            for bit in range(8):
-                data = bytearray(zeros)
-                data[8 * feature + byte] = 1 << bit
-                single[bit] = zlib.crc32(data) ^ base
-            for bit in range(8):
-                table[byte, feature, 1 << bit : 2 << bit] = table[byte, feature, : 1 << bit] ^ single[bit]
+    for bit in range(8):  # CRC-32 is linear in the bits: eight of them make all 256 values
+        for byte, feature in np.ndindex(n_bytes, n_features):
+            data = bytearray(zeros)
+            data[8 * feature + byte] = 1 << bit
+            table[byte, feature, 1 << bit] = zlib.crc32(data) ^ base
+        table[:, :, (1 << bit) + 1 : 2 << bit] = table[:, :, 1 : 1 << bit] ^ table[:, :, 1 << bit, None]
     return table, np.array([base], np.uint32)
