@@ -29,7 +29,7 @@ from pans.decide.still import Core
 from pans.live.timing.causes import INFERENCE, NS_PER_S
 from pans.live.timing.lateness import Lateness
 from pans.protocol.links import Link, count_delimiters, descriptor_of
-from pans.protocol.session import STREAM_TYPES, Refusal
+from pans.protocol.session import ANSWER_TYPES, STREAM_TYPES, Refusal
 from pans.protocol.wire import HEADER, Frame, Opcode, decode_ack, unpack_body
 
 from .deciding import PARK_GIVE_UP_S, DecidingThread
@@ -261,7 +261,7 @@ class Receiver:
             yield from self.stop_serving()
             self._ask_why(kernel)
             return
-        if ended == ring.ODD:  # of a flow
+        if ended == ring.ODD:  # of a flow, or an answer
             yield from self._take_odd(kernel)
         elif ended == ring.BROKEN:
             self._sent(kernel, ended)
@@ -291,8 +291,9 @@ class Receiver:
                 if session.digest(frame, arrival_ns)
             ]
             odd: Taken | None = None
-            if kernel.end.ended == ring.ODD and self._rows_stay:
-                # an irregular message is taken before the accounting, so that the kernel waits for nothing else
+            # An irregular message is taken before the accounting, so that the kernel waits for nothing else; an answer is not, since it
+            # would be on record before those of this batch.
+            if kernel.end.ended == ring.ODD and self._rows_stay and kernel.odd_type not in ANSWER_TYPES:
                 odd = self._taken(kernel)
                 self._go_on(kernel)
             yield batch._replace(passed=passed, odd=odd)
@@ -330,7 +331,7 @@ class Receiver:
         kernel = self._kernel
         if kernel is None or not self.serves:
             return
-        if kernel.end.ended == ring.ODD:  # of a flow: it was about to park for this one
+        if kernel.end.ended == ring.ODD:  # it was about to park for this one
             yield from self._take_odd(kernel)
         kernel.control[ring.PARK] = 0
         self._go_on(kernel)

@@ -31,6 +31,8 @@ from pans.record.recorder import Recorder
 from pans.record.replay import replay
 from pans_sim.device.clock import DeviceClock
 from pans_sim.device.instrument import Instrument
+from pans_sim.ports.faults import parse_faults
+from pans_sim.ports.faulty import FaultyDevice
 from pans_sim.ports.virtual import START_NS, VirtualLink
 from pans_sim.scene.still import scene_from_arrays
 from pans_sim.testing import small_setup
@@ -41,10 +43,13 @@ OBJECTS = 12
 class Served:
     """A simulated instrument for `mode` in a thread, behind a real port."""
 
-    def __init__(self, mode: str, listen: str) -> None:
+    def __init__(self, mode: str, listen: str, faults: str = "") -> None:
         self.profile, self.bundle, self.plan = small_setup(mode)
         clock = DeviceClock(self.profile.clock.tick_hz)
-        device = instrument(self.profile, clock.tick_at(time.perf_counter_ns()))
+        tick = clock.tick_at(time.perf_counter_ns())
+        device: Any = instrument(self.profile, tick)
+        if faults:
+            device = FaultyDevice(lambda _, tick: instrument(self.profile, tick), clock, parse_faults(faults), 1, tick)
         self._running = served(device, clock, listen)
         self.url = self._running.__enter__().url
 
@@ -58,10 +63,12 @@ def instrument(profile: Any, tick: int) -> Instrument:
     return Instrument(profile, scene, seed=3, power_on_tick=tick)
 
 
-def recorded(setup: Any, link: Any, path: Path, observers: Any = NO_OBSERVERS) -> tuple[RunResult, Any]:
+def recorded(
+    setup: Any, link: Any, path: Path, observers: Any = NO_OBSERVERS, objects: int = OBJECTS
+) -> tuple[RunResult, Any]:
     backend = "table" if setup.bundle.automaton is None else "automaton"
     decider = make_decider(setup.bundle, shots=1, backend=backend)
-    config = RunOptions(n_cycles=OBJECTS * setup.plan.cycles_per_object, deadline_us=1e9, realtime=False)
+    config = RunOptions(n_cycles=objects * setup.plan.cycles_per_object, deadline_us=1e9, realtime=False)
     core = Core(setup.plan, decider, 1, config.n_cycles)
     driven = {"drive": setup.plan.drive, "confidence": 0.0}
     facts = {"config": {"shots": 1, "tick_hz": setup.profile.clock.tick_hz, "backend": backend, **driven}}
@@ -96,6 +103,17 @@ def test_a_run_at_real_pace(mode: str, listen: str, tmp_path: Path) -> None:
         assert result.turn_us["max"] > 0
     else:
         assert not decisions["flags"].any()
+
+
+def test_answers_are_on_record_in_the_order_in_which_they_came(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those that only Python can take, as a second answer to a command that the kernel has sent, among many that the kernel takes."""
+    monkeypatch.setattr("pans.live.loop.PROBE_EVERY_NS", 1_000_000)
+    setup = Served("host-driven", "tcp:127.0.0.1:0", "duplicate:0.03")
+    _, recording = recorded(setup, open_link(setup.url), tmp_path / "a.pansrec", objects=60)
+    setup.close()
+    came = [at_ns for at_ns, _ in recording.answers()]
+    assert len(came) > 200
+    assert came == sorted(came)
 
 
 def test_a_recording_that_fails_counts_nothing_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
