@@ -131,6 +131,13 @@ def test_what_cannot_be_done_or_meant_is_refused_with_the_reason(
     assert words in session.error
 
 
+def test_a_run_that_is_refused_before_its_first_exposure_can_be_read(tmp_path: Path) -> None:
+    session = Stage("sequential").run(tmp_path, 1, Mutation("ARM", "n_cycles", 1 << 63))
+    assert not session.wrong
+    assert session.summary is not None
+    assert session.summary.as_json()["seconds"] == 0
+
+
 def test_a_device_that_never_ends_its_plan_does_not_keep_the_host(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

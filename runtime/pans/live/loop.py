@@ -189,9 +189,8 @@ class Timetable:
         self._probe_ns = self._lease_ns = self._flush_ns = 0
 
     def begin(self, run: Status) -> None:
-        """The device has been armed."""
-        now_ns = run.now_ns()
-        self._flush_ns = now_ns + FLUSH_EVERY_NS
+        """The device has been armed. ARM is on record before its first exposure: a run that is killed right then can be told."""
+        now_ns = self._flush_ns = run.now_ns()
         self._grant(run, now_ns)
 
     def next_ns(self, *, recorded: bool) -> int:
@@ -307,7 +306,7 @@ def _result(run: Status) -> RunResult:
         ),
         wrong_patterns=account.wrong_patterns,
         armed_after_s=run.armed_after_s,
-        seconds=(run.now_ns() - run.start_ns) / NS_PER_S,
+        seconds=max(0, run.now_ns() - run.start_ns) / NS_PER_S,  # it may end before its first exposure
         ended=run.ended,
         link_lost=run.link_lost,
         reconnects=run.reconnects,

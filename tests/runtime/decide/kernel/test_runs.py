@@ -189,6 +189,12 @@ def test_runs_under_all_faults_are_sound(seed: int) -> None:
     assert run_case("all", seed, 1200).violations == []
 
 
+@pytest.mark.parametrize("case", ["late", "host_stop", "pause"])
+def test_a_host_that_drives_and_asks_for_pulses_uses_each_number_once(case: str) -> None:
+    """Where a watcher asks for a pulse, the kernel's next SHOW has the number behind it."""
+    assert run_case(case, MODES.index("host-driven"), 1200).violations == []
+
+
 def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:
     """After this module's runs: the turn once for each kind of walk. A fresh process finds it in the cache, though it calls libc."""
     kinds = [kind for one in receive.turn.signatures for kind in re.findall(r"\b(?:Frame)?WalkArrays\b", str(one))]
