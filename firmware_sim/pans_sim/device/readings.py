@@ -29,7 +29,6 @@ U16 = NDArray[np.uint16]
 U64 = NDArray[np.uint64]
 NOISE_STREAMS, SOURCE_STREAMS = (48, 49), (50, 51)  # two uniform numbers make a normal one
 MAX_THRESHOLDS = 1 << 22  # of states times objects that are kept, twice each: 64 MiB
-OBJECTS_AHEAD = 3  # whose thresholds are made where there is time
 _U = np.uint64
 _MANY = 500.0  # photoelectrons, at which no reading is below the highest edge, 14.5
 _UNIT = 2.0**-53
@@ -237,17 +236,12 @@ class Clicks:
             before = readings[place]
         return readings
 
-    def prepare(self, exposure: int, states: States) -> bool:
-        """Make the thresholds of one of the objects to come; whether there was any to make."""
-        if not self.at_once:
+    def prepare(self, number: int, states: States) -> bool:
+        """Make the thresholds of object `number` of the scene; whether there was any to make."""
+        if not self.at_once or number in self._kept:
             return False
-        visit = self._walked.program.n_slots * self._walked.program.cycles_per_object
-        for ahead in range(OBJECTS_AHEAD):
-            number = self._walked.object_of(exposure + ahead * visit)
-            if number not in self._kept:
-                self._thresholds(number, states)
-                return True
-        return False
+        self._thresholds(number, states)
+        return True
 
     def follow(
         self, first: int, node: int, states: States, adaptive: NDArray[np.bool_], before: U8, stamps: U16, readings: U8
@@ -300,7 +294,7 @@ class Numbers:
         read_each(number, light[:, 0], self._conditions(first, len(light)), self._detector, readings[:, 0])
         return readings
 
-    def prepare(self, exposure: int, states: States) -> bool:
+    def prepare(self, number: int, states: States) -> bool:
         """Nothing: a walk needs no more than the light of its states."""
         return False
 

@@ -31,6 +31,7 @@ U16 = NDArray[np.uint16]
 BATCH_EXPOSURES = 1 << 14  # of a plan with fixed patterns, drawn at a time
 MOST_AHEAD = 1024  # the same of photon numbers: an object may stay for as many as the host likes
 BLOCK_ENTRIES = 1 << 20  # objects times patterns that are computed at a time
+OBJECTS_AHEAD = 3  # for whose walks everything is made where there is time
 MAX_BLOCKS = 4  # and how many of those are kept: 32 MiB of float64
 
 
@@ -44,7 +45,7 @@ class Reader(Protocol):
 
     def read(self, first: int, light: F64, before: U8) -> U8: ...
 
-    def prepare(self, exposure: int, states: States) -> bool: ...
+    def prepare(self, number: int, states: States) -> bool: ...
 
     def follow(
         self, first: int, node: int, states: States, adaptive: NDArray[np.bool_], before: U8, stamps: U16, readings: U8
@@ -216,8 +217,16 @@ class WalkSource:
         self.ahead = walked.program.n_slots if reader.at_once else 0
 
     def prepare(self, exposure: int) -> bool:
-        """See `SlotSource`."""
-        return self._reader.prepare(exposure, self._states)
+        """See `SlotSource`: what a walk on one of the objects to come needs, and what its mark says of its light."""
+        visit = self._walked.program.n_slots * self._walked.program.cycles_per_object
+        for ahead in range(OBJECTS_AHEAD):
+            number = self._walked.object_of(exposure + ahead * visit)
+            if self._reader.prepare(number, self._states):
+                return True
+            if self._walked.sample is None and number not in self._expected:
+                self.expected_photoelectrons(number)
+                return True
+        return False
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
         """See `SlotSource`."""

@@ -123,6 +123,23 @@ def test_both_ways_of_driving_give_the_same_walks(automaton: Automaton) -> None:
     assert np.array_equal(clicks, hosted[1])
 
 
+def test_what_the_next_walks_need_is_made_where_there_is_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An object that comes for the first time would else hold up its own exposures, and the decision on it."""
+    bench, made = bright(six_states())
+    start, cycles = bench.device.tick + 2000, 2 * made.cycles_per_object
+    bench.done(Opcode.ARM, pack_command(Arm(start, cycles, 100_000)))
+    while bench.device.draw_ahead():
+        pass
+
+    def made_late(*_: Any) -> None:
+        raise AssertionError("made when it was due")
+
+    for name in ("expected_light", "_of_states"):
+        monkeypatch.setattr(readings.Clicks, name, made_late)
+    messages = bench.run_to(start + cycles * made.cycle_ticks)
+    assert len(of_type(messages, wire.Mark)) == 2
+
+
 def test_marks_tell_the_light_of_a_walk_in_expectation() -> None:
     automaton = six_states()
     bench, made = bright(automaton)
