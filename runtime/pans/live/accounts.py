@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from pans.base.errors import LinkError
 from pans.base.machine import give_way
-from pans.decide import DECISION_DTYPE, Action, Follower, Output
-from pans.decide.kernel import Kernel, follow_up_of
+from pans.decide import DECISION_DTYPE, Follower, Output
+from pans.decide.kernel import Kernel
 from pans.decide.kernel import arrays as ring
 from pans.decide.plan import unknown_photons
 from pans.decide.still import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
@@ -78,7 +78,7 @@ class Accounts:
         self.decoded: Counter[str] = Counter()  # what the sessions that have ended have counted
         self.contradictions: Counter[str] = Counter()  # between messages and the clock, or the host's own books
         self.late: list[int] = []  # numbers of the late ones among the decisions that are shown next
-        self._core, self._follow_up = core, follow_up_of(core)
+        self._core = core
 
     def account(self) -> Account:
         """Return how things stand; from any thread."""
@@ -128,13 +128,9 @@ class Accounts:
             return
         clock, deadline_ns = session.known_clock(), self.timing.deadline_ns
         for action, arrival_ns, decided_ns in batch.pulses:
-
-            def late_us(action: Action, arrival_ns: int = arrival_ns, decided_ns: int = decided_ns) -> float:
-                end_ns, unsure_ns = clock.to_host_ns(action.end_tick)
-                end_ns = arrival_ns if end_ns - unsure_ns > arrival_ns else end_ns
-                return (decided_ns - end_ns - unsure_ns - deadline_ns) / NS_PER_US
-
-            self.gates.take([action], late_us)
+            end_ns, unsure_ns = clock.to_host_ns(action.end_tick)
+            end_ns = arrival_ns if end_ns - unsure_ns > arrival_ns else end_ns  # what has arrived has happened
+            self.gates.take([action], (decided_ns - end_ns - unsure_ns - deadline_ns) / NS_PER_US)
         if session.broken is None:
             try:
                 self.turn_gates(session)
@@ -187,9 +183,9 @@ class Accounts:
         self.lateness.block_came(int(blocks[-1, ring.ARRIVAL]))
         if not len(rows):
             return outputs
-        self.tally.add_rows(rows, self._follow_up.photons_of(kernel))
+        self.tally.add_rows(rows, batch.photons_of)
         give_way()
-        ends = self._follow_up.ends(kernel)
+        ends = batch.ends
         stamps = blocks[ends.blocks, : ring.RECORDED + 1]
         self._add_times(int(rows["index"][0]), ends.counts, *clock.to_host_ns_many(ends.ticks), stamps)
         return outputs

@@ -218,12 +218,12 @@ class GateQueue:
         self._sent: deque[tuple[int, Action]] = deque()  # command id, action
         self._session: HostSession | None = None
 
-    def take(self, actions: Iterable[Action], late_us: Callable[[Action], float] = lambda action: 0.0) -> None:
-        """Queue pulses; beyond MAX_WAITING the oldest expires, and so does one whose decision was `late_us` after its deadline, above 0."""
+    def take(self, actions: Iterable[Action], late_us: float = 0.0) -> None:
+        """Queue pulses of decisions that were `late_us` after their deadline: late ones expire, and beyond MAX_WAITING the oldest."""
         for action in actions:
             self.counters.asked += 1
-            if (by_us := late_us(action)) > 0:
-                self._expire(action, f"its decision was {by_us:.0f} us later than the deadline allows")
+            if late_us > 0:
+                self._expire(action, f"its decision was {late_us:.0f} us later than the deadline allows")
             else:
                 self._waiting.append(action)
         while len(self._waiting) > MAX_WAITING:

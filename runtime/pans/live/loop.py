@@ -179,7 +179,8 @@ def _until_ended(
                 lose_link(run, error)
             else:
                 come_back(run, error, progress, recovery, prepare, arming)
-                due.begin(run)
+                if not run.ended:
+                    due.begin(run)
 
 
 class Timetable:

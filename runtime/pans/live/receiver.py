@@ -23,8 +23,9 @@ import numpy.typing as npt
 from pans.base.errors import LinkError
 from pans.base.machine import give_way
 from pans.decide import DECISION_DTYPE, Action, Follower, Output, Standing
-from pans.decide.kernel import QUIET_NS, Kernel, Limits, follow_up_of, offered
+from pans.decide.kernel import NO_ENDS, QUIET_NS, Ends, Kernel, Limits, PhotonsOf, follow_up_of, offered
 from pans.decide.kernel import arrays as ring
+from pans.decide.plan import unknown_photons
 from pans.decide.still import Core
 from pans.live.timing.causes import INFERENCE, NS_PER_S
 from pans.live.timing.lateness import Lateness
@@ -38,13 +39,11 @@ from .session import Session
 
 Rows = npt.NDArray[np.void]
 
-GATHERED_BYTES = 1 << 18
+GATHERED_BYTES = 1 << 18  # of a virtual link, taken in one call: it makes thousands of blocks in the time of one call
 EAGER_NS = 200_000  # as protocol/links/reader.py: an answer that was asked for is waited for awake
-LEAST_NS = 100_000
-CALL_NS = (
-    30_000_000  # a call in turn returns at least so often: signals, the watchdog's heartbeat, other threads' wishes
-)
-WAIT_NS = 100_000_000  # so does a wait for a batch
+LEAST_NS = 100_000  # a wait that is due already would spin
+# A call in turn returns at least so often, and a wait for a batch: signals, the watchdog's heartbeat, other threads' wishes.
+CALL_NS, WAIT_NS = 30_000_000, 100_000_000
 
 
 class Taken(NamedTuple):
@@ -66,13 +65,16 @@ class Pulse(NamedTuple):
 class Batch(NamedTuple):
     """What one call of the kernel brought, or one message that Python took; valid until the next batch.
 
-    `kernel` is None where the kernel brought nothing: then there is `odd` alone. `rows` are its decisions, DECISION_DTYPE (n,). `outputs`
-    is used once, behind the recording: the core sees there what the kernel has decided. `passed` are the STATUS and EXPOSED among the
-    kernel's messages, `odd` is a message behind them; both have been taken by the core.
+    `kernel` is None where the kernel brought nothing: then there is `odd` alone. `rows` are its decisions, DECISION_DTYPE (n,), `ends` says
+    when they ended, `photons_of` how bright their objects are. `outputs` is used once, behind the recording: the core sees there what the
+    kernel has decided. `passed` are the STATUS and EXPOSED among the kernel's messages, `odd` is a message behind them; both have been
+    taken by the core.
     """
 
     kernel: Kernel | None
     rows: Rows
+    ends: Ends = NO_ENDS
+    photons_of: PhotonsOf = unknown_photons
     outputs: Iterable[Output] = ()
     pulses: Sequence[Pulse] = ()
     passed: Sequence[Taken] = ()
@@ -507,7 +509,7 @@ class Receiver:
             Pulse(action, int(blocks[place, ring.ARRIVAL]), int(blocks[place, ring.DECIDED]))
             for action, place in self._follow_up.pulses(kernel)
         ]
-        return Batch(kernel, rows, outputs, pulses)
+        return Batch(kernel, rows, self._follow_up.ends(kernel), self._follow_up.photons_of(kernel), outputs, pulses)
 
     def _settle_commands(self, kernel: Kernel) -> None:
         """Bring the session and the driver to where the kernel has them, and give the session the answers that are left to it."""

@@ -1,16 +1,15 @@
 """`Session`: the link, what was agreed on it, and the device's clock; it ends with the link.
 
 `open_session` brings a device to where ARM can follow: handshake, check, upload, clock. Each of these steps returns when the device has
-agreed, or raises LinkError (it is silent or gone) or DeviceError (it refused). `pump` reads, decodes, answers and sends; it returns the
-stream frames that came, stamped. Of an armed run receiver.py takes the bytes, but what is sent is sent here, except the next SHOW of the
-kernel.
+agreed, or raises LinkError (it is silent or gone) or DeviceError (it refused). `pump` reads, decodes, answers and sends. Of an armed run
+receiver.py takes the bytes. What is sent is sent here, except the next SHOW of the kernel.
 """
 
 from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from pans.base.errors import DeviceError, LinkError, PansError
 from pans.bundle.sensor import Bundle
@@ -44,13 +43,6 @@ CLOCK_BURST = 16
 PROBE_GIVE_UP_NS = NS_PER_S // 4  # of one probe of the burst: a lost one is not waited for
 
 
-class Arrived(NamedTuple):
-    """A frame for the core, and when its bytes were read."""
-
-    arrival_ns: int
-    what: Frame
-
-
 class Session:
     """Link, reader, decoder, session and clock of one session.
 
@@ -80,13 +72,12 @@ class Session:
         self._granted_until = 0  # stream messages
         self._failure: PansError | None = None  # met while digesting, kept until all that came with it is delivered
 
-    def pump(self, timeout_s: float) -> list[Arrived]:
-        """Send what is due, wait at most `timeout_s` for bytes, digest them; return what of them is the core's, in order."""
-        stream = self._take(self.chunks(timeout_s))
+    def pump(self, timeout_s: float) -> None:
+        """Send what is due, wait at most `timeout_s` for bytes, and digest them."""
+        came = self._digest_all(self.chunks(timeout_s))
         self.take_pongs()
-        if not stream:
+        if not came:
             self.raise_failure()
-        return stream
 
     def send_due(self) -> bool:
         """Send what is due and return whether that was anything; raises what the latest frames ended the session with."""
@@ -107,16 +98,15 @@ class Session:
 
     def rest(self) -> None:
         """Stop reading and digest what has arrived and was never taken: a host finds it that stood still while its device was lost."""
-        self._take(self.reader.rest())
+        self._digest_all(self.reader.rest())
 
-    def _take(self, chunks: list[Chunk]) -> list[Arrived]:
-        """Digest chunks and return what of them is the core's, in order."""
-        return [
-            Arrived(chunk.arrival_ns, frame)
-            for chunk in chunks
-            for frame in self.decoder.feed(chunk.data)
-            if self.sort(frame, chunk.arrival_ns)
-        ]
+    def _digest_all(self, chunks: list[Chunk]) -> bool:
+        """Digest chunks; return whether anything of them would be a core's."""
+        before = self.delivered
+        for chunk in chunks:
+            for frame in self.decoder.feed(chunk.data):
+                self.sort(frame, chunk.arrival_ns)
+        return self.delivered > before
 
     def raise_failure(self) -> None:
         """Raise what ended the session, once all that came with it has been delivered."""

@@ -20,11 +20,11 @@ from .receiver import Batch, Batches
 from .reconnect import MOST_FRUITLESS, Progress, Recovery, reconnect
 from .session import ARM_LEAD_NS, Session
 from .status import Status
+from .timing.lateness import POLL_S
 
 NS_PER_MS, NS_PER_S = 1_000_000, 1_000_000_000
-POLL_S = 0.02
 LONGEST_LEAD_NS = 32 * ARM_LEAD_NS  # five refusals, each twice as far ahead
-STOP_GIVE_UP_NS = 1 * NS_PER_S
+STOP_GIVE_UP_NS = 1 * NS_PER_S  # for STOP, its answer and a STATUS; a lease ends the light of a device that is slower
 
 
 def take(run: Status, batch: Batch) -> bool:
@@ -76,11 +76,11 @@ def lose_link(run: Status, error: LinkError) -> None:
 
 
 class Arming:
-    """Arms the device, again and again; `start_ns` and `over_ns` say when the exposures of the last ARM begin and end."""
+    """Arms the device, again and again; `over_ns` says when the exposures of the last ARM end."""
 
     def __init__(self) -> None:
         self._lead_ns = ARM_LEAD_NS  # of a start before its first exposure; a host that is too slow for it learns
-        self.start_ns = self.over_ns = 0
+        self.over_ns = 0
         self.setup: list[bytes] = []  # what each part of the recording must repeat
 
     def arm(self, run: Status) -> None:
@@ -117,17 +117,17 @@ class Arming:
 
     def _send(self, run: Status, now_ns: int, arm: Arm) -> None:
         session, receiver, recorder = run.session, run.receiver, run.accounts.recorder
-        self.start_ns = now_ns + self._lead_ns
-        run.accounts.lateness.attach(session, self.start_ns, receiver.thread_id)
+        start_ns = now_ns + self._lead_ns
+        run.accounts.lateness.attach(session, start_ns, receiver.thread_id)
         session.arm(arm)
         if receiver.driver is not None:
             receiver.driver.begin(session)
         if recorder is not None and recorder.limits is not None:
             self.setup = repeated_setup(run.job.plan, arm, session.host.nonce)
         planned_ns = round((arm.n_cycles + 1) * run.job.plan.cycle_us * 1000)
-        self.over_ns = self.start_ns + planned_ns if arm.n_cycles else 1 << 62
+        self.over_ns = start_ns + planned_ns if arm.n_cycles else 1 << 62
         if not run.reconnects:
-            run.start_ns = self.start_ns
+            run.start_ns = start_ns
             run.armed_after_s = (time.perf_counter_ns() - run.began_ns) / NS_PER_S
 
 

@@ -7,7 +7,7 @@ messages are left to Python. Start at calls.py (`Kernel`), then receive.py; arra
 from . import arrays as arrays
 from .arrays import OVERSLEPT_NS, Drive
 from .calls import BATCH_NS, Kernel, Limits
-from .follow_up import FollowUp, follow_up_of
+from .follow_up import NO_ENDS, Ends, FollowUp, follow_up_of
 from .follow_up import PhotonsOf as PhotonsOf
 from .receive import QUIET_NS, turn, unpack_blocks
 from .stream_core import StreamCore
@@ -15,9 +15,11 @@ from .system_calls import now_ns, offered, read_now, wait_for, write_now
 
 __all__ = [
     "BATCH_NS",
+    "NO_ENDS",
     "OVERSLEPT_NS",
     "QUIET_NS",
     "Drive",
+    "Ends",
     "FollowUp",
     "Kernel",
     "Limits",

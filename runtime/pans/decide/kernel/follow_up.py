@@ -29,9 +29,8 @@ from .calls import Kernel
 from .receive import unpack_blocks
 
 Rows = npt.NDArray[np.void]
-PhotonsOf = Callable[
-    [I64], npt.NDArray[np.float32]
-]  # object numbers (n,) -> photoelectrons (n,), NaN where it is not known
+# object numbers (n,) -> photoelectrons of one shot (n,), NaN where nobody told
+PhotonsOf = Callable[[I64], npt.NDArray[np.float32]]
 
 
 class Ends(NamedTuple):
@@ -40,6 +39,9 @@ class Ends(NamedTuple):
     ticks: I64
     counts: I64
     blocks: I64
+
+
+NO_ENDS = Ends(*(np.zeros(0, np.int64) for _ in Ends._fields))
 
 
 class FollowUp(Protocol):
@@ -90,8 +92,7 @@ class IdleFollowUp:
 
     def ends(self, kernel: Kernel) -> Ends:
         """See FollowUp."""
-        none: I64 = np.zeros(0, np.int64)
-        return Ends(none, none, none)
+        return NO_ENDS
 
     def pulses(self, kernel: Kernel) -> list[tuple[Action, int]]:
         """See FollowUp: objects that stand still ask for none."""

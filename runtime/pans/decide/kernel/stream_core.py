@@ -99,8 +99,8 @@ class StreamCore:
         """Yield what a call of the kernel brought, and take what ended it, until nothing is left."""
         turn, core = self.turn, self.core
         while True:
+            self._follow_up.marks(turn)  # the same order as live/receiver.py
             events = [event for _, frame, standing in turn.passed() for event in core.step(frame, standing).events]
-            self._follow_up.marks(turn)
             rows = turn.rows
             events += [event for output in self._follow_up.outputs(turn, rows) for event in output.events]
             if len(rows) or events:
